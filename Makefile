@@ -1,0 +1,46 @@
+# Two commands do all set-up: `make run` and `make test`. The environment is made once, in .venv,
+# from requirements.lock alone; PYTHON=python3.12 picks another interpreter.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+PACKAGES := backplane boards levels tools
+CONFIG ?= nasrem
+
+.DEFAULT_GOAL := help
+.PHONY: help run test lint lock clean
+
+help: ## show this
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 14
+
+run: $(STAMP) ## run the rack CONFIG (default: nasrem); ARGS="--lockstep" and the like are passed on
+	$(BIN)/rack run $(CONFIG) $(ARGS)
+
+test: $(STAMP) ## run the tests; ARGS="-k segment" and the like are passed on
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP) ## check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+lock: $(STAMP) ## pin the newest versions that pyproject.toml permits
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header \
+		--extra dev pyproject.toml --output-file requirements.lock
+
+clean: ## remove the environment and what tools have left; runs/ stays
+	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+$(STAMP): requirements.lock pyproject.toml
+	@[ "$$(uname -s)" = Linux ] || { echo "rack runs on Linux alone: it needs /dev/shm, pidfds, SCHED_FIFO"; exit 1; }
+	@[ -d /dev/shm ] && [ -w /dev/shm ] || { echo "rack needs /dev/shm, writable: mount a tmpfs there"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' 2>/dev/null \
+		|| { echo "rack needs Python 3.11 to 3.14, and $(PYTHON) is not that: try make PYTHON=python3.11"; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null \
+		|| { echo "$(PYTHON) has no venv: install it (Debian: apt-get install python3-venv)"; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index --editable .
+	@touch $(STAMP)

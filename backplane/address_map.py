@@ -1,0 +1,85 @@
+"""The memory map: where on the bus every board's window, task block and mailbox lies.
+
+Addresses are byte offsets in the segment. A board's window starts on a page and holds its tasks'
+control blocks and trace rings, then the mailboxes it writes. The map follows from the layout alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from backplane.layout import Layout, MailboxSpec, TaskSpec
+
+PAGE = 4096
+LINE = 64
+"""A cache line: blocks of two writers never share one."""
+
+HEAD_SIZE = PAGE
+BLOCK_WORDS = 24
+BLOCK_SIZE = BLOCK_WORDS * 8
+TRACE_RECORD_SIZE = 64
+MAILBOX_HEAD_SIZE = LINE
+SLOT_HEAD_SIZE = 64
+
+
+@dataclass(frozen=True)
+class Window:
+    """A board's part of the segment: `address` and `size` in bytes."""
+
+    board: str
+    address: int
+    size: int
+
+
+class AddressMap:
+    """Addresses of everything on one backplane; `size` is the bytes of all of it, texts not included."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.windows: list[Window] = []
+        self.blocks: dict[str, int] = {}
+        self.traces: dict[str, int] = {}
+        self.mailboxes: dict[str, int] = {}
+        address = HEAD_SIZE
+        for board in dict.fromkeys(task.board for task in layout.tasks):
+            address = self._place_board(board, layout, address)
+        self.size = address
+
+    def _place_board(self, board: str, layout: Layout, start: int) -> int:
+        address = start
+        tasks = [task for task in layout.tasks if task.board == board]
+        for task in tasks:
+            self.blocks[task.name] = address
+            self.traces[task.name] = address + BLOCK_SIZE
+            address = _up(address + BLOCK_SIZE + trace_size(task), LINE)
+        names = {task.name for task in tasks}
+        for mailbox in layout.mailboxes:
+            if mailbox.writer in names:
+                self.mailboxes[mailbox.name] = address
+                address = _up(address + mailbox_size(mailbox), LINE)
+        end = _up(address, PAGE)
+        self.windows.append(Window(board, start, end - start))
+        return end
+
+
+def pages(size: int) -> int:
+    """Return `size` bytes rounded up to whole pages."""
+    return _up(size, PAGE)
+
+
+def trace_size(task: TaskSpec) -> int:
+    """Return the bytes of a task's trace ring."""
+    return task.depth * TRACE_RECORD_SIZE
+
+
+def slot_stride(mailbox: MailboxSpec) -> int:
+    """Return the bytes from one slot of a mailbox to the next."""
+    return _up(SLOT_HEAD_SIZE + mailbox.size, LINE)
+
+
+def mailbox_size(mailbox: MailboxSpec) -> int:
+    """Return the bytes of a mailbox: its head and its slots."""
+    return MAILBOX_HEAD_SIZE + mailbox.depth * slot_stride(mailbox)
+
+
+def _up(value: int, step: int) -> int:
+    return -(-value // step) * step

@@ -1,0 +1,63 @@
+"""The system clock as every board sees it: an integer tick on one absolute grid (eq. 3.7)."""
+
+from __future__ import annotations
+
+from time import monotonic_ns
+
+from backplane.errors import ClockError
+from backplane.segment import Segment
+from backplane.words import Run, System
+
+# Plain integers for the hot path.
+_STATE, _TICK, _EPOCH, _PERIOD, _LOCKSTEP = (
+    int(w) for w in (System.STATE, System.TICK, System.EPOCH_NS, System.PERIOD_NS, System.LOCKSTEP)
+)
+
+
+class SystemClock:
+    """Read access to the clock: the current tick, and where ticks lie on CLOCK_MONOTONIC."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._words = segment.words
+        self.is_lockstep = bool(self._words[_LOCKSTEP])
+
+    @property
+    def tick(self) -> int:
+        """The newest tick that the clock board has given out."""
+        return self._words[_TICK]
+
+    @property
+    def is_stopped(self) -> bool:
+        """True when the run is over."""
+        return self._words[_STATE] == Run.STOPPED
+
+    @property
+    def is_running(self) -> bool:
+        """True from the first tick until the run is over."""
+        return self._words[_STATE] == Run.RUNNING
+
+    def now(self) -> int:
+        """Return the tick that has come by time; in lockstep, the newest tick given out.
+
+        In real time the grid decides, not the clock board, which may itself be late.
+        """
+        if self.is_lockstep:
+            return self._words[_TICK]
+        return (monotonic_ns() - self._words[_EPOCH]) // self._words[_PERIOD]
+
+    def time_of(self, tick: int) -> int:
+        """Return the CLOCK_MONOTONIC time of a tick, in ns."""
+        return self._words[_EPOCH] + tick * self._words[_PERIOD]
+
+
+def ticks_of(rate_hz: float, clock_ns: int, what: str) -> int:
+    """Return the period, in ticks, of a rate. Raises `ClockError` with the nearest rates when off the grid."""
+    clock_hz = 1e9 / clock_ns
+    ticks = clock_hz / rate_hz
+    every = round(ticks)
+    if every >= 1 and abs(ticks - every) <= 1e-6 * ticks:
+        return every
+    # Above the clock's own rate there is only one neighbour.
+    nearest = [n for n in (int(ticks) + 1, int(ticks)) if n >= 1]
+    rates = ", ".join(f"{clock_hz / n:.4g} Hz (every {n} tick{'s' if n > 1 else ''})" for n in nearest)
+    raise ClockError(f"{what}: {rate_hz:g} Hz does not divide the {clock_hz:g} Hz clock; nearest: {rates}")

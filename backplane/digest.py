@@ -1,0 +1,35 @@
+"""The digest of a run: a hash over everything every task wrote, ticks and values, no wall-clock time.
+
+Each message carries the running hash of its mailbox, so the digest is complete even when a recorder lost
+rows, and a restarted writer goes on with it. Messages that become visible behind the last tick do not
+count: whether they were finished is no part of the motion.
+"""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+
+from backplane.segment import Segment
+from backplane.slots import Slots
+from backplane.words import Box, System
+
+
+def chains(segment: Segment, until: int) -> dict[str, tuple[int, bytes]]:
+    """Return serial and running hash of every mailbox's newest message that was visible before tick `until`."""
+    found = {}
+    for spec in segment.layout.mailboxes:
+        slots = Slots(segment, spec)
+        serial = slots.box[Box.HEAD]
+        while serial and slots.fetch(serial) and slots.visible_at(serial) >= until:
+            serial -= 1
+        found[spec.name] = (serial, slots.chain if serial else bytes(8))
+    return found
+
+
+def digest(segment: Segment, until: int | None = None) -> str:
+    """Return the run's digest, 32 hexadecimal digits, up to tick `until` (default: where it stopped)."""
+    stop = segment.words[System.STOP_TICK] if until is None else until
+    total = blake2b(digest_size=16)
+    for name, (serial, chain) in sorted(chains(segment, stop).items()):
+        total.update(f"{name} {serial} ".encode() + chain)
+    return total.hexdigest()

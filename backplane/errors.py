@@ -1,0 +1,26 @@
+"""The exception tree of the bus, and where each one shows.
+
+`BackplaneError` is the root: catch it and every refusal of this package is caught.
+
+- `SegmentError`: a rack name that is in use, a segment of another layout or owner, a full /dev/shm.
+- `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
+- `ClockError`: a rate off the grid, a period that is no period.
+"""
+
+from __future__ import annotations
+
+
+class BackplaneError(Exception):
+    """Root of every error this package raises; its text is one line for the user."""
+
+
+class SegmentError(BackplaneError):
+    """A segment that cannot be made, attached or removed."""
+
+
+class MailboxError(BackplaneError):
+    """A mailbox that cannot be opened, claimed or matched with a message type."""
+
+
+class ClockError(BackplaneError):
+    """A rate or a period that the system clock cannot keep."""

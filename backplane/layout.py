@@ -1,0 +1,96 @@
+"""What a rack puts on its backplane: mailboxes and tasks, as plain data.
+
+The Rack computes a layout from its config; the segment is laid out from it and carries it as text,
+so that a tool which attaches by name knows every mailbox and every task without the config's classes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Protocol = Literal["time-slice", "double-buffer", "lock"]
+PROTOCOLS: tuple[Protocol, ...] = ("time-slice", "double-buffer", "lock")
+
+Role = Literal["executor", "planner"]
+
+
+@dataclass(frozen=True)
+class FieldSpec:
+    """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit, meaning.
+
+    `fields` is not empty for a group of fields (a nested message).
+    """
+
+    name: str
+    kind: str
+    shape: tuple[int, ...]
+    offset: int
+    unit: str
+    meaning: str
+    fields: tuple[FieldSpec, ...] = ()
+
+
+@dataclass(frozen=True)
+class MailboxSpec:
+    """One mailbox: who writes it, what it carries, how it is shared.
+
+    `every` is the writer's period and `delay` the ticks from release to visibility, both in ticks;
+    `depth` is the number of slots, a power of two.
+    """
+
+    name: str
+    writer: str
+    readers: tuple[str, ...]
+    protocol: Protocol
+    every: int
+    delay: int
+    depth: int
+    message: str
+    version: int
+    size: int
+    fields: tuple[FieldSpec, ...]
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """One schedulable task: the executor of a board or its planner.
+
+    `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in
+    ticks; `within_cycles` the cycles that one plan may take. `priority` is SCHED_FIFO's, 0 for
+    ordinary scheduling. `depth` is the number of records in its trace ring, a power of two.
+    """
+
+    name: str
+    board: str
+    role: Role
+    slot: int
+    core: int
+    priority: int
+    every: int
+    within_cycles: int
+    depth: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Everything on one backplane. `clock_ns` is the period of the system clock."""
+
+    rack: str
+    clock_ns: int
+    tasks: tuple[TaskSpec, ...]
+    mailboxes: tuple[MailboxSpec, ...]
+
+    def mailbox(self, name: str) -> MailboxSpec:
+        """Return the mailbox of that name. Raises `KeyError`."""
+        return {m.name: m for m in self.mailboxes}[name]
+
+    def task(self, name: str) -> TaskSpec:
+        """Return the task of that name. Raises `KeyError`."""
+        return {t.name: t for t in self.tasks}[name]
+
+
+def depth_for(span_ticks: int, every: int, least: int = 4) -> int:
+    """Return the slots, a power of two, that keep `span_ticks` ticks of a writer of period `every`."""
+    wanted = max(least, -(-span_ticks // every) + 3)
+    return 1 << (wanted - 1).bit_length()

@@ -1,0 +1,154 @@
+"""Message types: fixed numpy structured layouts, documented field by field.
+
+A message type is declared once, with symbolic sizes ("joints"); a rack resolves the sizes
+from its config. The bytes of a resolved type are what travels through a mailbox.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from backplane.errors import MailboxError
+
+REASON_BYTES = 120
+
+
+class State(IntEnum):
+    """State of a level, in every status message."""
+
+    IDLE = 0
+    EXECUTING = 1
+    DONE = 2
+    ERROR = 3
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a message: numpy scalar type, shape, unit and meaning.
+
+    `shape` mixes integers and symbolic sizes; `kind` is a numpy type string or, for a group of
+    fields, a nested `MessageType`.
+    """
+
+    name: str
+    kind: str | MessageType
+    unit: str
+    meaning: str
+    shape: tuple[int | str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MessageType:
+    """A named, versioned layout. `fields` stand in the order of their bytes."""
+
+    name: str
+    version: int
+    fields: tuple[Field, ...]
+
+    def dtype(self, sizes: Mapping[str, int]) -> np.dtype:
+        """Return the numpy dtype with every symbolic size filled in.
+
+        Raises `MailboxError` when `sizes` lacks one. Padding is explicit in numpy's aligned layout,
+        zeroed once at creation and never written, so that equal messages have equal bytes.
+        """
+        return np.dtype([self._column(f, sizes) for f in self.fields], align=True)
+
+    def _column(self, field: Field, sizes: Mapping[str, int]) -> tuple[str, Any, tuple[int, ...]]:
+        kind = field.kind.dtype(sizes) if isinstance(field.kind, MessageType) else np.dtype(field.kind)
+        missing = [s for s in field.shape if isinstance(s, str) and s not in sizes]
+        if missing:
+            known = ", ".join(sorted(sizes)) or "none"
+            raise MailboxError(
+                f"message '{self.name}' field '{field.name}': size '{missing[0]}' is unknown; known sizes: {known}"
+            )
+        shape = tuple(sizes[s] if isinstance(s, str) else s for s in field.shape)
+        return field.name, kind, shape
+
+
+def command(name: str, version: int, *fields: Field) -> MessageType:
+    """Return a command type: `fields` behind the command's serial."""
+    serial = Field("id", "u4", "1", "serial of the command; 0: nothing is commanded")
+    return MessageType(name, version, (serial, *fields))
+
+
+def status(name: str, version: int, *fields: Field) -> MessageType:
+    """Return a status type: `fields` behind echo, state, error code and reason."""
+    head = (
+        Field("echo", "u4", "1", "serial of the command that this status answers"),
+        Field("state", "u1", "State", "idle, executing, done or error"),
+        Field("error", "u2", "1", "error code of the level; 0: none"),
+        Field("reason", f"S{REASON_BYTES}", "ASCII", "the error, readable"),
+    )
+    return MessageType(name, version, (*head, *fields))
+
+
+class Message:
+    """A local copy of one message: a mailbox reads into it or writes from it.
+
+    Every field is an attribute. Array fields are numpy views of `record`: fill them in place
+    (`m.position[:] = q`) or assign (`m.position = q`). Scalars read and assign as plain numbers,
+    byte strings as `str`. `record` is the structured array, shape (), `raw` its bytes.
+    """
+
+    record: np.ndarray
+    raw: memoryview
+
+    def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Message:
+        return object.__new__(_class_for(dtype))
+
+    def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
+        self.raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
+        self.record = np.frombuffer(self.raw, dtype=dtype, count=1).reshape(())
+        self.__dict__.update({f"_{name}": self.record[name] for name in dtype.names or ()})
+
+    def clear(self) -> None:
+        """Set every byte to zero."""
+        self.raw[:] = bytes(len(self.raw))
+
+    def copy_from(self, other: Message) -> None:
+        """Take over the bytes of a message of the same type."""
+        self.raw[:] = other.raw
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # A misspelt field would otherwise become a Python attribute and travel nowhere.
+        if name not in ("raw", "record") and not hasattr(type(self), name):
+            raise AttributeError(f"message has no field '{name}'; fields: {', '.join(self.record.dtype.names or ())}")
+        object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
+
+
+_CLASSES: dict[np.dtype, type[Message]] = {}
+
+
+def _class_for(dtype: np.dtype) -> type[Message]:
+    """Return the subclass of `Message` with one property a field, made once a dtype."""
+    if dtype not in _CLASSES:
+        properties = {name: _property(name, dtype[name]) for name in dtype.names or ()}
+        _CLASSES[dtype] = type("Message", (Message,), properties)
+    return _CLASSES[dtype]
+
+
+def _property(name: str, dtype: np.dtype) -> property:
+    slot = f"_{name}"
+
+    def store(self: Message, value: Any) -> None:
+        self.__dict__[slot][...] = value
+
+    if dtype.shape or dtype.names:
+        return property(lambda self: self.__dict__[slot], store)
+    if dtype.kind == "S":
+        size = dtype.itemsize
+
+        def store_text(self: Message, value: str | bytes) -> None:
+            data = value.encode("ascii", "replace") if isinstance(value, str) else value
+            self.__dict__[slot][...] = data[:size]
+
+        return property(lambda self: self.__dict__[slot].item().decode("ascii", "replace"), store_text)
+    return property(lambda self: self.__dict__[slot].item(), store)

@@ -1,0 +1,30 @@
+"""The three mailbox protocols by name: one writer class and one reader class each."""
+
+from __future__ import annotations
+
+from backplane.double_buffer import DoubleBufferReader, DoubleBufferWriter
+from backplane.layout import Protocol
+from backplane.lock import LockReader, LockWriter
+from backplane.mailbox import Reader, Writer
+from backplane.segment import Segment
+
+WRITERS: dict[Protocol, type[Writer]] = {
+    "time-slice": Writer,
+    "double-buffer": DoubleBufferWriter,
+    "lock": LockWriter,
+}
+READERS: dict[Protocol, type[Reader]] = {
+    "time-slice": Reader,
+    "double-buffer": DoubleBufferReader,
+    "lock": LockReader,
+}
+
+
+def open_writer(segment: Segment, name: str) -> Writer:
+    """Claim a mailbox for writing under its protocol. Raises `MailboxError` when it has a writer."""
+    return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
+
+
+def open_reader(segment: Segment, name: str) -> Reader:
+    """Open a mailbox for reading under its protocol."""
+    return READERS[segment.layout.mailbox(name).protocol](segment, name)

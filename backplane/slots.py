@@ -1,0 +1,127 @@
+"""The slots of one mailbox: how a message gets into shared memory whole, and out of it.
+
+A message is built in a local record, copied into the slot behind the newest one, and published by one
+store of its serial in the mailbox's head. A writer killed at any instruction leaves every published
+message as it was. A reader checks serial and CRC of its copy, so it never gives out half a message.
+"""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+from time import monotonic_ns
+from zlib import crc32
+
+import numpy as np
+
+from backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from backplane.layout import FieldSpec, MailboxSpec
+from backplane.message import Message
+from backplane.segment import Segment
+from backplane.words import Box, Slot
+
+CRC_FROM = Slot.EPOCH * 8
+CHAIN_FROM = Slot.SERIAL * 8
+CHAIN_AT = Slot.CHAIN * 8
+# Plain integers: an IntEnum member costs a conversion at every use as an index.
+_STAMP, _CRC, _EPOCH, _BASIS, _SERIAL, _TICK, _VISIBLE = range(7)
+
+
+def message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
+    """Return the numpy dtype of a mailbox's message, from its layout."""
+    return np.dtype(
+        {
+            "names": [f.name for f in fields],
+            "formats": [_format(f) for f in fields],
+            "offsets": [f.offset for f in fields],
+            "itemsize": size,
+        }
+    )
+
+
+def _format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
+    if not field.fields:
+        return field.kind, field.shape
+    # A group's own size stands in its kind, "V<bytes>".
+    return message_dtype(field.fields, int(field.kind[1:])), field.shape
+
+
+class Slots:
+    """One process's access to the slots of a mailbox: a local `record` and its `message`.
+
+    `record` holds the head's eight words (`words.Slot`), then the message.
+    """
+
+    def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
+        self.spec = spec
+        self.dtype = message_dtype(spec.fields, spec.size)
+        address = segment.map.mailboxes[spec.name]
+        stride = slot_stride(spec)
+        self.box = segment.words[address // 8 : address // 8 + len(Box)]
+        self.mask = spec.depth - 1
+        self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
+        self.message = Message(self.dtype, self.record[SLOT_HEAD_SIZE:])
+        first = address + MAILBOX_HEAD_SIZE
+        self.ring = segment.view(first, spec.depth * stride)
+        self._slots = [segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)]
+        self._slot_words = [slot[:SLOT_HEAD_SIZE].cast("q") for slot in self._slots]
+        self._words = self.record[:SLOT_HEAD_SIZE].cast("q")
+        self._crc_part = self.record[CRC_FROM:]
+        self._chain_part = self.record[CHAIN_FROM:]
+        self._chain = self.record[CHAIN_AT:SLOT_HEAD_SIZE]
+
+    def resume(self, epoch: int) -> int:
+        """Take the writer's place behind the newest published message; return its serial."""
+        head = self.box[Box.HEAD]
+        self._words[_SERIAL] = head
+        self._words[_EPOCH] = epoch
+        self._chain[:] = bytes(self._slots[head & self.mask][CHAIN_AT:SLOT_HEAD_SIZE]) if head else bytes(8)
+        return head
+
+    def publish(self, tick: int, visible_at: int, basis: int) -> None:
+        """Copy the local message into the next slot, then publish it."""
+        words = self._words
+        serial = words[_SERIAL] + 1
+        words[_BASIS] = basis
+        words[_SERIAL] = serial
+        words[_TICK] = tick
+        words[_VISIBLE] = visible_at
+        # The word still holds the chain of the message before: hashed in, then replaced.
+        self._chain[:] = blake2b(self._chain_part, digest_size=8).digest()
+        words[_CRC] = crc32(self._crc_part)
+        words[_STAMP] = monotonic_ns()
+        self._slots[serial & self.mask][:] = self.record
+        self.box[0] = serial
+
+    def visible_at(self, serial: int) -> int:
+        """Return the tick from which the message in that serial's slot may be read."""
+        return self._slot_words[serial & self.mask][_VISIBLE]
+
+    def fetch(self, serial: int) -> bool:
+        """Copy a message into the local record; False when it is not that message, whole."""
+        self.record[:] = self._slots[serial & self.mask]
+        return self._words[_SERIAL] == serial and self._words[_CRC] == crc32(self._crc_part)
+
+    @property
+    def serial(self) -> int:
+        """Serial of the message in the local record; 0: none."""
+        return self._words[_SERIAL]
+
+    @property
+    def epoch(self) -> int:
+        """Writer's epoch of that message."""
+        return self._words[_EPOCH]
+
+    @property
+    def tick(self) -> int:
+        """Release tick of the cycle that wrote that message."""
+        return self._words[_TICK]
+
+    @property
+    def basis(self) -> int:
+        """Tick of the oldest information that the message rests on, level by level."""
+        return self._words[_BASIS]
+
+    @property
+    def chain(self) -> bytes:
+        """Running hash over this and every earlier message of the mailbox, 8 bytes."""
+        return bytes(self._chain)

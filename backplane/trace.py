@@ -1,0 +1,67 @@
+"""Trace rings: one fixed record a cycle of a task, written without ever waiting.
+
+One record gives lateness (start - release), t_comm (read and write parts), t_exec (the process part)
+and t_residual (deadline - end) of eq. 3.5. A reader that falls behind knows how many it lost.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+import numpy as np
+
+from backplane.address_map import TRACE_RECORD_SIZE
+from backplane.ring import Ring
+from backplane.segment import Segment
+from backplane.words import Block
+
+RECORD = np.dtype(
+    [
+        ("tick", "i8"),  # release, in ticks
+        ("release_ns", "i8"),  # the grid point of that tick, CLOCK_MONOTONIC
+        ("start_ns", "i8"),
+        ("read_ns", "i8"),  # commands, statuses, plan read
+        ("process_ns", "i8"),  # process done
+        ("end_ns", "i8"),  # commands, statuses written
+        ("flags", "i8"),  # Flag
+        ("state", "i8"),  # state of the level
+    ]
+)
+FIELDS = tuple(RECORD.names or ())
+
+
+class Flag(IntFlag):
+    """What a cycle's record says besides its times."""
+
+    MISSED = 1  # ended behind its deadline, or a message came too late
+    SKIPPED = 2  # releases were skipped just before this one
+    BUS_ERROR = 4  # an access was cut off by its bound
+    CORRUPT = 8  # a message failed its CRC
+    PLANNED = 16  # the record of a planner's cycle that made a plan
+
+
+class TraceWriter:
+    """The writing end of a task's trace ring: fill `record`, in the order of `RECORD`, and call `write`."""
+
+    def __init__(self, segment: Segment, task: str) -> None:
+        spec = segment.layout.task(task)
+        self._block = segment.block(task)
+        start = segment.map.traces[task] // 8
+        stride = TRACE_RECORD_SIZE // 8
+        self._slots = [segment.words[start + i * stride : start + (i + 1) * stride] for i in range(spec.depth)]
+        self._mask = spec.depth - 1
+        self._count = self._block[Block.TRACE_HEAD]
+        self.record = memoryview(bytearray(TRACE_RECORD_SIZE)).cast("q")
+
+    def write(self) -> None:
+        """Append the record."""
+        self._count += 1
+        self._slots[self._count & self._mask][:] = self.record
+        self._block[16] = self._count  # Block.TRACE_HEAD
+
+
+def trace_ring(segment: Segment, task: str) -> Ring:
+    """Return the reading end of a task's trace ring; its rows are of dtype `RECORD`."""
+    spec = segment.layout.task(task)
+    head = segment.block(task)[Block.TRACE_HEAD : Block.TRACE_HEAD + 1]
+    return Ring(segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE), RECORD, head)

@@ -1,0 +1,109 @@
+"""The shared words: every number on the backplane that is not in a message, by name.
+
+Each is an aligned 64-bit integer with one writer, stored and loaded at once through a memoryview
+cast to 'q' ('struct' packs byte by byte, so a reader could see half a number).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Head(IntEnum):
+    """Words at the head of the segment, written once by the Rack."""
+
+    MAGIC = 0
+    VERSION = 1
+    SIZE = 2
+    LAUNCHER_PID = 3
+    LAUNCHER_START = 4  # start time of that process, in kernel clock ticks since boot
+    CREATED_NS = 5  # CLOCK_REALTIME
+    LAYOUT_AT = 6
+    LAYOUT_SIZE = 7
+    CONFIG_AT = 8
+    CONFIG_SIZE = 9
+
+
+class System(IntEnum):
+    """Words of the system clock and the utility lines, behind the head's."""
+
+    STATE = 32  # Run
+    TICK = 33
+    EPOCH_NS = 34  # CLOCK_MONOTONIC of tick 0
+    PERIOD_NS = 35  # wall-clock time from tick to tick: the clock's period over the speed factor
+    LOCKSTEP = 36
+    STOP_REQUEST = 37  # written by the host
+    STOP_TICK = 38  # first tick that does not happen; 0: not known
+    CLOCK_SKIPPED = 39  # ticks that the clock itself left out
+    FOLLOWER_PID = 40  # a recorder for which lockstep waits; 0: none
+    FOLLOWER_TICK = 41  # everything up to here is recorded
+    SYSRESET = 48
+    ACFAIL = 49
+    EMERGENCY_STOP = 50
+    SYSFAIL = 64  # one word a slot, 22 of them: 1 until the board's self-test has passed
+
+
+class Run(IntEnum):
+    """Values of `System.STATE`."""
+
+    STARTING = 0
+    RUNNING = 1
+    STOPPED = 2
+
+
+class Block(IntEnum):
+    """Words of a task's control block. RELEASED is the clock's, all others the task's."""
+
+    RELEASED = 0  # newest release, as a tick; -1: none yet
+    DEADLINE = 1  # tick before which that cycle, or plan, must be finished
+    DONE = 2  # newest release that is finished; -1: none yet
+    PID = 3
+    STATE = 4  # TaskState
+    CYCLES = 5
+    MISSED = 6
+    SKIPPED = 7
+    PRIORITY = 8  # SCHED_FIFO priority obtained; 0: ordinary scheduling
+    CORE = 9
+    READS = 10
+    READ_BYTES = 11
+    WRITES = 12
+    WRITE_BYTES = 13
+    CORRUPT = 14  # messages that failed their CRC
+    BUS_ERRORS = 15  # accesses that their bound cut off
+    TRACE_HEAD = 16  # trace records written
+    LEVEL_STATE = 17  # state of the level, as in its status
+    PLANS = 18  # plans made
+
+
+class TaskState(IntEnum):
+    """Values of `Block.STATE`."""
+
+    ABSENT = 0
+    STARTING = 1
+    READY = 2
+    RUNNING = 3
+    ENDED = 4
+    FAILED = 5
+
+
+class Box(IntEnum):
+    """Words at the head of a mailbox."""
+
+    HEAD = 0  # serial of the newest whole message; 0: none
+    EPOCH = 1  # counts the writers that have claimed the mailbox
+    WRITER_PID = 2
+    LOCK_HOLDER = 3  # pid in the critical section, protocol lock
+
+
+class Slot(IntEnum):
+    """Words in front of every message in its slot. The chain covers SERIAL to the end of the message,
+    the CRC also BASIS and EPOCH; the time stamp is in neither, so that equal runs have equal chains."""
+
+    STAMP_NS = 0
+    CRC = 1
+    EPOCH = 2
+    BASIS = 3
+    SERIAL = 4
+    TICK = 5
+    VISIBLE_AT = 6
+    CHAIN = 7

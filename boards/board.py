@@ -1,0 +1,83 @@
+"""A board: one process on one core, from its power-on to the end of the run."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Callable
+
+from backplane.errors import BackplaneError
+from backplane.lines import UtilityLines
+from backplane.segment import Segment
+from backplane.words import Block, TaskState
+from boards.clock_board import ClockWiring, run_clock
+from boards.executor_task import ExecutorTask
+from boards.planner_task import PlannerTask
+from boards.processor import die_with_parent, name_process, set_priority, take_processor
+from boards.wiring import TaskWiring
+from levels.errors import LevelError
+from levels.level import Executor, Planner
+
+SELF_TEST_FAILED = 3
+"""Exit status of a board whose start-up test failed."""
+
+
+def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
+    """Run `board` in the forked child of the crate; return its exit status."""
+    die_with_parent(crate)
+    name_process(f"{segment.rack}:{name}")
+    try:
+        return board(segment)
+    except (BackplaneError, LevelError) as error:
+        print(f"board '{name}': {error}", file=sys.stderr, flush=True)
+        return SELF_TEST_FAILED
+    except Exception:
+        print(f"board '{name}' failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+        return 1
+
+
+def run_task_board(segment: Segment, wiring: TaskWiring, ready: int) -> int:
+    """Build a task's level, test it, take the processor, and cycle until the run is over.
+
+    `ready` is an eventfd that counts the boards whose self-test has passed.
+    """
+    spec = segment.layout.task(wiring.task)
+    block = segment.block(wiring.task)
+    block[Block.PID] = os.getpid()
+    block[Block.STATE] = TaskState.STARTING
+    level = load(wiring.target)(wiring.context)
+    try:
+        level.self_test()
+        UtilityLines(segment).release_sysfail(spec.slot)
+        processor = take_processor(spec)
+        block[Block.CORE], block[Block.PRIORITY] = processor.core, processor.priority
+        kind = ExecutorTask if isinstance(level, Executor) else PlannerTask
+        task = kind(segment, wiring, level)
+        block[Block.STATE] = TaskState.READY
+        os.eventfd_write(ready, 1)
+        task.run()
+    except BaseException:
+        block[Block.STATE] = TaskState.FAILED
+        raise
+    finally:
+        # Ordinary scheduling for what is left: closing files must not hold up another board's cycle.
+        set_priority(0)
+        level.close()
+    block[Block.STATE] = TaskState.ENDED
+    return 0
+
+
+def run_clock_board(segment: Segment, wiring: ClockWiring) -> int:
+    """Take the processor and run the system clock."""
+    os.sched_setaffinity(0, {wiring.core})
+    set_priority(wiring.priority)
+    run_clock(segment, wiring)
+    return 0
+
+
+def load(target: str) -> type[Executor] | type[Planner]:
+    """Return the class that "package.module:Class" names; the config has checked that it is there."""
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)

@@ -1,0 +1,29 @@
+"""The sizes of messages that follow from the arm and its cell, built once in a process."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from boards.config.schema import RackConfig
+from boards.errors import Mistake
+from levels.errors import RobotError
+from levels.robot import RobotConfig
+from levels.scene import SceneConfig
+
+
+def cell_sizes(config: RackConfig, mistakes: list[Mistake]) -> dict[str, int]:
+    """Return the symbolic sizes by name, none without an arm; add what is wrong with the cell to `mistakes`."""
+    if config.robot is None:
+        return {}
+    try:
+        return dict(_sizes(config.robot, config.scene, config.clock_ns))
+    except RobotError as error:
+        mistakes.append(Mistake("robot", None, str(error)))
+        return {}
+
+
+@lru_cache(maxsize=4)
+def _sizes(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[tuple[str, int], ...]:
+    from levels.cell import build_cell, sizes  # MuJoCo takes half a second to import: only who has an arm pays
+
+    return tuple(sizes(build_cell(robot, scene, clock_ns)).items())

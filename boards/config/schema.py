@@ -1,0 +1,106 @@
+"""The tables of a rack's config: every field with its unit, range and meaning.
+
+`[robot]` and `[scene]` are of `levels.robot` and `levels.scene`; `[task]` is the task level's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints
+
+from backplane.clock import ticks_of
+from backplane.layout import Protocol
+from boards.config.text import to_toml
+from levels.robot import Positive, RobotConfig, Table
+from levels.scene import SceneConfig
+
+CLOCK_SLOT = 1
+"""Slot of the system controller, as on VME."""
+LAST_SLOT = 21
+
+Coupling = Literal["tight", "loose", "none"]
+Mode = Literal["realtime", "lockstep"]
+Wake = Literal["signal", "poll"]
+
+RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
+ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
+MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
+Slot = Annotated[int, Field(gt=CLOCK_SLOT, le=LAST_SLOT)]
+Core = Annotated[int, Field(ge=0, le=1023)]
+Priority = Annotated[int, Field(ge=0, le=99)]
+
+
+class ClockConfig(Table):
+    """`[clock]`: the system clock and its board, the system controller in slot 1."""
+
+    period_ms: float = Field(gt=0, le=1000, allow_inf_nan=False, description="one tick, ms, in whole ns")
+    mode: Mode = Field("realtime", description="ticks by time, or lockstep: as soon as every task has finished")
+    speed: Positive = Field(1.0, description="real time runs this many times faster than simulated time")
+    wake: Wake = Field("signal", description="how boards wait for their cycle: a semaphore each, or busy-waiting")
+    core: Core = Field(0, description="core of the system controller")
+    priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
+
+
+class ProtocolConfig(Table):
+    """`[protocol]`: how mailboxes are shared."""
+
+    default: Protocol = Field("time-slice", description="protocol of every mailbox not named below")
+    mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
+
+
+class BoardConfig(Table):
+    """`[board.<name>]`: one processor of the rack, its level, and how that is wired."""
+
+    slot: Slot = Field(description="slot in the crate, 2 to 21; slot 1 is the clock's")
+    core: Core = Field(0, description="core that the board is pinned to; cores the machine lacks are shared out")
+    rate_hz: Positive | None = Field(None, description="rate of the executor, Hz; must divide the clock's")
+    every: int | None = Field(None, ge=1, description="instead of rate_hz: period of the executor, ticks")
+    priority: Priority = Field(0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling")
+    wake: Wake | None = Field(None, description="how this board waits for its cycle; default: clock.wake")
+    above: str | None = Field(None, description="board of the level above, whose commands are read")
+    below: str | None = Field(None, description="board of the level below, whose status is read")
+    executor: ClassName = Field(description="class of the executor, package.module:Class")
+    planner: ClassName | None = Field(None, description="class of the planner, package.module:Class")
+    coupling: Coupling = Field("none", description="planner on this board (tight), on its own (loose), or none")
+    within_cycles: int = Field(1, ge=1, le=10_000, description="cycles that one plan may take")
+    planner_slot: Slot | None = Field(None, description="slot of a loosely coupled planner, 2 to 21")
+    planner_core: Core | None = Field(None, description="core of a loosely coupled planner")
+    planner_priority: Priority = Field(0, description="SCHED_FIFO priority of the planner; 0: ordinary scheduling")
+    reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the executor, where not the level's own")
+    planner_reads: dict[str, MailboxName] = Field({}, description="the same for the planner")
+    params: dict[str, Any] = Field({}, description="parameters of the level, by name")
+    ends_run: bool = Field(False, description="the run ends when this level's status says done or error")
+
+
+class RackConfig(Table):
+    """A rack, resolved: everything that a run depends on."""
+
+    name: RackName = Field(description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40")
+    seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of everything random")
+    python_path: tuple[Path, ...] = Field(
+        (), description="folders of your own levels, for import; relative to the file"
+    )
+    clock: ClockConfig = Field(description="the system clock")
+    protocol: ProtocolConfig = Field(ProtocolConfig(), description="how mailboxes are shared")
+    robot: RobotConfig | None = Field(None, description="the arm; a rack without one has levels that need none")
+    scene: SceneConfig = Field(SceneConfig(), description="what stands in the cell besides the arm")
+    task: dict[str, Any] = Field({}, description="program of the task level")
+    board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
+
+    @property
+    def clock_ns(self) -> int:
+        """One tick, in ns of simulated time."""
+        return round(self.clock.period_ms * 1e6)
+
+    def every(self, board: str) -> int:
+        """Return the period of a board's executor, in ticks. Raises `ClockError` when off the grid."""
+        config = self.board[board]
+        if config.every is not None:
+            return config.every
+        return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
+
+    def text(self) -> str:
+        """Return the config as TOML that loads again with the same meaning, by itself."""
+        return to_toml(self.model_dump(mode="json", exclude_none=True))

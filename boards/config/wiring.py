@@ -1,0 +1,149 @@
+"""From config to layout: every mailbox and every task of a rack, as plain data for its segment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from backplane.errors import MailboxError
+from backplane.layout import Layout, MailboxSpec, TaskSpec, depth_for
+from backplane.message import MessageType
+from boards.config.cell import cell_sizes
+from boards.config.cores import obtained_core
+from boards.config.fields import field_specs
+from boards.config.ports import TaskPorts, all_ports
+from boards.config.rules import mistakes_in
+from boards.config.schema import BoardConfig, RackConfig
+from boards.errors import ConfigError, Mistake
+
+HISTORY_S = 2.0
+"""Simulated time that mailboxes and trace rings keep for a recorder: real-time boards may starve it for 1 s."""
+
+
+def wire(config: RackConfig) -> Layout:
+    """Return the layout of a rack. Raises `ConfigError` with every mistake."""
+    mistakes = mistakes_in(config)
+    wiring = Wiring(config)
+    mistakes += wiring.mistakes
+    sizes = {} if mistakes else cell_sizes(config, mistakes)
+    if not mistakes:
+        mistakes += wiring.check_sizes(sizes)
+    if mistakes:
+        raise ConfigError(mistakes)
+    return wiring.layout(sizes)
+
+
+class Wiring:
+    """The ports of all tasks brought together: who writes each mailbox, and who reads it."""
+
+    def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
+        self.config = config
+        self.mistakes: list[Mistake] = []
+        self._tasks = all_ports(config, self.mistakes)
+        # Mailboxes of a board that has mistakes of its own cannot be told: no mistake follows from that.
+        found = {ports.task for ports in self._tasks}
+        lacking = {name for name, board in config.board.items() if name not in found}
+        lacking |= {n for n, b in config.board.items() if b.planner is not None and f"{n}.planner" not in found}
+        self._untold = lacking | {place.removeprefix("board.") for place in broken}
+        self._writers: dict[str, tuple[TaskPorts, MessageType]] = {}
+        for ports in self._tasks:
+            self._add_writer(ports)
+        for ports in self._tasks:
+            self._check_reads(ports)
+        self._check_rest()
+
+    def _add_writer(self, ports: TaskPorts) -> None:
+        for port, mailbox in ports.writes.items():
+            if mailbox in self._writers:
+                first = self._writers[mailbox][0].task
+                self.mistakes.append(Mistake(f"mailbox {mailbox}", ports.task, f"has a writer already: {first}"))
+            else:
+                self._writers[mailbox] = ports, ports.outputs[port]
+
+    def _check_reads(self, ports: TaskPorts) -> None:
+        key = "reads" if ports.role == "executor" else "planner_reads"
+        for port, mailbox in ports.reads.items():
+            place, wanted = f"board.{ports.board}.{key}.{port}", ports.inputs[port]
+            if mailbox not in self._writers:
+                if mailbox.partition(".")[0] not in self._untold:
+                    self.mistakes.append(Mistake(place, mailbox, f"nobody writes it; mailboxes: {self._names()}"))
+            elif (found := self._writers[mailbox][1]) != wanted:
+                why = f"carries {found.name} {found.version}; the port wants {wanted.name} {wanted.version}"
+                self.mistakes.append(Mistake(place, mailbox, why))
+
+    def _check_rest(self) -> None:
+        for mailbox in self.config.protocol.mailbox:
+            if mailbox not in self._writers and mailbox.partition(".")[0] not in self._untold:
+                self.mistakes.append(
+                    Mistake(f"protocol.mailbox.{mailbox}", None, f"no such mailbox; mailboxes: {self._names()}")
+                )
+        for name, board in self.config.board.items():
+            if board.ends_run and name not in self._untold and f"{name}.status" not in self._writers:
+                self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
+
+    def _names(self) -> str:
+        return ", ".join(self._writers)
+
+    def check_sizes(self, sizes: Mapping[str, int]) -> list[Mistake]:
+        """Return a mistake for every message with a size that the rack does not know."""
+        found = []
+        for mailbox, (ports, kind) in self._writers.items():
+            try:
+                kind.dtype(sizes)
+            except MailboxError as error:
+                found.append(Mistake(f"mailbox {mailbox}", ports.task, str(error)))
+        return found
+
+    def layout(self, sizes: Mapping[str, int]) -> Layout:
+        """Return the layout; there are no mistakes."""
+        tasks = tuple(self._task(ports) for ports in self._tasks)
+        by_name = {task.name: task for task in tasks}
+        mailboxes = tuple(self._mailbox(mailbox, by_name, sizes) for mailbox in self._writers)
+        return Layout(self.config.name, self.config.clock_ns, tasks, mailboxes)
+
+    def _task(self, ports: TaskPorts) -> TaskSpec:
+        board, every = self.config.board[ports.board], self.config.every(ports.board)
+        slot, core, priority = _place(board) if ports.role == "planner" else (board.slot, board.core, board.priority)
+        return TaskSpec(
+            name=ports.task,
+            board=ports.board,
+            role=ports.role,
+            slot=slot,
+            core=obtained_core(core),
+            priority=priority,
+            every=every,
+            within_cycles=board.within_cycles if ports.role == "planner" else 1,
+            depth=depth_for(self._history_ticks, every),
+        )
+
+    @property
+    def _history_ticks(self) -> int:
+        return round(HISTORY_S * 1e9 / self.config.clock_ns)
+
+    def _mailbox(self, name: str, tasks: Mapping[str, TaskSpec], sizes: Mapping[str, int]) -> MailboxSpec:
+        ports, kind = self._writers[name]
+        writer = tasks[ports.task]
+        readers = [tasks[t.task] for t in self._tasks if name in t.reads.values()]
+        delay = writer.every * writer.within_cycles
+        # A reader may still read, at the end of its own slice, what was visible at its start.
+        slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
+        protocol = self.config.protocol
+        return MailboxSpec(
+            name=name,
+            writer=writer.name,
+            readers=tuple(reader.name for reader in readers),
+            protocol=protocol.mailbox.get(name, protocol.default),
+            every=writer.every,
+            delay=delay,
+            depth=depth_for(max(slowest + delay, self._history_ticks), writer.every),
+            message=kind.name,
+            version=kind.version,
+            size=kind.dtype(sizes).itemsize,
+            fields=field_specs(kind, sizes),
+        )
+
+
+def _place(board: BoardConfig) -> tuple[int, int, int]:
+    """Return slot, core and priority of a board's planner."""
+    slot = board.slot if board.planner_slot is None else board.planner_slot
+    core = board.core if board.planner_core is None else board.planner_core
+    return slot, core, board.planner_priority

@@ -1,0 +1,133 @@
+"""The crate: one small process that imports what the boards need, then forks every board from itself.
+
+Importing numpy, MuJoCo and the planning libraries takes a second; forked boards share it. The crate stays
+single-threaded, so that forking is safe at any time, and it is the boards' parent: it reaps them, and the
+kernel kills them should it end. Started by the Rack as
+`python -m boards.crate LINE READY`: descriptors of the line and of the eventfd on which boards report ready.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from backplane import semaphores
+from backplane.segment import Segment
+from boards.board import enter, run_clock_board, run_task_board
+from boards.channel import Channel
+from boards.clock_board import ClockWiring
+from boards.crate_messages import Ended, Forked, Open, Opened, PowerOff, PowerOn, Preload
+from boards.wiring import TaskWiring
+
+LEAVE_S = 0.5
+"""Time that boards get to end by themselves when the launcher is gone."""
+
+
+class Crate:
+    """The boards' parent. Lives until the Rack closes the line."""
+
+    def __init__(self, line: Channel, ready: int) -> None:
+        self._line = line
+        self._ready = ready
+        self._segment: Segment | None = None
+        self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
+        self._poll = select.poll()
+        self._poll.register(line, select.POLLIN)
+
+    def run(self) -> None:
+        """Serve the Rack until it is gone, then see that no board is left."""
+        while True:
+            for fd, _ in self._poll.poll():
+                if fd in self._boards:
+                    self._reap(fd)
+                elif (request := self._line.receive()) is None:
+                    self._leave()
+                    return
+                else:
+                    self._serve(request)
+
+    def _serve(self, request: object) -> None:
+        match request:
+            case Preload(modules, path):
+                sys.path[:] = path
+                for name in modules:
+                    # A module that does not import is the config's mistake, reported by the Rack.
+                    with suppress(Exception):
+                        importlib.import_module(name)
+                gc.collect()
+                gc.freeze()
+            case Open(rack):
+                self._segment = Segment.attach(rack)
+                semaphores.open_all(self._segment.layout)
+                self._line.send(Opened())
+            case PowerOn(name, TaskWiring() as wiring):
+                self._fork(name, lambda segment: run_task_board(segment, wiring, self._ready))
+            case PowerOn(name, ClockWiring() as wiring):
+                self._fork(name, lambda segment: run_clock_board(segment, wiring))
+            case PowerOff():
+                self._kill()
+
+    def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
+        assert self._segment is not None, "the Rack opens the segment first"
+        crate = os.getpid()
+        pid = os.fork()
+        if pid == 0:
+            self._line.socket.close()
+            # No way out of the child but this one: the crate's own code must not run twice.
+            status = 70
+            try:
+                status = enter(crate, name, self._segment, board)
+            finally:
+                os._exit(status)
+        pidfd = os.pidfd_open(pid)
+        self._boards[pidfd] = name, pid
+        self._poll.register(pidfd, select.POLLIN)
+        self._line.send(Forked(name, pid))
+
+    def _reap(self, pidfd: int) -> None:
+        name, pid = self._boards.pop(pidfd)
+        self._poll.unregister(pidfd)
+        os.close(pidfd)
+        _, status = os.waitpid(pid, 0)
+        try:
+            self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status)))
+        except OSError:
+            return
+
+    def _kill(self) -> None:
+        for pidfd in self._boards:
+            signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+
+    def _leave(self) -> None:
+        """The Rack is gone: the boards see it and end; what has not ended in time is killed."""
+        self._poll.unregister(self._line)
+        deadline = time.monotonic() + LEAVE_S
+        while self._boards and (left := deadline - time.monotonic()) > 0:
+            self._reap_ended(int(left * 1000) + 1)
+        self._kill()
+        while self._boards:
+            self._reap_ended(None)
+
+    def _reap_ended(self, timeout_ms: int | None) -> None:
+        for pidfd, _ in self._poll.poll(timeout_ms):
+            self._reap(pidfd)
+
+
+def main() -> None:
+    """Serve as the crate of the Rack at the other end of the inherited socket."""
+    # Ctrl-C reaches the whole foreground group; how the run ends is the Rack's decision.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    line, ready = (int(fd) for fd in sys.argv[1:])
+    Crate(Channel(socket.socket(fileno=line)), ready).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""The Rack's end of the crate: starts it, and hears from it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+from boards.channel import Channel
+
+PROJECT = Path(__file__).resolve().parent.parent
+SINGLE_THREADED = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+"""The crate must not have threads when it forks, and a board's mathematics belong on its own core."""
+
+
+class CrateLine:
+    """A running crate: its line, its eventfd of ready boards, and what its boards print."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self.ready = os.eventfd(0, os.EFD_NONBLOCK)
+        # A file in memory: a board that prints never waits for a reader.
+        self._printed = os.memfd_create("boards")
+        self._read_to = 0
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "boards.crate", str(theirs.fileno()), str(self.ready)],
+            pass_fds=(theirs.fileno(), self.ready),
+            stdin=subprocess.DEVNULL,
+            stdout=self._printed,
+            stderr=self._printed,
+            env={**os.environ, **SINGLE_THREADED, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])},
+        )
+        theirs.close()
+        self.line = Channel(ours)
+
+    @property
+    def pid(self) -> int:
+        """Process id of the crate."""
+        return self._process.pid
+
+    def printed(self) -> list[str]:
+        """Return the lines that boards have printed since the last call."""
+        data = os.pread(self._printed, 1 << 20, self._read_to)
+        whole = data[: data.rfind(b"\n") + 1]
+        self._read_to += len(whole)
+        return whole.decode(errors="replace").splitlines()
+
+    def close(self, timeout_s: float) -> None:
+        """Close the line, whereupon the crate ends its boards and itself; kill it should it not."""
+        self.line.socket.close()
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self.ready)
+        os.close(self._printed)

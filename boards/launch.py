@@ -1,0 +1,102 @@
+"""What a launch needs to know, worked out from the config before any board starts."""
+
+from __future__ import annotations
+
+
+from dataclasses import dataclass
+
+from backplane.layout import Layout
+from backplane.message import State
+from backplane.protocols import open_reader
+from backplane.segment import Segment
+from backplane.words import Block
+from boards.clock_board import ClockWiring
+from boards.config import context, shared_out, wire
+from boards.config.cores import obtained_core
+from boards.config.ports import TaskPorts, all_ports
+from boards.config.schema import RackConfig
+from boards.outcome import Cause
+from boards.wiring import TaskWiring
+
+LINGER_S = 0.5
+"""Simulated time that a run goes on behind the task's end: the arm is seen at rest."""
+HISTORY_S = 1.0
+"""Simulated time by which lockstep may be ahead of a recorder: half of what the rings hold."""
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A config, wired: the layout, and every task with its ports."""
+
+    config: RackConfig
+    layout: Layout
+    tasks: tuple[TaskWiring, ...]
+
+    @classmethod
+    def of(cls, config: RackConfig) -> Launch:
+        """Wire a config. Raises `ConfigError` with every mistake."""
+        layout = wire(config)
+        tasks = tuple(_task(config, layout, ports) for ports in all_ports(config, []))
+        return cls(config, layout, tasks)
+
+    def clock(self, seconds: float | None) -> ClockWiring:
+        """Return how the run goes in time; it lasts `seconds` of simulated time, or until the task ends."""
+        clock, tick_ns = self.config.clock, self.config.clock_ns
+        return ClockWiring(
+            lockstep=clock.mode == "lockstep",
+            period_ns=round(tick_ns / clock.speed),
+            stop_tick=0 if seconds is None else max(1, round(seconds * 1e9 / tick_ns)),
+            ends_run=self.ends_run,
+            linger=round(LINGER_S * 1e9 / tick_ns),
+            history=round(HISTORY_S * 1e9 / tick_ns),
+            core=obtained_core(clock.core),
+            priority=clock.priority,
+        )
+
+    @property
+    def ends_run(self) -> str | None:
+        """The status mailbox whose state ends the run; None when no level does."""
+        return next((f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None)
+
+    def final_state(self, segment: Segment) -> tuple[str, str]:
+        """Return state and reason of the level that ends the run, as last written."""
+        if self.ends_run is None:
+            return "", ""
+        status = open_reader(segment, self.ends_run).peek()
+        if not status.is_there:
+            return State.IDLE.name.lower(), ""
+        return State(status.value.state).name.lower(), status.value.reason
+
+    def cause_of(self, state: str) -> Cause:
+        """Return why a run ended that nothing stopped from outside."""
+        ends: dict[str, Cause] = {State.DONE.name.lower(): "task done", State.ERROR.name.lower(): "task refused"}
+        return ends.get(state, "time over")
+
+    def notes(self, segment: Segment) -> list[str]:
+        """Return what the launch must say: cores shared out, real-time priority refused."""
+        refused = [t.name for t in self.layout.tasks if t.priority and not segment.block(t.name)[Block.PRIORITY]]
+        notes = shared_out(self.config)
+        if refused:
+            notes.append(f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}; misses are likely")
+        return notes
+
+
+def modules(config: RackConfig) -> tuple[str, ...]:
+    """Return the modules of all levels, for the crate to import while the config is being checked."""
+    targets = [t for board in config.board.values() for t in (board.executor, board.planner) if t]
+    return tuple(dict.fromkeys(target.partition(":")[0] for target in targets))
+
+
+def _task(config: RackConfig, layout: Layout, ports: TaskPorts) -> TaskWiring:
+    board, spec = config.board[ports.board], layout.task(ports.task)
+    tight = spec.role == "planner" and board.coupling == "tight"
+    locked = layout.mailbox(f"{ports.board}.plan").protocol == "lock" if tight else False
+    return TaskWiring(
+        task=ports.task,
+        target=f"{ports.kind.__module__}:{ports.kind.__qualname__}",
+        inputs=dict(ports.reads),
+        outputs=dict(ports.writes),
+        context=context(config, ports.board),
+        poll=(board.wake or config.clock.wake) == "poll" and spec.role == "executor",
+        critical_priority=board.priority if locked else 0,
+    )

@@ -1,0 +1,64 @@
+"""The planner section of the paper's algorithm: plans in the background, within its cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from time import monotonic_ns
+
+from backplane.segment import Segment
+from backplane.words import Block
+from boards.processor import set_priority
+from boards.task import Task
+from boards.wiring import TaskWiring
+from levels.level import Planner
+
+
+class PlannerTask(Task):
+    """Runs a level's planner: asks every cycle whether a plan is wanted, and gives each plan its cycles."""
+
+    def __init__(self, segment: Segment, wiring: TaskWiring, planner: Planner) -> None:
+        super().__init__(segment, wiring)
+        self.planner = planner
+        self.slice = self.spec.every * self.spec.within_cycles
+        self._critical_priority = wiring.critical_priority
+        self._priority = self.block[Block.PRIORITY]
+
+    def cycle(self, tick: int) -> None:
+        """Read what the plan rests on; plan when one is wanted; write the plan."""
+        start = monotonic_ns()
+        self.inputs.read(tick)
+        read = monotonic_ns()
+        if not self.planner.wanted(self.inputs.values, tick):
+            self._pass(tick)
+            return
+        # From here the time slice is the plan's: the clock releases nothing until its end.
+        self.next_cycle.hold_until(tick + self.slice)
+        self.block[Block.DEADLINE] = tick + self.slice
+        self.tell_clock()
+        self.planner.plan(self.inputs.values, self.outputs.messages.plan, tick)
+        processed = monotonic_ns()
+        with self._critical_section():
+            in_time = self.outputs.write(tick, self.clock.now(), self.inputs)
+        self.block[Block.PLANS] += 1
+        self.finish(tick, start, read, processed, tick + self.slice, in_time)
+
+    def _pass(self, tick: int) -> None:
+        """Let a release go by without a plan. A decision that comes too late counts as a miss."""
+        block = self.block
+        block[Block.CYCLES] += 1
+        block[Block.SKIPPED] += self.next_cycle.skipped
+        block[Block.MISSED] += self.clock.now() >= tick + self.spec.every
+        block[Block.DONE] = tick
+        self.tell_clock()
+
+    @contextmanager
+    def _critical_section(self) -> Iterator[None]:
+        """Update the plan without being preempted by the executor: at its priority, for that long."""
+        if self._critical_priority:
+            set_priority(self._critical_priority)
+        try:
+            yield
+        finally:
+            if self._critical_priority:
+                set_priority(self._priority)

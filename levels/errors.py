@@ -1,0 +1,30 @@
+"""The exception tree of the levels, and where each one shows.
+
+`LevelError` is the root.
+
+- `RobotError`: an MJCF file that is missing or malformed, joints or sites that the model lacks.
+- `ProgramError`: a task program that names an unknown object, verb or place.
+- `Refused`: a command that cannot be carried out; a planner turns it into a status with its code and reason.
+"""
+
+from __future__ import annotations
+
+
+class LevelError(Exception):
+    """Root of every error this package raises; its text is one line for the user."""
+
+
+class RobotError(LevelError):
+    """A robot or a cell that cannot be built from its description."""
+
+
+class ProgramError(LevelError):
+    """A task program that cannot be understood."""
+
+
+class Refused(LevelError):
+    """A command that cannot be carried out: `code` is one of `levels.messages.Error`."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code = int(code)

@@ -1,0 +1,115 @@
+"""A level: an executor every cycle and a planner in the background (fig. 1).
+
+The author of a level writes `process` and `plan`; pinning, timing, tracing, mailboxes and faults
+stay outside, in the board that runs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, ClassVar, NamedTuple
+
+from backplane.mailbox import Reading, Verdict
+from backplane.message import Message, MessageType
+from levels.robot import RobotConfig
+from levels.scene import SceneConfig
+
+__all__ = ["Executor", "Input", "LevelContext", "Planner", "Ports", "Reading", "Verdict"]
+
+
+class Input(NamedTuple):
+    """A port that a level reads.
+
+    `source` is a mailbox ("world.model"), or is relative to the level: "above.command",
+    "below.status", "own.plan". A config may wire the port elsewhere.
+    """
+
+    type: MessageType
+    source: str
+
+
+class Ports(SimpleNamespace):
+    """The ports of one cycle by name: `Reading`s for inputs, `Message`s for outputs."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"no port '{name}'; ports: {', '.join(sorted(self.__dict__))}")
+
+
+@dataclass(frozen=True)
+class LevelContext:
+    """What a level knows of its rack, from the config. Times are ticks of the system clock."""
+
+    board: str
+    every: int
+    within_cycles: int
+    clock_ns: int
+    seed: int
+    robot: RobotConfig
+    scene: SceneConfig
+    task: Mapping[str, Any]
+    sizes: Mapping[str, int]
+    periods: Mapping[str, int]
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def period_s(self) -> float:
+        """The level's cycle, in s."""
+        return self.every * self.clock_ns * 1e-9
+
+    @property
+    def tick_s(self) -> float:
+        """One tick of the system clock, in s."""
+        return self.clock_ns * 1e-9
+
+
+class Executor:
+    """The foreground of a level: runs every cycle, at high priority, in bounded time.
+
+    Subclasses name their ports and write `process`. Output messages keep their values from cycle to
+    cycle; each is written to its mailbox `<board>.<port>` at the end of every cycle.
+    """
+
+    inputs: ClassVar[Mapping[str, Input]] = {}
+    outputs: ClassVar[Mapping[str, MessageType]] = {}
+
+    def __init__(self, context: LevelContext) -> None:
+        self.context = context
+
+    def self_test(self) -> None:
+        """Raise `LevelError` when the level must not start; the board then holds SYSFAIL."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Release what the level holds; called once, after the last cycle."""
+
+
+class Planner:
+    """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
+
+    A planner has one output, `plan`, its mailbox `<board>.plan`.
+    """
+
+    inputs: ClassVar[Mapping[str, Input]] = {}
+    output: ClassVar[MessageType]
+
+    def __init__(self, context: LevelContext) -> None:
+        self.context = context
+
+    def self_test(self) -> None:
+        """Raise `LevelError` when the level must not start; the board then holds SYSFAIL."""
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Say, in well under a cycle, whether a plan is wanted now. Default: a command is new."""
+        return bool(read.command.is_new)
+
+    def plan(self, read: Ports, write: Message, tick: int) -> None:
+        """Make one plan into `write`. It takes effect `within_cycles` cycles after `tick`."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Release what the planner holds; called once, after the last plan."""

@@ -1,0 +1,264 @@
+"""The messages of the default rack: commands go down, statuses come up, plans stay within a level.
+
+Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (MuJoCo's
+integration state). Quaternions are w, x, y, z. Poses are of the world frame.
+Simulated time is tick times the clock's period.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from backplane.message import Field, MessageType, command, status
+
+WINDOW = 4
+"""Elemental moves that the task level hands down at once: the next level never waits for a cycle above it."""
+SEGMENTS = 2
+"""Segments that the elemental move level hands down at once."""
+WAYPOINTS = 24
+"""Joint-space points of one path, at most."""
+MOVES = 96
+"""Elemental moves of one task program, at most."""
+SECTIONS_A_LINE = 8
+"""Sections of constant jerk for one line of a path and the corner behind it: seven change speed, one keeps it."""
+SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
+"""Sections of constant jerk of one trajectory, at most."""
+
+
+class Error(IntEnum):
+    """Error codes of the levels' statuses."""
+
+    NONE = 0
+    UNREACHABLE = 1
+    NO_PATH = 2
+    TOO_LATE = 3
+    GRASP_MISSED = 4
+    OBJECT_LOST = 5
+    FOLLOWING = 6
+    LIMIT = 7
+    SIMULATION = 8
+    BELOW = 9
+    TOUCHED = 10
+
+
+class Verb(IntEnum):
+    """What an elemental move does."""
+
+    NONE = 0
+    MOVE = 1  # free motion of the tool to a pose
+    MOVE_JOINTS = 2  # free motion to joint positions
+    APPROACH = 3  # straight motion; what is held or is about to be grasped may touch its support
+    GRASP = 4  # close the gripper on an object
+    DEPART = 5  # straight motion away; the same contacts are permitted
+    RELEASE = 6  # open the gripper
+
+
+class SegmentKind(IntEnum):
+    """What the primitive level is asked for."""
+
+    NONE = 0
+    PATH = 1
+    GRIPPER = 2
+
+
+ELEMENTAL_MOVE = MessageType(
+    "elemental_move",
+    1,
+    (
+        Field("id", "u4", "1", "serial of the move, rising by one from 1; 0: empty"),
+        Field("action", "u2", "1", "index of the program's action that it serves"),
+        Field("verb", "u1", "Verb", "what to do"),
+        Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
+        Field("position", "f8", "m", "tool position at the end", (3,)),
+        Field("quaternion", "f8", "1", "tool orientation at the end", (4,)),
+        Field("joints", "f8", "rad", "joint positions at the end, for MOVE_JOINTS; with `posture`, near the end", ("joints",)),
+        Field("posture", "u1", "1", "1: of the configurations at the pose, the one nearest to `joints` is wanted"),
+        Field("by", "f8", "s", "simulated time by which it must be done; 0: no such time"),
+    ),
+)
+
+TASK_PLAN = MessageType(
+    "task_plan",
+    1,
+    (
+        Field("id", "u4", "1", "serial of the plan"),
+        Field("error", "u2", "Error", "why the program is refused; 0: it is not"),
+        Field("reason", "S120", "ASCII", "the refusal, readable"),
+        Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
+        Field("count", "u2", "1", "moves that follow"),
+        Field("moves", ELEMENTAL_MOVE, "", "the program, decomposed", (MOVES,)),
+    ),
+)
+
+TASK_COMMAND = command(
+    "task_command",
+    1,
+    Field("count", "u2", "1", "moves that follow; id is the newest one's"),
+    Field("moves", ELEMENTAL_MOVE, "", "a window on the plan, oldest first", (WINDOW,)),
+)
+
+TASK_STATUS = status(
+    "task_status",
+    1,
+    Field("action", "u2", "1", "actions done"),
+    Field("actions", "u2", "1", "actions of the program"),
+    Field("moves_done", "u2", "1", "elemental moves done"),
+    Field("moves", "u2", "1", "elemental moves of the plan; 0 before there is one"),
+)
+
+MOVE_STATUS = status(
+    "move_status",
+    1,
+    Field("done", "u4", "1", "newest elemental move done; 0: none yet"),
+    Field("current", "u4", "1", "elemental move under way; 0: none"),
+    Field("verb", "u1", "Verb", "of the move under way"),
+    Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
+    Field("planned", "u4", "1", "newest elemental move whose path is at hand; 0: none yet"),
+    Field("end", "f8", "rad", "joint positions at the end of that path", ("joints",)),
+    Field("replan", "u4", "1", "serial of the open request to plan the current move anew from `start`; 0: none is open"),
+    Field("start", "f8", "rad", "joint positions where that motion holds", ("joints",)),
+    Field("replans", "u4", "1", "plans made anew because something was in the way"),
+)
+
+MOVE_PLAN = MessageType(
+    "move_plan",
+    1,
+    (
+        Field("move", "u4", "1", "elemental move that the plan serves"),
+        Field("replan", "u4", "1", "request that it answers; 0: the first plan of the move"),
+        Field("error", "u2", "Error", "why there is no plan; 0: there is"),
+        Field("reason", "S120", "ASCII", "the error, readable"),
+        Field("kind", "u1", "SegmentKind", "path or gripper"),
+        Field("count", "u2", "1", "waypoints that follow"),
+        Field("waypoints", "f8", "rad", "collision-free path in joint space", (WAYPOINTS, "joints")),
+        Field("blend", "f8", "rad", "length over which corner k is rounded, before and behind it", (WAYPOINTS,)),
+    ),
+)
+
+SEGMENT = MessageType(
+    "segment",
+    1,
+    (
+        Field("id", "u4", "1", "serial of the segment, rising by one from 1; 0: empty"),
+        Field("move", "u4", "1", "elemental move that it serves"),
+        Field("kind", "u1", "SegmentKind", "path or gripper"),
+        Field("object", "i2", "1", "object held, or to be grasped; -1: none"),
+        Field("touch", "u1", "1", "1: the object may touch supports and fingers (approach, depart)"),
+        Field("count", "u2", "1", "waypoints that follow"),
+        Field("waypoints", "f8", "rad", "path in joint space, first point where the motion starts", (WAYPOINTS, "joints")),
+        Field("blend", "f8", "rad", "length over which corner k is rounded", (WAYPOINTS,)),
+        Field("by", "f8", "s", "simulated time by which it must be done; 0: no such time"),
+        Field("opening", "f8", "m", "gripper joint position to go to, for GRIPPER"),
+        Field("force", "f8", "N", "largest gripper force on the way and afterwards"),
+    ),
+)
+
+MOVE_COMMAND = command(
+    "move_command",
+    1,
+    Field("hold", "u1", "1", "1: ramp to rest on the path and stay"),
+    Field("count", "u2", "1", "segments that follow; id is the newest one's"),
+    Field("segments", SEGMENT, "", "segments to do, oldest first", (SEGMENTS,)),
+)
+
+PRIMITIVE_STATUS = status(
+    "primitive_status",
+    1,
+    Field("done", "u4", "1", "newest segment done; 0: none yet"),
+    Field("current", "u4", "1", "segment under way; 0: none"),
+    Field("progress", "f8", "1", "part of the segment's path behind, 0 to 1"),
+    Field("blocked", "u1", "1", "1: motion holds because something is in the way"),
+    Field("resting", "u1", "1", "1: commanded velocity is zero"),
+    Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
+    Field("opening", "f8", "m", "gripper joint position, measured"),
+    Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
+    Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
+    Field("ends", "f8", "s", "simulated time at which the segment under way should be done; 0: not known"),
+    Field("wants", "u4", "1", "segment for which the level wants a trajectory of its planner; 0: none"),
+    Field("begin", "f8", "rad", "path parameter at which that trajectory is to begin, from rest"),
+)
+
+TRAJECTORY = MessageType(
+    "trajectory",
+    1,
+    (
+        Field("segment", "u4", "1", "segment that it serves"),
+        Field("error", "u2", "Error", "why there is none; 0: there is"),
+        Field("reason", "S120", "ASCII", "the error, readable"),
+        Field("begin", "f8", "rad", "path parameter at which it begins"),
+        Field("duration", "f8", "s", "from rest to rest"),
+        Field("earliest", "f8", "s", "simulated time at which the segment could be done at the earliest"),
+        Field("count", "u2", "1", "sections that follow"),
+        Field("sections", "f8", "s, 1, 1/s, 1/s2, 1/s3", "start, s, ds, dds, constant jerk of the path parameter", (SECTIONS, 5)),
+    ),
+)
+
+JOINT_SET_POINT = command(
+    "joint_set_point",
+    1,
+    Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point yet, hold"),
+    Field("position", "f8", "rad", "joint positions", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    Field("acceleration", "f8", "rad/s2", "joint accelerations", ("joints",)),
+    Field("opening", "f8", "m", "gripper joint position to go to"),
+    Field("force", "f8", "N", "largest gripper force"),
+    Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
+)
+
+SERVO_PLAN = MessageType(
+    "servo_plan",
+    1,
+    (
+        Field("inertia", "f8", "kg m2", "joint-space inertia for the coming cycles, what is held included", ("joints", "joints")),
+        Field("held", "i2", "1", "object included; -1: none"),
+        Field("payload_mass", "f8", "kg", "mass in the gripper"),
+        Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
+    ),
+)
+
+SERVO_STATUS = status(
+    "servo_status",
+    1,
+    Field("position", "f8", "rad", "joint positions, measured", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities, measured", ("joints",)),
+    Field("torque", "f8", "N m", "torque given to the arm in this cycle, behind the limit gate", ("joints",)),
+    Field("target", "f8", "rad", "set point interpolated for this cycle", ("joints",)),
+    Field("target_velocity", "f8", "rad/s", "set point interpolated for this cycle", ("joints",)),
+    Field("opening", "f8", "m", "gripper joint position, measured"),
+    Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
+    Field("grip_force", "f8", "N", "force given to the gripper"),
+    Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
+    Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),
+    Field("touches", "u4", "1", "contacts that no task means, counted at every substep"),
+)
+
+ARM_STATE = MessageType(
+    "arm_state",
+    1,
+    (
+        Field("tick", "i8", "tick", "tick that the state belongs to"),
+        Field("state", "f8", "", "mjSTATE_INTEGRATION of the simulated cell", ("state",)),
+    ),
+)
+
+SCENE = MessageType(
+    "scene",
+    1,
+    (
+        Field("position", "f8", "m", "body origins as sensed", ("bodies", 3)),
+        Field("quaternion", "f8", "1", "body orientations as sensed", ("bodies", 4)),
+        Field("tool_position", "f8", "m", "tool as sensed", (3,)),
+        Field("tool_quaternion", "f8", "1", "tool as sensed", (4,)),
+    ),
+)
+
+WORLD_MODEL = MessageType(
+    "world_model",
+    1,
+    (
+        Field("revision", "u4", "1", "rises whenever a body that was at rest moves, and when it rests again"),
+        Field("position", "f8", "m", "body origins", ("bodies", 3)),
+        Field("quaternion", "f8", "1", "body orientations", ("bodies", 4)),
+        Field("velocity", "f8", "m/s", "body velocities, estimated", ("bodies", 3)),
+    ),
+)

@@ -1,0 +1,176 @@
+"""Collisions of the arm, and of what it holds, with the cell and with itself.
+
+MuJoCo finds the pairs; a matrix of required distances, one entry a pair of geoms, says which of them count.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from levels.cell import Cell
+from levels.scene import SceneConfig
+from levels.touches import geom_name
+
+Array = NDArray[np.float64]
+
+TOUCH_DEPTH_M = 0.003
+"""How deep a contact that is meant may go: simulated bodies are soft and sensed poses are not exact."""
+
+NO_MATTER = -np.inf
+
+
+class CollisionChecker:
+    """Says whether a configuration of the arm is free, on a cell of its own.
+
+    The arm, its gripper open and whatever it holds included, keeps `scene.clearance` from everything that is not the
+    arm; links must only not touch each other or what carries the arm. One instance belongs to one task; a check takes
+    some microseconds.
+    """
+
+    def __init__(self, cell: Cell, scene: SceneConfig) -> None:
+        self.cell = cell
+        self.clearance = scene.clearance
+        self.held: int | None = None
+        self._touched: int | None = None
+        self._model = copy.copy(cell.model)
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
+        self._row_geoms = [np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b) for b in cell.bodies]
+        self._offset = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        self._tool_quaternion = np.zeros(4)
+        self._contype = self._filter_to_arm()
+        self._base = self._required_distances()
+        self._required = self._base.copy()
+
+    def place(self, positions: Array, quaternions: Array) -> None:
+        """Put objects and obstacles at the world model's poses: (bodies, 3) in m, (bodies, 4) as w, x, y, z."""
+        for row, address in enumerate(self.cell.object_qpos):
+            self._data.qpos[address : address + 3] = positions[row]
+            self._data.qpos[address + 3 : address + 7] = quaternions[row]
+        for row, mocap in enumerate(self.cell.mocap, start=len(self.cell.object_qpos)):
+            self._data.mocap_pos[mocap] = positions[row]
+            self._data.mocap_quat[mocap] = quaternions[row]
+
+    def hold(self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)) -> None:
+        """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
+        self.held = row
+        self._offset = (np.array(position, dtype=float), np.array(quaternion, dtype=float))
+        self._model.geom_contype[:] = self._contype
+        if row is not None:
+            self._model.geom_contype[self._row_geoms[row]] = 1
+        self._apply()
+
+    def permit(self, row: int | None, touch: bool = True) -> None:
+        """Let object `row` touch supports and gripper, and the gripper come close to supports; or no longer."""
+        self._touched = row if touch else None
+        self._apply()
+
+    def free(self, q: Array, clearance: float | None = None) -> bool:
+        """Say whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, in m, may lower the scene's."""
+        return not bool(np.any(self._shortfalls(q, clearance) > 0))
+
+    def room(self, q: Array) -> float:
+        """Return the largest clearance, in m and at most the scene's, with which `q` is free; negative if none is."""
+        short = self._shortfalls(q, None)
+        pairs = self._data.contact.geom
+        required = self._required[pairs[:, 0], pairs[:, 1]]
+        if np.any((short > 0) & (required <= 0)):
+            return -1.0
+        return self.clearance - max(0.0, float(np.max(short, initial=0.0)))
+
+    def why(self, q: Array, clearance: float | None = None) -> str:
+        """Name the pair that is nearest its bound or beyond it, with distance and bound; empty when `q` is free."""
+        short = self._shortfalls(q, clearance)
+        if not np.any(short > 0):
+            return ""
+        worst = int(np.argmax(short))
+        first, second = self._data.contact.geom[worst]
+        distance = self._data.contact.dist[worst]
+        return (
+            f"'{geom_name(self._model, first)}' and '{geom_name(self._model, second)}' are {distance * 1e3:.1f} mm apart, "
+            f"{(distance + short[worst]) * 1e3:.1f} mm is the least"
+        )
+
+    def _shortfalls(self, q: Array, clearance: float | None) -> Array:
+        """Return what each close pair lacks to its required distance, in m."""
+        m, d = self._model, self._data
+        d.qpos[self.cell.qpos] = q
+        mujoco.mj_kinematics(m, d)
+        if self.held is not None:
+            self._carry(self.held)
+            mujoco.mj_kinematics(m, d)
+        mujoco.mj_collision(m, d)
+        contact = d.contact
+        pairs = contact.geom
+        required = self._required[pairs[:, 0], pairs[:, 1]]
+        if clearance is not None:
+            np.minimum(required, clearance, out=required)
+        return np.asarray(required - contact.dist)
+
+    def _carry(self, row: int) -> None:
+        d, address = self._data, self.cell.object_qpos[row]
+        tool = self.cell.tool
+        mujoco.mju_mat2Quat(self._tool_quaternion, d.site_xmat[tool])
+        d.qpos[address : address + 3] = d.site_xpos[tool] + d.site_xmat[tool].reshape(3, 3) @ self._offset[0]
+        mujoco.mju_mulQuat(d.qpos[address + 3 : address + 7], self._tool_quaternion, self._offset[1])
+
+    def _filter_to_arm(self) -> NDArray[np.int32]:
+        """Leave MuJoCo only the pairs with the arm in them: a tenth of the work. Return the contact types."""
+        m = self._model
+        solid = (m.geom_contype | m.geom_conaffinity) != 0
+        arm = np.zeros(m.ngeom, dtype=bool)
+        arm[self.cell.arm_geoms] = True
+        m.geom_contype[:] = arm & solid
+        m.geom_conaffinity[:] = solid
+        # MuJoCo adds the margins of the two geoms: the arm's are zero, so that self-collision has none.
+        m.geom_margin[:] = np.where(arm, 0.0, self.clearance)
+        m.geom_gap[:] = 0.0
+        m.pair_margin[:] = self.clearance
+        return m.geom_contype.copy()
+
+    def _required_distances(self) -> Array:
+        """Return (geoms, geoms), in m: clearance for arm and cell, 0 for what the cell lets touch itself."""
+        m, arm = self.cell.model, self.cell.arm_geoms
+        typ, affinity = m.geom_contype, m.geom_conaffinity
+        collide = (typ[:, None] & affinity[None, :]) | (typ[None, :] & affinity[:, None]) != 0
+        required = np.full((m.ngeom, m.ngeom), NO_MATTER)
+        required[arm, :] = self.clearance
+        required[:, arm] = self.clearance
+        own = np.union1d(arm, self._carriers())
+        for some, others in ((arm, own), (own, arm)):
+            required[np.ix_(some, others)] = np.where(collide[np.ix_(some, others)], 0.0, NO_MATTER)
+        return required
+
+    def _carriers(self) -> NDArray[np.int_]:
+        """Return the geoms of the fixed bodies that carry the arm: its links come near them at every joint angle."""
+        m = self.cell.model
+        body = m.body_parentid[m.dof_bodyid[self.cell.dof[0]]]
+        chain = []
+        while body > 0:
+            chain.append(body)
+            body = m.body_parentid[body]
+        return np.flatnonzero(np.isin(m.geom_bodyid, chain))
+
+    def _apply(self) -> None:
+        """Work out the required distances for what is held and what may be touched."""
+        self._required[:] = self._base
+        arm, gripper, supports = self.cell.arm_geoms, self.cell.gripper_geoms, self.cell.supports
+        if self.held is not None:
+            held = self._row_geoms[self.held]
+            self._require(held, np.arange(self._model.ngeom), self.clearance)
+            self._require(held, arm, 0.0)
+            self._require(held, gripper, NO_MATTER)
+            self._require(held, held, NO_MATTER)
+        if self._touched is not None:
+            touched = self._row_geoms[self._touched]
+            self._require(touched, gripper, NO_MATTER if self._touched == self.held else -TOUCH_DEPTH_M)
+            self._require(touched, supports, -TOUCH_DEPTH_M)
+            self._require(gripper, supports, 0.0)
+
+    def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:
+        self._required[np.ix_(some, others)] = distance
+        self._required[np.ix_(others, some)] = distance

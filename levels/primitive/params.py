@@ -1,0 +1,37 @@
+"""What a config may set of the primitive level, in `[board.<name>.params]`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from levels.errors import LevelError
+from levels.robot import Positive, Table
+
+
+class PrimitiveParams(Table):
+    """Bounds of following, settling and guarding."""
+
+    following: Positive = Field(0.05, description="largest distance of a joint from its set point under way, rad")
+    settled: Positive = Field(0.003, description="largest distance of a settled joint from its goal, rad")
+    settled_opening: Positive = Field(0.002, description="largest speed of a settled gripper, m/s")
+    settled_cycles: int = Field(3, ge=1, le=100, description="cycles in a row that a settled arm stays so")
+    settling: Positive = Field(3.0, description="longest time that arm or gripper may take to settle, s")
+    astray: Positive = Field(0.02, description="largest distance of a joint from the path when motion begins, rad")
+    bridging: Positive = Field(0.5, description="time in which such a distance is taken back, s")
+    silent: Positive = Field(2.0, description="time without status from below, or a world model, that is an error, s")
+    lookahead: Positive = Field(2.0, description="time ahead of the arm that the guard watches in every cycle, s")
+    clear: Positive = Field(0.5, description="time that the way must be clear before held motion goes on, s")
+
+
+def primitive_params(params: Mapping[str, Any]) -> PrimitiveParams:
+    """Return the parameters. Raises `LevelError` that names the key, its value and what is valid."""
+    try:
+        return PrimitiveParams(**params)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        valid = ", ".join(PrimitiveParams.model_fields)
+        raise LevelError(f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}") from error

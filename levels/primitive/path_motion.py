@@ -1,0 +1,135 @@
+"""Motion of the arm's set point along one path: begun, held, resumed, ended, always at rest or on a trajectory."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from levels.primitive.path import COINCIDENT_RAD, BlendedPath
+from levels.primitive.speed import JointLimits
+from levels.primitive.stop import make_stop
+from levels.primitive.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+NEAREST_STEP_RAD = 0.01
+"""Spacing of the points among which the one nearest to the arm is looked for."""
+
+
+class SetPoint(NamedTuple):
+    """What the set point is at one time: rad, rad/s, rad/s2, (joints,) each."""
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+
+class PathMotion:
+    """One path under way. `set_point` is where the arm is to be after the last `advance`.
+
+    The arm may begin a little beside the path: the distance is taken back over `bridging_s` while it moves.
+    """
+
+    def __init__(self, path: BlendedPath, limits: JointLimits, bridging_s: float) -> None:
+        self.path = path
+        self.s = 0.0
+        self.trajectory: Trajectory | None = None
+        self.time_s = 0.0
+        self.stopping = False
+        self._limits = limits
+        self._bridging_s = bridging_s
+        self._offset = np.zeros(path.joints)
+        self._bridged_s = bridging_s
+        self.set_point = SetPoint(path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints))
+        self._scratch = np.zeros(path.joints)
+
+    @property
+    def resting(self) -> bool:
+        """True when the set point does not move."""
+        return self.trajectory is None
+
+    @property
+    def finished(self) -> bool:
+        """True when the set point rests at the end of the path."""
+        return self.resting and self.s >= self.path.length and self._bridged_s >= self._bridging_s
+
+    @property
+    def remaining_s(self) -> float:
+        """Time until the trajectory under way ends, in s."""
+        return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
+
+    def rest_at(self, position: Array) -> float:
+        """Rest at the begin of the path, beside it where `position` (joints,) is; return the largest distance, in rad."""
+        return self._rest(0.0, position)
+
+    def rest_near(self, position: Array) -> float:
+        """Rest where the path is nearest to `position` (joints,); return the largest distance of a joint, in rad."""
+        points = self.path.sample(NEAREST_STEP_RAD)
+        nearest = int(np.argmin(np.linalg.norm(points - position, axis=1)))
+        return self._rest(self.path.length * nearest / max(len(points) - 1, 1), position)
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Set out along `trajectory`, which begins at rest where the motion rests."""
+        self.trajectory = trajectory
+        self.time_s = 0.0
+        self.stopping = False
+
+    def hold(self) -> None:
+        """Begin to ramp to rest on the path, as soon as the joint limits let it; call in every cycle."""
+        if self.trajectory is None or self.stopping:
+            return
+        stop = make_stop(self.path, self._limits, self.trajectory.at(self.time_s))
+        if stop is not None:
+            self.trajectory, self.time_s, self.stopping = stop, 0.0, True
+
+    def advance(self, duration_s: float) -> SetPoint:
+        """Go on by `duration_s`; return the set point then. Its arrays are overwritten by the next call."""
+        position, velocity, acceleration = self.set_point
+        if self.trajectory is None:
+            velocity.fill(0.0)
+            acceleration.fill(0.0)
+            return self.set_point
+        self.time_s += duration_s
+        self.s, ds, dds = self.trajectory.at(self.time_s)
+        q, dq_ds, d2q_ds2 = self.path.evaluate(self.s)
+        position[:] = q
+        np.multiply(dq_ds, ds, out=velocity)
+        np.multiply(d2q_ds2, ds * ds, out=acceleration)
+        acceleration += np.multiply(dq_ds, dds, out=self._scratch)
+        if self._bridged_s < self._bridging_s:
+            self._bridge(duration_s)
+        if self.time_s >= self.trajectory.duration:
+            self._come_to_rest()
+        return self.set_point
+
+    def _rest(self, s: float, position: Array) -> float:
+        self.s, self.trajectory, self.stopping = s, None, False
+        np.subtract(position, self.path.evaluate(s).q, out=self._offset)
+        distance = float(np.abs(self._offset).max())
+        self._bridged_s = 0.0 if distance > COINCIDENT_RAD else self._bridging_s
+        for value, start in zip(self.set_point, (position, 0.0, 0.0), strict=True):
+            value[:] = start
+        return distance
+
+    def _come_to_rest(self) -> None:
+        if self._bridged_s < self._bridging_s:
+            return
+        # Trajectories end where they should up to rounding; the end of the path is met exactly.
+        if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
+            self.s = self.path.length
+            self.set_point.position[:] = self.path.evaluate(self.s).q
+        self.trajectory, self.stopping = None, False
+        self.set_point.velocity.fill(0.0)
+        self.set_point.acceleration.fill(0.0)
+
+    def _bridge(self, duration_s: float) -> None:
+        """Add what is left of the distance to the path: a quintic from one to zero, at rest at both ends."""
+        self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
+        u, per_s = self._bridged_s / self._bridging_s, 1.0 / self._bridging_s
+        left = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
+        rate = -30.0 * u**2 * (1.0 - u) ** 2 * per_s
+        change = -60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) * per_s**2
+        for value, factor in zip(self.set_point, (left, rate, change), strict=True):
+            value += np.multiply(self._offset, factor, out=self._scratch)

@@ -1,0 +1,55 @@
+"""A segment of work, taken out of the window that the level above hands down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backplane.message import Message
+from levels.messages import SegmentKind
+from levels.primitive.path import BlendedPath
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A copy of one SEGMENT; see there for units. `object` is None for none."""
+
+    id: int
+    kind: SegmentKind
+    object: int | None
+    touch: bool
+    waypoints: NDArray[np.float64]
+    blend: NDArray[np.float64]
+    by: float
+    opening: float
+    force: float
+
+    def path(self) -> BlendedPath:
+        """Return the segment's path. Raises `ValueError` for one that cannot be."""
+        return BlendedPath(self.waypoints, self.blend)
+
+
+def window(command: Message) -> list[int]:
+    """Return the serials of the segments that a MOVE_COMMAND holds, oldest first."""
+    serials: list[int] = command.segments["id"][: command.count].tolist()
+    return serials
+
+
+def read_segment(command: Message, serial: int) -> Segment:
+    """Return the segment of that serial, which must be in the window."""
+    record = command.segments[window(command).index(serial)]
+    count = int(record["count"])
+    held = int(record["object"])
+    return Segment(
+        id=serial,
+        kind=SegmentKind(int(record["kind"])),
+        object=held if held >= 0 else None,
+        touch=bool(record["touch"]),
+        waypoints=record["waypoints"][:count].copy(),
+        blend=record["blend"][:count].copy(),
+        by=float(record["by"]),
+        opening=float(record["opening"]),
+        force=float(record["force"]),
+    )

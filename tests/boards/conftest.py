@@ -1,0 +1,54 @@
+"""A small rack without an arm, as TOML text and as files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+SMALL = f"""
+name = "small"
+python_path = ["{Path(__file__).parent}"]
+
+[clock]
+period_ms = 2.5
+mode = "lockstep"
+
+[board.upper]
+slot = 2
+rate_hz = 50
+below = "lower"
+executor = "two_levels:Upper"
+ends_run = true
+
+[board.lower]
+slot = 3
+rate_hz = 400
+above = "upper"
+executor = "two_levels:Lower"
+planner = "two_levels:LowerPlanner"
+coupling = "tight"
+within_cycles = 4
+"""
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """A rack of two levels that count, as a file."""
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str, str], Path]:
+    """Write a file beside the small rack's."""
+
+    def write_file(name: str, text: str) -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        return path
+
+    return write_file

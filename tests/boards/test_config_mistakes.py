@@ -1,0 +1,112 @@
+"""Mistakes of a config: all of them at once, each with its place, its value and what is permitted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from boards.config import load, wire
+from boards.errors import ConfigError
+
+MISTAKES = {
+    "unknown key": ("clock.periodms=1", "clock.periodms = 1: unknown key; did you mean 'period_ms'?"),
+    "out of range": ("board.upper.slot=22", "board.upper.slot = 22: should be less than or equal to 21; slot in"),
+    "slot of the clock": ("board.upper.slot=1", "slot 1 is the clock's"),
+    "slot taken": ("board.upper.slot=3", "board.lower.slot = 3: the slot is taken by board.upper.slot"),
+    "name": ("name='../x'", 'name = "../x": '),
+    "choice": ("clock.mode=fast", "'realtime' or 'lockstep'"),
+    "not finite": ("clock.speed=inf", "clock.speed = inf: should be a finite number"),
+    "period": ("clock.period_ms=2.4999995", "clock.period_ms = 2.4999995: is no whole number of ns"),
+    "rate": (
+        "board.upper.rate_hz=60",
+        "60 Hz does not divide the 400 Hz clock; nearest: 57.14 Hz (every 7 ticks), 66.67 Hz (every 6 ticks)",
+    ),
+    "rate above the clock": ("board.upper.rate_hz=1000", "nearest: 400 Hz (every 1 tick)"),
+    "speed in lockstep": ("clock.speed=2", "clock.speed = 2.0: lockstep runs as fast as it can"),
+    "neighbour": ("board.lower.above=uper", 'board.lower.above = "uper": no other board is called so; boards: upper'),
+    "own neighbour": ("board.lower.above=lower", "no other board is called so"),
+    "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose", as there is a planner'),
+    "no planner": ("board.upper.coupling=tight", 'permitted: "none", as there is no planner'),
+    "loose": ("board.lower.coupling=loose", "board.lower.planner_slot: missing; a loosely coupled planner has"),
+    "planner slot": ("board.lower.planner_slot=9", 'only a planner with coupling = "loose" has one'),
+    "priorities": ("board.lower.planner_priority=5", "a tightly coupled planner runs below its executor"),
+    "polling": ("board.upper.wake=poll", "needs a core of its own; core 0 has also: lower, clock, lower.planner"),
+    "two ends": ("board.lower.ends_run=true", "one board ends the run, and 'upper' does already"),
+    "board name": (
+        "board.own={ slot = 4, every = 1, executor = 'two_levels:Upper', below = 'lower' }",
+        "no name for a",
+    ),
+    "no class name": ("board.upper.executor=two_levels", "package.module:Class"),
+    "moving what is not there": ("scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]", "no obstacle is called so"),
+}
+WIRING_MISTAKES = {
+    "no module": ("board.upper.executor='no_levels:Upper'", "cannot import 'no_levels': ModuleNotFoundError"),
+    "no class": ("board.upper.executor='two_levels:Uper'", "has no class 'Uper'; it has: Lower, PlanWriter, Upper"),
+    "no executor": ("board.upper.executor='two_levels:LowerPlanner'", "has no Executor named 'LowerPlanner'"),
+    "nobody writes": ("board.upper.reads={ status = 'lower.state' }", "nobody writes it; mailboxes: upper.command"),
+    "type": (
+        "board.upper.reads={ status = 'upper.command' }",
+        "carries count_command 1; the port wants count_status 1",
+    ),
+    "no port": ("board.upper.reads={ state = 'lower.status' }", "the executor has no such port; ports: status"),
+    "two writers": ("board.lower.executor='two_levels:PlanWriter'", "mailbox lower.plan"),
+    "protocol": ("protocol.mailbox={ 'lower.state' = 'lock' }", "protocol.mailbox.lower.state: no such mailbox"),
+    "size": ("board.lower.planner='two_levels:SizedPlanner'", "carries count_plan 1; the port wants small_plan 1"),
+}
+
+
+@pytest.mark.parametrize(("setting", "told"), MISTAKES.values(), ids=MISTAKES)
+def test_load_tells_the_mistake(small: Path, setting: str, told: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(small, [setting])
+    assert told in str(error.value)
+    assert len(error.value.mistakes) == 1
+
+
+@pytest.mark.parametrize(("setting", "told"), WIRING_MISTAKES.values(), ids=WIRING_MISTAKES)
+def test_wire_tells_the_mistake(small: Path, setting: str, told: str) -> None:
+    config = load(small, [setting])
+    with pytest.raises(ConfigError) as error:
+        wire(config)
+    assert told in str(error.value)
+    assert len(error.value.mistakes) == 1
+
+
+def test_all_mistakes_are_told_at_once_wherever_they_stand(small: Path) -> None:
+    settings = [
+        "clock.wake=sleep",
+        "board.upper.core=-1",
+        "board.lower.planner_slot=9",
+        "board.lower.above=uper",
+        "board.lower.planner='two_levels:Nobody'",
+    ]
+    with pytest.raises(ConfigError) as error:
+        load(small, settings)
+    places = {mistake.place for mistake in error.value.mistakes}
+    assert places >= {
+        "clock.wake",
+        "board.upper.core",
+        "board.lower.planner_slot",
+        "board.lower.above",
+        "board.lower.planner",
+    }
+
+
+def test_a_broken_board_does_not_make_its_neighbours_wrong(small: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(small, ["board.lower.slot=99"])
+    assert [mistake.place for mistake in error.value.mistakes] == ["board.lower.slot"]
+
+
+def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(small, [f"clock.mode='{'long' * 100}'"])
+    assert len(str(error.value)) < 250
+    assert "\n" not in str(error.value)
+
+
+def test_lists_of_another_length_than_the_joints_are_told_together() -> None:
+    with pytest.raises(ConfigError) as error:
+        load("nasrem", ["robot.home=[0, 0]", "robot.jerk=[1]", "robot.model=none.xml"])
+    assert {mistake.place for mistake in error.value.mistakes} == {"robot.home", "robot.jerk", "robot.model"}

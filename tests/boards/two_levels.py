@@ -1,0 +1,56 @@
+"""Two small levels that count, for tests of configs: no arm, no cell."""
+
+from __future__ import annotations
+
+from backplane.message import Field, Message, MessageType, command, status
+from levels.level import Executor, Input, Planner, Ports
+
+COUNT_COMMAND = command("count_command", 1, Field("goal", "i8", "1", "count to reach"))
+COUNT_STATUS = status("count_status", 1, Field("count", "i8", "1", "count reached"))
+COUNT_PLAN = MessageType("count_plan", 1, (Field("steps", "i8", "1", "counts to go, by joint", ("joints",)),))
+SMALL_PLAN = MessageType("small_plan", 1, (Field("steps", "i8", "1", "counts to go"),))
+
+
+class Upper(Executor):
+    """Commands a goal, reads how far it is."""
+
+    inputs = {"status": Input(COUNT_STATUS, "below.status")}
+    outputs = {"command": COUNT_COMMAND, "status": COUNT_STATUS}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Ask for one more."""
+        write.command.goal = read.status.value.count + 1
+
+
+class Lower(Executor):
+    """Counts towards the goal, by its own plan."""
+
+    inputs = {"command": Input(COUNT_COMMAND, "above.command"), "plan": Input(SMALL_PLAN, "own.plan")}
+    outputs = {"status": COUNT_STATUS}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Count to the goal."""
+        write.status.count = read.command.value.goal
+
+
+class LowerPlanner(Planner):
+    """Plans the way to the goal."""
+
+    inputs = {"command": Input(COUNT_COMMAND, "above.command")}
+    output = SMALL_PLAN
+
+    def plan(self, read: Ports, write: Message, tick: int) -> None:
+        """Plan one step."""
+        write.steps = 1
+
+
+class SizedPlanner(LowerPlanner):
+    """Writes a plan whose size only a rack with an arm knows."""
+
+    output = COUNT_PLAN
+
+
+class PlanWriter(Lower):
+    """Writes the mailbox of its own planner."""
+
+    outputs = {"status": COUNT_STATUS, "plan": SMALL_PLAN}

@@ -1,0 +1,18 @@
+"""`rack clean`: remove what killed racks left behind."""
+
+from __future__ import annotations
+
+from tools.answer import Json, print_json
+
+
+def clean(as_json: Json = False) -> None:
+    """Remove the shared memory of racks that nobody runs; a rack in use is never touched."""
+    from boards.clean import clean as remove
+
+    removed, in_use = remove()
+    if as_json:
+        print_json({"removed": removed, "in_use": in_use})
+        return
+    print(f"removed: {', '.join(removed) or 'nothing'}")
+    if in_use:
+        print(f"in use: {', '.join(in_use)}")

@@ -1,0 +1,56 @@
+"""The `rack` command: one file a subcommand; each imports what it needs only when it runs."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from tools.answer import Failure, fail
+from tools.clean import clean
+from tools.list import list_racks
+from tools.status import status
+from tools.stop import stop
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
+    epilog="Exit status: 0 it worked, 1 it did not, 2 usage or config error.",
+)
+app.command("list")(list_racks)
+app.command()(status)
+app.command()(stop)
+app.command()(clean)
+
+
+def main() -> None:
+    """Run the command line; what is refused shows as one line a mistake."""
+    if sys.platform != "linux":
+        sys.exit(f"rack runs on Linux alone, not on {sys.platform}: it needs /dev/shm, pidfds and SCHED_FIFO")
+    try:
+        app()
+    except Failure as failure:
+        fail(str(failure), failure.status)
+    except Exception as error:
+        status_of_error = _status(error)
+        if status_of_error is None:
+            raise
+        fail(str(error), status_of_error)
+
+
+def _status(error: Exception) -> int | None:
+    """Return the exit status of an error that the project raises on purpose; None for any other."""
+    from backplane.errors import BackplaneError
+    from boards.errors import BoardError, ConfigError
+    from levels.errors import LevelError
+
+    if isinstance(error, ConfigError):
+        return 2
+    return 1 if isinstance(error, BackplaneError | BoardError | LevelError) else None
+
+
+if __name__ == "__main__":
+    main()

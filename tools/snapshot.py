@@ -1,0 +1,138 @@
+"""What a running rack shows to the host side: one row a task, and how far the task is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from backplane.layout import TaskSpec
+from backplane.lines import UtilityLines
+from backplane.message import State
+from backplane.protocols import open_reader
+from backplane.segment import Segment
+from backplane.trace import trace_ring
+from backplane.words import Block, Run, System, TaskState
+
+TASK_STATUS = "task_status"
+"""Message type of the level that reports how far the whole task is."""
+
+
+@dataclass(frozen=True)
+class TaskRow:
+    """One task now. Times are of the cycles since the last row, in ms; None when there were none.
+
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling.
+    """
+
+    task: str
+    slot: int
+    core: int
+    priority: int
+    rate_hz: float
+    state: str
+    tick: int
+    cycles: int
+    plans: int
+    missed: int
+    skipped: int
+    exec_ms: float | None
+    lateness_ms: float | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far the task is: elemental moves done, and of how many; actions likewise."""
+
+    moves_done: int
+    moves: int
+    actions_done: int
+    actions: int
+    state: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A rack now. `time_s` is simulated time; `lines` are the utility lines that are asserted."""
+
+    rack: str
+    run: str
+    tick: int
+    time_s: float
+    clock_skipped: int
+    lines: tuple[str, ...]
+    tasks: tuple[TaskRow, ...]
+    progress: Progress | None
+
+
+class Viewer:
+    """Takes snapshots of one rack; every one shows the cycles since the one before."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._lines = UtilityLines(segment)
+        self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+        written = {m.name: m.message for m in segment.layout.mailboxes}
+        self._statuses = {
+            task.name: open_reader(segment, f"{task.name}.status")
+            for task in segment.layout.tasks
+            if f"{task.name}.status" in written
+        }
+        whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
+        self._whole = open_reader(segment, whole) if whole else None
+
+    def look(self) -> Snapshot:
+        """Return the rack as it is now."""
+        words, layout = self._segment.words, self._segment.layout
+        tick = words[System.TICK]
+        return Snapshot(
+            rack=layout.rack,
+            run=Run(words[System.STATE]).name.lower(),
+            tick=tick,
+            time_s=tick * layout.clock_ns * 1e-9,
+            clock_skipped=words[System.CLOCK_SKIPPED],
+            lines=tuple(self._asserted()),
+            tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
+            progress=self._progress(),
+        )
+
+    def _asserted(self) -> list[str]:
+        lines = self._lines
+        held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
+        single = {"ACFAIL": lines.acfail, "SYSRESET": lines.sysreset, "EMERGENCY STOP": lines.emergency_stop}
+        return held + [name for name, asserted in single.items() if asserted]
+
+    def _row(self, task: TaskSpec) -> TaskRow:
+        block = self._segment.block(task.name)
+        cycles = self._traces[task.name].drain().rows
+        state, reason = TaskState(block[Block.STATE]).name.lower(), ""
+        if task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
+            state, reason = State(status.value.state).name.lower(), status.value.reason
+        return TaskRow(
+            task=task.name,
+            slot=task.slot,
+            core=block[Block.CORE],
+            priority=block[Block.PRIORITY],
+            rate_hz=1e9 / (task.every * self._segment.layout.clock_ns),
+            state=state,
+            tick=block[Block.DONE],
+            cycles=block[Block.CYCLES],
+            plans=block[Block.PLANS],
+            missed=block[Block.MISSED],
+            skipped=block[Block.SKIPPED],
+            exec_ms=_longest_ms(cycles["process_ns"] - cycles["read_ns"]),
+            lateness_ms=_longest_ms(cycles["start_ns"] - cycles["release_ns"]),
+            reason=reason,
+        )
+
+    def _progress(self) -> Progress | None:
+        if self._whole is None or not (status := self._whole.peek()).is_there:
+            return None
+        at = status.value
+        return Progress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
+
+
+def _longest_ms(durations_ns: np.ndarray) -> float | None:
+    return float(durations_ns.max()) * 1e-6 if len(durations_ns) else None

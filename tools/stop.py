@@ -1,0 +1,22 @@
+"""`rack stop`: end a run."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from tools.answer import Failure, Json, RackName, print_json
+
+
+def stop(
+    rack: RackName,
+    wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="seconds to wait for the rack's end")] = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Have a running rack end at its next tick, and wait until it is gone."""
+    from tools.stopping import stop_rack
+
+    if not stop_rack(rack, wait):
+        raise Failure(f"rack '{rack}' has not ended within {wait:g} s; its launcher still runs")
+    print_json({"rack": rack, "stopped": True}) if as_json else print(f"rack '{rack}' has ended")
