@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -95,8 +96,10 @@ class Message:
     byte strings as `str`. `record` is the structured array, shape (), `raw` its bytes.
     """
 
-    record: np.ndarray
+    # Slots all the way down: a misspelt field is an error, not an attribute that travels nowhere.
+    __slots__ = ("raw", "record")
     raw: memoryview
+    record: np.ndarray
 
     def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Message:
         return object.__new__(_class_for(dtype))
@@ -104,7 +107,8 @@ class Message:
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
         self.raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
         self.record = np.frombuffer(self.raw, dtype=dtype, count=1).reshape(())
-        self.__dict__.update({f"_{name}": self.record[name] for name in dtype.names or ()})
+        for name in dtype.names or ():
+            setattr(self, f"_{name}", self.record[name])
 
     def clear(self) -> None:
         """Set every byte to zero."""
@@ -114,11 +118,9 @@ class Message:
         """Take over the bytes of a message of the same type."""
         self.raw[:] = other.raw
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        # A misspelt field would otherwise become a Python attribute and travel nowhere.
-        if name not in ("raw", "record") and not hasattr(type(self), name):
-            raise AttributeError(f"message has no field '{name}'; fields: {', '.join(self.record.dtype.names or ())}")
-        object.__setattr__(self, name, value)
+    # Field names are the layout's; a type checker cannot know them.
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"message has no field '{name}'; fields: {', '.join(self.record.dtype.names or ())}")
 
     def __repr__(self) -> str:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
@@ -130,25 +132,27 @@ _CLASSES: dict[np.dtype, type[Message]] = {}
 def _class_for(dtype: np.dtype) -> type[Message]:
     """Return the subclass of `Message` with one property a field, made once a dtype."""
     if dtype not in _CLASSES:
-        properties = {name: _property(name, dtype[name]) for name in dtype.names or ()}
-        _CLASSES[dtype] = type("Message", (Message,), properties)
+        names = dtype.names or ()
+        properties = {name: _property(f"_{name}", dtype[name]) for name in names}
+        slots = tuple(f"_{name}" for name in names)
+        _CLASSES[dtype] = type("Message", (Message,), {"__slots__": slots, **properties})
     return _CLASSES[dtype]
 
 
-def _property(name: str, dtype: np.dtype) -> property:
-    slot = f"_{name}"
+def _property(slot: str, dtype: np.dtype) -> property:
+    view = attrgetter(slot)
 
     def store(self: Message, value: Any) -> None:
-        self.__dict__[slot][...] = value
+        view(self)[...] = value
 
     if dtype.shape or dtype.names:
-        return property(lambda self: self.__dict__[slot], store)
+        return property(view, store)
     if dtype.kind == "S":
         size = dtype.itemsize
 
         def store_text(self: Message, value: str | bytes) -> None:
             data = value.encode("ascii", "replace") if isinstance(value, str) else value
-            self.__dict__[slot][...] = data[:size]
+            view(self)[...] = data[:size]
 
-        return property(lambda self: self.__dict__[slot].item().decode("ascii", "replace"), store_text)
-    return property(lambda self: self.__dict__[slot].item(), store)
+        return property(lambda self: view(self).item().decode("ascii", "replace"), store_text)
+    return property(lambda self: view(self).item(), store)

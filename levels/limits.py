@@ -1,4 +1,4 @@
-"""Limits of an arm's joints, from the config and the model."""
+"""Limits of an arm's joints, from the config and the model: what motion is planned within, and what is never exceeded."""
 
 from __future__ import annotations
 
@@ -11,14 +11,33 @@ from numpy.typing import NDArray
 from levels.errors import RobotError
 from levels.robot import RobotConfig
 
+VELOCITY_ROOM = 0.05
+"""Part of a velocity limit that planned motion leaves free, so that tracking it does not run into the limit gate."""
+POSITION_ROOM_RAD = 0.005
+"""What planned motion keeps from the ends of a joint's range, for the same reason."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the arm never exceeds, fault or not: the limits as config and model give them.
+
+    Slides have m and N where hinges have rad and N m.
+
+    - `position`: (joints, 2), low and high, rad; -inf and inf for a joint without.
+    - `velocity`: (joints,), both ways, rad/s. `torque`: (joints,), both ways, N m.
+    """
+
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    torque: NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the joints. Slides have m and N where hinges have rad and N m.
+    """What motion is planned within: the bounds, less some room to track it, and the config's smoothness.
 
-    - `position`: (joints, 2), low and high, rad; -inf and inf for a joint without.
-    - `velocity`, `acceleration`, `jerk`: (joints,), both ways, rad/s, rad/s2, rad/s3.
-    - `torque`: (joints,), both ways, N m.
+    `position` (joints, 2), rad; `velocity`, `acceleration`, `jerk` (joints,), both ways, rad/s, rad/s2, rad/s3; `torque`
+    (joints,), N m.
     """
 
     position: NDArray[np.float64]
@@ -28,10 +47,10 @@ class Limits:
     torque: NDArray[np.float64]
 
 
-def joint_limits(
+def joint_bounds(
     model: mujoco.MjModel, joints: NDArray[np.int_], robot: RobotConfig, torque: NDArray[np.float64]
-) -> Limits:
-    """Return the limits; of a position range in both config and model the tighter end holds.
+) -> Bounds:
+    """Return the bounds; of a position range in both config and model the tighter end holds.
 
     Raises `RobotError` for a range that is empty.
     """
@@ -40,12 +59,17 @@ def joint_limits(
         given = np.array(robot.position)
         ranges = np.stack((np.maximum(ranges[:, 0], given[:, 0]), np.minimum(ranges[:, 1], given[:, 1])), axis=1)
     for name, (low, high) in zip(robot.joints, ranges, strict=True):
-        if not low < high:
+        if not high - low > 2 * POSITION_ROOM_RAD:
             raise RobotError(f"robot.position: joint '{name}' has no room from {low:g} to {high:g} rad")
+    return Bounds(position=ranges, velocity=np.array(robot.velocity), torque=torque)
+
+
+def planned_limits(bounds: Bounds, robot: RobotConfig) -> Limits:
+    """Return the limits of planned motion."""
     return Limits(
-        position=ranges,
-        velocity=np.array(robot.velocity),
+        position=bounds.position + np.array([POSITION_ROOM_RAD, -POSITION_ROOM_RAD]),
+        velocity=bounds.velocity * (1.0 - VELOCITY_ROOM),
         acceleration=np.array(robot.acceleration),
         jerk=np.array(robot.jerk),
-        torque=torque,
+        torque=bounds.torque,
     )

@@ -48,10 +48,9 @@ def geom_name(model: mujoco.MjModel, geom: int) -> str:
     return model.geom(geom).name or f"body {model.body(model.geom_bodyid[geom]).name}"
 
 
-def touching(model: mujoco.MjModel, data: mujoco.MjData, touch: NDArray[np.bool_]) -> tuple[int, int] | None:
+def touching(data: mujoco.MjData, touch: NDArray[np.bool_]) -> tuple[int, int] | None:
     """Return the first pair of geoms in a contact that no task means; None: there is none."""
     contact = data.contact
     pairs = contact.geom
-    meant = touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0)
-    first = np.flatnonzero(meant)
+    first = np.flatnonzero(touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0))
     return (int(pairs[first[0], 0]), int(pairs[first[0], 1])) if first.size else None

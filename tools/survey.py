@@ -20,7 +20,11 @@ def describe(name: str) -> dict[str, str | int | float]:
     launcher = words[Head.LAUNCHER_PID]
     alive = segment.launcher_is_alive
     state = Run(words[System.STATE]).name.lower() if alive else "dead"
-    by = f"launched {age_s:.0f} s ago by process {launcher}" if alive else "its launcher is gone: 'rack clean' removes it"
+    by = (
+        f"launched {age_s:.0f} s ago by process {launcher}"
+        if alive
+        else "its launcher is gone: 'rack clean' removes it"
+    )
     boards = len({task.board for task in segment.layout.tasks})
     detail = f"{boards} boards, tick {words[System.TICK]}, {by}"
     segment.close()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from boards.config.classes import extend_path
 from boards.config.files import CONFIGS, Tables, anchor, parse, read
 from boards.config.overrides import override
 from boards.config.rules import mistakes_in
@@ -30,7 +31,7 @@ def loads(text: str) -> RackConfig:
 
 
 def resolve(tables: Tables) -> RackConfig:
-    """Return the config that plain tables hold. Raises `ConfigError` with every mistake."""
+    """Return the config that plain tables hold; its levels can be imported. Raises `ConfigError` with every mistake."""
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
@@ -40,11 +41,13 @@ def resolve(tables: Tables) -> RackConfig:
         raise ConfigError([*mistakes_of(error, RackConfig, tables), *rest]) from None
     if mistakes_in(config):
         raise ConfigError(_mistakes(config, frozenset()))
+    extend_path(config.python_path)
     return config
 
 
 def _mistakes(config: RackConfig, broken: frozenset[str]) -> list[Mistake]:
     """Return everything wrong with a config, its wiring too: one run of a command shows every mistake there is."""
+    extend_path(config.python_path)
     return [*mistakes_in(config, broken), *Wiring(config, broken).mistakes]
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from backplane.layout import Role
 from backplane.message import MessageType
-from boards.config.classes import extend_path, find_class
+from boards.config.classes import find_class
 from boards.config.schema import RackConfig
 from boards.errors import ConfigError, Mistake
 from levels.level import Executor, Input, Planner
@@ -61,7 +61,6 @@ def _roles(config: RackConfig) -> Iterator[tuple[str, Role]]:
 
 
 def _wired(config: RackConfig, board: str, role: Role, mistakes: list[Mistake]) -> TaskPorts | None:
-    extend_path(config.python_path)
     table = config.board[board]
     try:
         kind, outputs = _class(table.executor if role == "executor" else table.planner or "", role)

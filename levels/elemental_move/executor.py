@@ -105,7 +105,7 @@ class ElementalMoveExecutor(Executor):
             self._done = int(taken["move"])
             grasped = taken["kind"] == SegmentKind.GRIPPER and taken["opening"] == self._gripper.closed
             if grasped and self._is_shut(status):
-                self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm and holds nothing")
+                self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm, it holds nothing")
 
     def _watch(self, status: Message, segments: SegmentWindow) -> None:
         """Fail with the level below, and when what was held is gone."""
@@ -208,13 +208,12 @@ class ElementalMoveExecutor(Executor):
 
     def _report_plans(self, status: Message, report: Message) -> None:
         """Say how far plans are at hand: from there the planner goes on."""
-        planned = self._plans.newest(self._handed_down)
-        plan = self._plans.of(planned)
-        if plan is not None:
-            report.end = plan.waypoints[plan.count - 1]
-        elif planned <= self._done and status.resting:
+        report.planned = self._plans.newest(self._handed_down)
+        end = self._plans.end(report.planned)
+        if report.planned <= self._done and status.resting:
             report.end = status.position
-        report.planned = planned
+        elif end is not None:
+            report.end = end
 
     def _state(self, command: Message) -> State:
         if self._error:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from backplane.mailbox import Reading
 from backplane.message import Message
 from levels.messages import WINDOW, Error
@@ -18,13 +21,14 @@ class PlansAtHand:
         self._anew: Message | None = None
 
     def take(self, plan: Reading, done: int) -> None:
-        """Take over a plan that is new. Plans of moves up to `done` are given up."""
+        """Take over a plan that is new. Plans of moves before `done` are given up, behind a refusal all."""
         if not plan.is_new:
             return
-        for move in [m for m in self._by_move if m <= done]:
-            del self._by_move[move]
         message = Message(plan.value.record.dtype)
         message.copy_from(plan.value)
+        refused = message.error and not message.replan
+        for move in [m for m in self._by_move if m < done or (refused and m > message.move)]:
+            del self._by_move[move]
         if message.replan:
             self._anew = message
         elif message.move > done and len(self._by_move) < CAPACITY:
@@ -38,10 +42,14 @@ class PlansAtHand:
         """Return the answer to a request to plan anew; None: not yet there."""
         return self._anew if self._anew is not None and self._anew.replan == request else None
 
-    def newest(self, move: int) -> int:
-        """Return the newest move with a path in unbroken reach: `move`, or one behind it."""
-        found = move
-        for candidate in sorted(self._by_move):
-            if candidate > found and self._by_move[candidate].error == Error.NONE:
-                found = candidate
-        return found
+    def newest(self, handed_down: int) -> int:
+        """Return the newest move whose path is at hand, at least `handed_down`."""
+        return max([handed_down, *(m for m, plan in self._by_move.items() if plan.error == Error.NONE)])
+
+    def end(self, move: int) -> NDArray[np.float64] | None:
+        """Return where the newest path up to that of `move` ends, (joints,) in rad; None: no such path is at hand."""
+        paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
+        if not paths:
+            return None
+        plan = self._by_move[max(paths)]
+        return np.asarray(plan.waypoints[plan.count - 1])

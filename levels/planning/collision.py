@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from levels.cell import Cell
+from levels.gripper import set_opening
 from levels.scene import SceneConfig
 from levels.touches import geom_name
 
@@ -55,6 +56,11 @@ class CollisionChecker:
             self._data.mocap_pos[mocap] = positions[row]
             self._data.mocap_quat[mocap] = quaternions[row]
 
+    def open_gripper(self, opening: float) -> None:
+        """Set the gripper to `opening`, m or rad; at first it is as open as it goes, its widest."""
+        if self.cell.gripper_qpos is not None:
+            set_opening(self._model, self._data.qpos, self.cell.gripper_qpos, opening)
+
     def hold(self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)) -> None:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
         self.held = row
@@ -90,10 +96,9 @@ class CollisionChecker:
         worst = int(np.argmax(short))
         first, second = self._data.contact.geom[worst]
         distance = self._data.contact.dist[worst]
-        return (
-            f"'{geom_name(self._model, first)}' and '{geom_name(self._model, second)}' are {distance * 1e3:.1f} mm apart, "
-            f"{(distance + short[worst]) * 1e3:.1f} mm is the least"
-        )
+        pair = f"'{geom_name(self._model, first)}' and '{geom_name(self._model, second)}'"
+        least = distance + short[worst]
+        return f"{pair} are {distance * 1e3:.1f} mm apart, {least * 1e3:.1f} mm is the least"
 
     def _shortfalls(self, q: Array, clearance: float | None) -> Array:
         """Return what each close pair lacks to its required distance, in m."""

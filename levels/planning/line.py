@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from levels.planning.ik import InverseKinematics
-from levels.planning.path_planner import Path
+from levels.planning.path import Path
 from levels.planning.pose import Pose
 from levels.primitive.path import BlendedPath
 

@@ -9,10 +9,11 @@ from levels.cell import Cell
 from levels.errors import Refused
 from levels.messages import Error, Verb
 from levels.planning.collision import CollisionChecker
-from levels.planning.ik import InverseKinematics
+from levels.planning.ik import SAME_RAD, InverseKinematics
 from levels.planning.line import straight_line
 from levels.planning.move import NAMES, Move
-from levels.planning.path_planner import Path, PathPlanner
+from levels.planning.path import Path
+from levels.planning.path_planner import PathPlanner
 from levels.planning.pose import Pose
 from levels.planning.situation import Situation
 from levels.scene import SceneConfig
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 CLOSE_PART = 0.9
 """Of the room that is left where the arm rests too close to something: the clearance of the way out."""
 AHEAD_PART = 0.5
-"""Part of the clearance that a path planned before must still have: sensed poses differ a little from predicted ones."""
+"""Part of the clearance that a path planned before must still have: sensed and predicted poses differ a little."""
 
 
 class MotionPlanner:
@@ -35,15 +36,18 @@ class MotionPlanner:
         self.checker = CollisionChecker(cell, scene)
         self.paths = PathPlanner(cell, scene.clearance, seed)
 
-    def plan(self, move: Move, start: Array, situation: Situation, attempt: int = 0) -> Path:
-        """Return the path of `move` from `start` (joints,), rad. `attempt` counts tries in the same situation.
+    def plan(
+        self, move: Move, start: Array, situation: Situation, attempt: int = 0, goal: Array | None = None
+    ) -> Path:
+        """Return the path of `move` from `start` (joints,), rad.
 
-        Raises `Refused` with UNREACHABLE when no configuration serves, NO_PATH when something is in the way.
+        `attempt` counts tries in the same situation. With `goal` (joints,) the path ends there, so that paths planned
+        from there stay good. Raises `Refused`: UNREACHABLE when no configuration serves, NO_PATH when all are blocked.
         """
         self.lay_out(move, situation)
         if move.touches:
-            return self._line(move, start)
-        return self.path_to(move, start, self.goal(move, start), attempt)
+            return self._line(move, start, goal)
+        return self.path_to(move, start, self.goal(move, start) if goal is None else goal, attempt)
 
     def lay_out(self, move: Move, situation: Situation) -> None:
         """Set the collision checker to `situation` with the contacts that `move` means."""
@@ -83,8 +87,10 @@ class MotionPlanner:
         clearance = AHEAD_PART * self.clearance
         return self.paths.is_free(path, lambda q: self.checker.free(q, clearance))
 
-    def _line(self, move: Move, start: Array) -> Path:
+    def _line(self, move: Move, start: Array, goal: Array | None) -> Path:
         path = straight_line(self.ik, start, move.tool)
+        if path is not None and goal is not None and np.max(np.abs(path.end - goal)) < SAME_RAD:
+            path.waypoints[-1] = goal
         if path is None:
             raise Refused(Error.UNREACHABLE, f"{NAMES[move.verb]}: no straight tool line to {at(move.tool)}")
         clearance = self._clearance_at(start)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from levels.cell import Cell
 from levels.messages import WAYPOINTS
+from levels.planning.path import Path
 from levels.planning.reach import lever_arms
 from levels.planning.sampling import SampledSearch
 from levels.primitive.path import BlendedPath
@@ -30,18 +30,6 @@ BLENDS = (1.0, 0.6, 0.35, 0.2, 0.1)
 """Parts of the largest blend that are tried at a corner; when all collide, the motion stops there."""
 END_PART = 0.9
 """Part of the first and the last line that a blend may take."""
-
-
-class Path(NamedTuple):
-    """Waypoints (k, joints), in rad, and the length, in rad, over which each corner is rounded, (k,)."""
-
-    waypoints: Array
-    blend: Array
-
-    @property
-    def end(self) -> Array:
-        """The last waypoint."""
-        return np.asarray(self.waypoints[-1])
 
 
 class PathPlanner:

@@ -17,7 +17,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Situation:
-    """Poses by row of the world model, (bodies, 3) in m and (bodies, 4), the row in the gripper and its pose in the tool."""
+    """Poses of the world model's rows, (bodies, 3) in m and (bodies, 4).
+
+    `held` is the row in the gripper and `grip` its pose in the tool's frame; None: nothing is held.
+    """
 
     positions: Array
     quaternions: Array

@@ -1,1 +1,6 @@
-"""The primitive level: paths become jerk-limited joint set points at its cycle, in the background and ahead."""
+"""The primitive level: paths become jerk-limited joint set points, one a cycle, their timing planned in the background."""
+
+from levels.primitive.executor import PrimitiveExecutor
+from levels.primitive.planner import PrimitivePlanner
+
+__all__ = ["PrimitiveExecutor", "PrimitivePlanner"]

@@ -112,9 +112,9 @@ class Guard:
             self._obstructed = None
         for _ in range(FAR_CHECKS):
             self._cursor += FAR_STEP_RAD
-            if not begin < self._cursor < path.length:
-                self._cursor = begin if self._cursor > begin else begin
-            if not self._free(path, self._cursor):
+            if not begin <= self._cursor < path.length + FAR_STEP_RAD:
+                self._cursor = begin
+            if not self._free(path, min(self._cursor, path.length)):
                 self._obstructed = self._cursor
                 return False
         return True

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from pydantic import Field
 
-from pydantic import Field, ValidationError
-
-from levels.errors import LevelError
 from levels.robot import Positive, Table
 
 
@@ -21,17 +17,7 @@ class PrimitiveParams(Table):
     settling: Positive = Field(3.0, description="longest time that arm or gripper may take to settle, s")
     astray: Positive = Field(0.02, description="largest distance of a joint from the path when motion begins, rad")
     bridging: Positive = Field(0.5, description="time in which such a distance is taken back, s")
-    silent: Positive = Field(2.0, description="time without status from below, or a world model, that is an error, s")
+    silent: Positive = Field(2.0, description="time without status from below that is an error, s")
+    blind: Positive = Field(0.2, description="time without a new world model after which motion holds, s")
     lookahead: Positive = Field(2.0, description="time ahead of the arm that the guard watches in every cycle, s")
     clear: Positive = Field(0.5, description="time that the way must be clear before held motion goes on, s")
-
-
-def primitive_params(params: Mapping[str, Any]) -> PrimitiveParams:
-    """Return the parameters. Raises `LevelError` that names the key, its value and what is valid."""
-    try:
-        return PrimitiveParams(**params)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        valid = ", ".join(PrimitiveParams.model_fields)
-        raise LevelError(f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}") from error

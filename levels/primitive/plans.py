@@ -37,6 +37,10 @@ class Plans:
         trajectory = self._trajectories.get(serial)
         return trajectory if trajectory is not None and trajectory.begin == begin else None
 
+    def lacks(self, serial: int, begin: float) -> bool:
+        """Say whether neither a trajectory from `begin` nor a refusal of the segment is there."""
+        return self.trajectory(serial, begin) is None and serial not in self._refusals
+
     def refusal(self, serial: int) -> Fault | None:
         """Return why the planner makes none for a segment."""
         return self._refusals.get(serial)

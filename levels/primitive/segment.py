@@ -38,13 +38,14 @@ def window(command: Message) -> list[int]:
 
 
 def read_segment(command: Message, serial: int) -> Segment:
-    """Return the segment of that serial, which must be in the window."""
+    """Return the segment of that serial, which must be in the window. Raises `ValueError` for an unknown kind."""
     record = command.segments[window(command).index(serial)]
-    count = int(record["count"])
-    held = int(record["object"])
+    count, kind, held = int(record["count"]), int(record["kind"]), int(record["object"])
+    if kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):
+        raise ValueError(f"segment {serial}: kind {kind}; valid: 1 (path), 2 (gripper)")
     return Segment(
         id=serial,
-        kind=SegmentKind(int(record["kind"])),
+        kind=SegmentKind(kind),
         object=held if held >= 0 else None,
         touch=bool(record["touch"]),
         waypoints=record["waypoints"][:count].copy(),

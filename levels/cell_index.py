@@ -1,0 +1,78 @@
+"""Look up in a compiled model what a config names. Every mistake is one `RobotError` that says what the model has."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from levels.errors import RobotError
+from levels.motors import listed
+from levels.robot import RobotConfig
+from levels.touches import below, geoms_of
+
+NOUNS = {
+    mujoco.mjtObj.mjOBJ_SITE: "site",
+    mujoco.mjtObj.mjOBJ_BODY: "body",
+    mujoco.mjtObj.mjOBJ_GEOM: "geom",
+    mujoco.mjtObj.mjOBJ_JOINT: "joint",
+}
+
+
+def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> int:
+    """Return the id of a named element; `place` is the config's key. Raises `RobotError`."""
+    found = mujoco.mj_name2id(model, kind, name)
+    if found >= 0:
+        return int(found)
+    count = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom, "joint": model.njnt}[NOUNS[kind]]
+    have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
+    raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
+
+
+def find_all(model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str) -> NDArray[np.int_]:
+    """Return the ids of named elements. Raises `RobotError`."""
+    return np.array([find(model, kind, name, place) for name in names], dtype=int)
+
+
+def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_]) -> int:
+    """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm. Raises `RobotError`."""
+    tool = find(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
+    if not moved[model.site_bodyid[tool]]:
+        raise RobotError(f"robot.tool: '{name}' is on a body that the arm does not move")
+    return tool
+
+
+def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.bool_]) -> int | None:
+    """Return the id of the gripper's joint; None: the arm has no gripper. Raises `RobotError`."""
+    if robot.gripper is None:
+        return None
+    name = robot.gripper.joint
+    joint = find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
+    if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
+        raise RobotError(f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of its own")
+    return joint
+
+
+def hand_geoms(model: mujoco.MjModel, gripper: int | None) -> NDArray[np.int_]:
+    """Return the geoms of the body that carries the gripper's joint, and of all that hangs on that body."""
+    if gripper is None:
+        return np.zeros(0, dtype=int)
+    return geoms_of(model, below(model, model.body_parentid[model.jnt_bodyid[[gripper]]]))
+
+
+def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return the ids of the objects' free joints. Raises `RobotError` for a body without one."""
+    joints = model.body_jntadr[bodies]
+    for body, joint in zip(bodies, joints, strict=True):
+        if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+            raise RobotError(f"scene.objects: body '{model.body(body).name}' has no free joint; give it <freejoint/>")
+    return joints.astype(int)
+
+
+def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return the mocap ids of the obstacles. Raises `RobotError` for a body without one."""
+    for body in bodies:
+        if model.body_mocapid[body] < 0:
+            name = model.body(body).name
+            raise RobotError(f"scene.obstacles: body '{name}' cannot move by itself; give it mocap='true'")
+    return model.body_mocapid[bodies].astype(int)

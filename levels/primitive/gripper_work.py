@@ -1,0 +1,43 @@
+"""A GRIPPER segment under way: the gripper goes to an opening, as far as its force takes it."""
+
+from __future__ import annotations
+
+from backplane.message import Message
+from levels.messages import Error
+from levels.primitive.fault import Fault
+from levels.primitive.path_work import WorkRules
+from levels.primitive.segment import Segment
+from levels.primitive.tracking import HANDOVER_CYCLES, Quiet
+
+
+class GripperWork:
+    """One GRIPPER segment under way; it is done when the gripper has come to rest, wherever that is.
+
+    `closing` says whether an object is grasped by it, not released.
+    """
+
+    def __init__(self, segment: Segment, closing: bool, rules: WorkRules) -> None:
+        self.segment = segment
+        self.closing = closing
+        self.fault: Fault | None = None
+        self._permitted_m_s = rules.params.settled_opening
+        self._cycles = 0
+        # Before the command has reached it, the gripper rests too.
+        self._quiet = Quiet(rules.params.settled_cycles, rules.cycles(rules.params.settling))
+
+    @property
+    def held_after(self) -> int | None:
+        """The object in the gripper afterwards."""
+        return self.segment.object if self.closing else None
+
+    def done(self, status: Message) -> bool:
+        """Say whether the gripper has come to rest."""
+        self._cycles += 1
+        if self._cycles <= HANDOVER_CYCLES:
+            return False
+        speed = abs(status.opening_velocity)
+        settled = self._quiet.settled(speed < self._permitted_m_s)
+        if self._quiet.overdue and not settled:
+            reason = f"gripper still moves at {speed:.4f} m/s; below {self._permitted_m_s} is at rest"
+            self.fault = Fault(Error.FOLLOWING, reason)
+        return settled

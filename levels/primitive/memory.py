@@ -1,0 +1,32 @@
+"""What the executor must not forget: enough of its last messages to go on after its board has died."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from levels.level import Ports
+
+
+@dataclass
+class Memory:
+    """Newest segment done, segment that was under way (0: none), object held, and what the gripper was told (m, N)."""
+
+    done: int = 0
+    interrupted: int = 0
+    held: int | None = None
+    opening: float = 0.0
+    force: float = 0.0
+
+
+def recall(read: Ports, force: float) -> Memory:
+    """Return the memory of the level's own last messages; without any, the gripper stays as it is, with `force` in N."""
+    status, command = read.last_status, read.last_command
+    if not (status.is_there and command.is_there and command.value.due):
+        return Memory(opening=read.status.value.opening, force=force)
+    return Memory(
+        done=status.value.done,
+        interrupted=status.value.current,
+        held=status.value.held if status.value.held >= 0 else None,
+        opening=command.value.opening,
+        force=command.value.force,
+    )

@@ -1,0 +1,61 @@
+"""The README is true: its example level runs, as it stands there, and so do its commands."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+README = Path(__file__).parent.parent / "README.md"
+BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
+
+
+@pytest.fixture
+def example(tmp_path: Path) -> Path:
+    for name, text in BLOCK.findall(README.read_text()):
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def rack(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tools.cli", *words]
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=55, check=False, env=environment()
+    )
+
+
+def environment() -> dict[str, str]:
+    import os
+
+    return {**os.environ, "PYTHONPATH": str(README.parent)}
+
+
+def test_the_example_level_runs_as_the_readme_has_it(example: Path) -> None:
+    ended = rack(example, "run", "metered.toml", "--lockstep", "--seconds", "5", "--json")
+    assert ended.returncode == 0, ended.stderr
+    answer = json.loads(ended.stdout)
+    signals = pq.read_table(Path(example, answer["folder"], "signals.parquet"), filters=[("mailbox", "=", "power.status")])
+    assert signals.num_rows == 250
+    assert max(signals["power.status.energy"].to_pylist()) > 0.0
+
+
+def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
+    script = re.search(r"```python\n(from boards.rack.*?)```", README.read_text(), re.DOTALL)
+    assert script
+    (tmp_path / "script.py").write_text(script[1].replace('"nasrem"', '"nasrem"').replace("seconds=10", "seconds=1"))
+    ended = subprocess.run(
+        [sys.executable, "script.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=55,
+        check=False,
+        env=environment(),
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.startswith("time over 400 ")

@@ -1,0 +1,1 @@
+"""Benchmarks: what the backplane costs on this machine."""

@@ -1,0 +1,125 @@
+"""What one access to a mailbox costs: a message of 200 bytes, written and read, fields included."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from backplane import semaphores
+from backplane.layout import PROTOCOLS, Layout, MailboxSpec, Protocol, TaskSpec
+from backplane.message import Field, command
+from backplane.protocols import open_reader, open_writer
+from backplane.segment import Segment, unlink
+from boards.config.fields import field_specs
+
+CALLS = 20_000
+ROUNDS = 15
+MESSAGE = command(
+    "bench",
+    1,
+    Field("position", "f8", "rad", "joint positions", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    Field("torque", "f8", "N m", "joint torques", ("joints",)),
+)
+SIZES = {"joints": 8}
+
+
+@dataclass(frozen=True)
+class MailboxCost:
+    """One protocol's cost of an access in us: medians over rounds, and the fastest round."""
+
+    protocol: Protocol
+    bytes: int
+    write_us: float
+    read_us: float
+    write_best_us: float
+    read_best_us: float
+
+
+def measure() -> list[MailboxCost]:
+    """Return the cost of every protocol; their rounds are interleaved, for the machine's speed drifts."""
+    rack = f"bench-{os.getpid()}"
+    layout = _layout(rack)
+    segment = Segment.create(layout, "")
+    semaphores.create(layout)
+    try:
+        accesses = {p: _accesses(segment, p) for p in PROTOCOLS}
+        times: dict[Protocol, list[tuple[float, float]]] = {p: [] for p in PROTOCOLS}
+        for _ in range(ROUNDS):
+            for protocol, (write, read, both) in accesses.items():
+                # A read of an old message copies nothing: reads are measured as pairs less their writes.
+                alone = _us_a_call(write)
+                times[protocol].append((alone, _us_a_call(both) - alone))
+                read()
+        return [_cost(layout, protocol, rounds) for protocol, rounds in times.items()]
+    finally:
+        semaphores.unlink(layout)
+        unlink(rack)
+
+
+def _layout(rack: str) -> Layout:
+    size = MESSAGE.dtype(SIZES).itemsize
+    tasks = tuple(TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", "reader")))
+    boxes = tuple(
+        MailboxSpec(
+            name=f"writer.{protocol}",
+            writer="writer",
+            readers=("reader",),
+            protocol=protocol,
+            every=1,
+            delay=1,
+            depth=64,
+            message=MESSAGE.name,
+            version=MESSAGE.version,
+            size=size,
+            fields=field_specs(MESSAGE, SIZES),
+        )
+        for protocol in PROTOCOLS
+    )
+    return Layout(rack, 2_500_000, tasks, boxes)
+
+
+def _accesses(segment: Segment, protocol: Protocol) -> tuple[Callable[[], None], ...]:
+    writer, reader = open_writer(segment, f"writer.{protocol}"), open_reader(segment, f"writer.{protocol}")
+    message, joints, tick = writer.message, np.linspace(-1.0, 1.0, SIZES["joints"]), 0
+
+    def write() -> None:
+        nonlocal tick
+        tick += 1
+        message.id = tick
+        message.position[:] = joints
+        writer.write(tick)
+
+    def read() -> float:
+        reading = reader.read(tick + 1)
+        return reading.value.position[0]
+
+    def both() -> None:
+        write()
+        read()
+
+    return write, read, both
+
+
+def _us_a_call(call: Callable[[], None]) -> float:
+    start = time.perf_counter_ns()
+    for _ in range(CALLS):
+        call()
+    return (time.perf_counter_ns() - start) / CALLS / 1000
+
+
+def _cost(layout: Layout, protocol: Protocol, rounds: list[tuple[float, float]]) -> MailboxCost:
+    writes, reads = zip(*rounds, strict=True)
+    return MailboxCost(
+        protocol=protocol,
+        bytes=layout.mailbox(f"writer.{protocol}").size,
+        write_us=round(statistics.median(writes), 3),
+        read_us=round(statistics.median(reads), 3),
+        write_best_us=round(min(writes), 3),
+        read_best_us=round(min(reads), 3),
+    )
