@@ -12,29 +12,30 @@ import struct
 
 from backplane.segment import Segment
 
+_FLOCK = struct.Struct("hhqqi4x")
+"""`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description have none)."""
+
 
 class ByteLock:
     """The lock on the byte at a bus address."""
 
     def __init__(self, segment: Segment, address: int) -> None:
         self._fd = os.open(f"/proc/self/fd/{segment.fd}", os.O_RDWR | os.O_CLOEXEC)
-        self._address = address
+        self._take = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
+        self._give_back = _FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, address, 1, 0)
 
     def take(self) -> bool:
         """Take the lock; False when another has it."""
         try:
-            self._request(fcntl.F_WRLCK)
+            fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._take)
         except (BlockingIOError, PermissionError):
             return False
         return True
 
     def give_back(self) -> None:
         """Release the lock; it may be taken again."""
-        self._request(fcntl.F_UNLCK)
+        fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._give_back)
 
     def close(self) -> None:
         """Release the lock for good."""
         os.close(self._fd)
-
-    def _request(self, kind: int) -> None:
-        fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack("hhqqi4x", kind, os.SEEK_SET, self._address, 1, 0))

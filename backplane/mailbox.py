@@ -25,7 +25,7 @@ class Verdict(IntEnum):
     NONE = 0  # no message has come yet
     OLD = 1  # the message of an earlier read again
     NEW = 2  # a message not read before
-    BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one
+    BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one, and there is one
 
 
 class Reading(NamedTuple):
@@ -56,8 +56,8 @@ class Writer:
         self.spec = spec = segment.layout.mailbox(name)
         self._slots = Slots(segment, spec)
         self.message = self._slots.message
-        address = segment.map.mailboxes[name]
-        self._claim = ByteLock(segment, address)
+        self.bus_errors = 0
+        self._claim = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.CLAIM)
         if not self._claim.take():
             pid = self._slots.box[Box.WRITER_PID]
             self._claim.close()
@@ -119,8 +119,9 @@ class Reader:
 
     def _newest_visible(self, head: int, tick: int) -> int:
         """Walk back from the newest message to the newest that is visible, or to the one already read."""
-        visible_at, oldest = self._fetched.visible_at, max(self._serial, head - self._fetched.mask)
-        serial = head
+        visible_at = self._fetched.visible_at
+        # Past the last slot nothing is visible any more: what was, is overwritten, and taking it fails.
+        oldest, serial = max(self._serial, head - self._fetched.depth), head
         while serial > oldest and visible_at(serial) > tick:
             serial -= 1
         return serial
@@ -133,10 +134,13 @@ class Reader:
             return self._readings[Verdict.NEW]
         # Overwritten meanwhile: the reader came later than the slots reach back. Else: damaged.
         if self._box[0] - serial >= self._fetched.mask:
-            self.bus_errors += 1
-            return self._readings[Verdict.BUS_ERROR]
+            return self._cut_off()
         self.corrupt += 1
         return self._readings[Verdict.OLD if self._serial else Verdict.NONE]
+
+    def _cut_off(self) -> Reading:
+        self.bus_errors += 1
+        return self._readings[Verdict.BUS_ERROR if self._serial else Verdict.NONE]
 
     def age_ticks(self, tick: int) -> int | None:
         """Return the ticks since the release that wrote the last good message; None before the first."""

@@ -57,6 +57,7 @@ class Slots:
         address = segment.map.mailboxes[spec.name]
         stride = slot_stride(spec)
         self.box = segment.words[address // 8 : address // 8 + len(Box)]
+        self.depth = spec.depth
         self.mask = spec.depth - 1
         self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
         self.message = Message(self.dtype, self.record[SLOT_HEAD_SIZE:])

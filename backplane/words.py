@@ -92,7 +92,8 @@ class Box(IntEnum):
     HEAD = 0  # serial of the newest whole message; 0: none
     EPOCH = 1  # counts the writers that have claimed the mailbox
     WRITER_PID = 2
-    LOCK_HOLDER = 3  # pid in the critical section, protocol lock
+    CLAIM = 3  # no number: the writer holds the kernel's lock on this address
+    OWNER = 4  # likewise whoever is in the critical section, protocol lock
 
 
 class Slot(IntEnum):

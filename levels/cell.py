@@ -18,7 +18,7 @@ from levels.mjcf import compile_spec, load_spec
 from levels.motors import fit_gripper, fit_motors, listed
 from levels.robot import GripperConfig, RobotConfig
 from levels.scene import SceneConfig
-from levels.touches import below, geom_name, geoms_of, touch_matrix, touching
+from levels.touches import below, geom_name, geoms_of, touch_matrix, unmeant
 
 __all__ = ["STATE", "Bounds", "Cell", "Limits", "build_cell", "sizes"]
 
@@ -203,9 +203,8 @@ def check_start(cell: Cell, robot: RobotConfig) -> None:
     data = cell.start()
     if not np.isfinite(data.qacc).all():
         raise RobotError(f"model '{robot.model}': the acceleration at home is not finite; check masses, inertias, gravity")
-    pair = touching(data, cell.touch)
-    if pair is not None:
-        first, second = (geom_name(cell.model, g) for g in pair)
+    for pair in unmeant(data, cell.touch):
+        first, second = (geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
             f"robot.home: '{first}' touches '{second}'; move home or the object, name a support, or exclude the pair"
         )

@@ -11,7 +11,7 @@ from enum import IntEnum
 
 from backplane.message import Field, MessageType, command, status
 
-WINDOW = 4
+WINDOW = 8
 """Elemental moves that the task level hands down at once: the next level never waits for a cycle above it."""
 SEGMENTS = 2
 """Segments that the elemental move level hands down at once."""
@@ -237,6 +237,8 @@ ARM_STATE = MessageType(
     1,
     (
         Field("tick", "i8", "tick", "tick that the state belongs to"),
+        Field("clipped", "u4", "1", "cycles in which the limit gate cut a command"),
+        Field("touches", "u4", "1", "contacts that no task means"),
         Field("state", "f8", "", "mjSTATE_INTEGRATION of the simulated cell", ("state",)),
     ),
 )
@@ -256,7 +258,7 @@ WORLD_MODEL = MessageType(
     "world_model",
     1,
     (
-        Field("revision", "u4", "1", "rises whenever a body that was at rest moves, and when it rests again"),
+        Field("revision", "u4", "1", "rises whenever a body that was at rest moves, and when it rests again; 0: nothing sensed yet"),
         Field("position", "f8", "m", "body origins", ("bodies", 3)),
         Field("quaternion", "f8", "1", "body orientations", ("bodies", 4)),
         Field("velocity", "f8", "m/s", "body velocities, estimated", ("bodies", 3)),

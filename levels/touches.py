@@ -48,9 +48,8 @@ def geom_name(model: mujoco.MjModel, geom: int) -> str:
     return model.geom(geom).name or f"body {model.body(model.geom_bodyid[geom]).name}"
 
 
-def touching(data: mujoco.MjData, touch: NDArray[np.bool_]) -> tuple[int, int] | None:
-    """Return the first pair of geoms in a contact that no task means; None: there is none."""
+def unmeant(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return (n, 2): the pairs of geoms in contacts that no task means."""
     contact = data.contact
-    pairs = contact.geom
-    first = np.flatnonzero(touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0))
-    return (int(pairs[first[0], 0]), int(pairs[first[0], 1])) if first.size else None
+    pairs: NDArray[np.int32] = contact.geom
+    return pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0.0)]

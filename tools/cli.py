@@ -7,8 +7,11 @@ import sys
 import typer
 
 from tools.answer import Failure, fail
+from tools.check import check
 from tools.clean import clean
 from tools.list import list_racks
+from tools.report import report
+from tools.run import run
 from tools.status import status
 from tools.stop import stop
 
@@ -20,10 +23,13 @@ app = typer.Typer(
     help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
     epilog="Exit status: 0 it worked, 1 it did not, 2 usage or config error.",
 )
+app.command()(run)
+app.command()(check)
 app.command("list")(list_racks)
 app.command()(status)
 app.command()(stop)
 app.command()(clean)
+app.command()(report)
 
 
 def main() -> None:

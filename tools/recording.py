@@ -11,6 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from backplane.layout import Layout, MailboxSpec, TaskSpec
+from backplane.trace import RECORD
 from tools.answer import Failure
 
 
@@ -40,6 +42,14 @@ class Recording:
         return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
     @cached_property
+    def layout(self) -> Layout:
+        """The rack's layout; the fields of its messages are `signal`'s to know."""
+        text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
+        boxes = (MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": ()}) for m in text["mailboxes"])
+        tasks = tuple(TaskSpec(**task) for task in text["tasks"])
+        return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes))
+
+    @cached_property
     def lost(self) -> dict[str, int]:
         """Rows that were overwritten before the recorder came, by task and by mailbox."""
         texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
@@ -51,10 +61,15 @@ class Recording:
         table = self._cycles.read()
         names = table.column_names[1:]
         tasks = table["task"].to_numpy()
-        rows = np.empty(len(tasks), dtype=[(name, "i8") for name in names])
+        rows = np.empty(len(tasks), dtype=RECORD)
         for name in names:
             rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
+
+    @property
+    def no_cycles(self) -> np.ndarray:
+        """The trace of a task that has none."""
+        return np.empty(0, dtype=RECORD)
 
     def signal(self, mailbox: str, field: str) -> np.ndarray:
         """Return one field of every message of a mailbox, oldest first, shape (messages, *shape of the field).

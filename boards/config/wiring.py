@@ -14,6 +14,7 @@ from boards.config.ports import TaskPorts, all_ports
 from boards.config.rules import mistakes_in
 from boards.config.schema import BoardConfig, RackConfig
 from boards.errors import ConfigError, Mistake
+from levels.errors import ProgramError
 
 HISTORY_S = 2.0
 """Simulated time that mailboxes and trace rings keep for a recorder: real-time boards may starve it for 1 s."""
@@ -50,6 +51,8 @@ class Wiring:
         for ports in self._tasks:
             self._check_reads(ports)
         self._check_rest()
+        if "robot" not in broken and "scene" not in broken:
+            self._check_program()
 
     def _add_writer(self, ports: TaskPorts) -> None:
         for port, mailbox in ports.writes.items():
@@ -79,6 +82,19 @@ class Wiring:
         for name, board in self.config.board.items():
             if board.ends_run and name not in self._untold and f"{name}.status" not in self._writers:
                 self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
+
+    def _check_program(self) -> None:
+        """Check the program of the project's own task level; a user's own reads its `[task]` itself."""
+        robot = self.config.robot
+        if robot is None or not any(ports.kind.__module__.startswith("levels.task") for ports in self._tasks):
+            return
+        from levels.task import read_program  # imported by its board's class already
+
+        try:
+            read_program(self.config.task, robot, self.config.scene)
+        except ProgramError as error:
+            told = (line.partition(": ") for line in str(error).splitlines())
+            self.mistakes += [Mistake(place, None, why) for place, _, why in told]
 
     def _names(self) -> str:
         return ", ".join(self._writers)

@@ -105,7 +105,7 @@ class ElementalMoveExecutor(Executor):
             self._done = int(taken["move"])
             grasped = taken["kind"] == SegmentKind.GRIPPER and taken["opening"] == self._gripper.closed
             if grasped and self._is_shut(status):
-                self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm, it holds nothing")
+                self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm, without object")
 
     def _watch(self, status: Message, segments: SegmentWindow) -> None:
         """Fail with the level below, and when what was held is gone."""

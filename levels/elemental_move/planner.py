@@ -42,7 +42,7 @@ HANDED_DOWN = 1
 class ElementalMovePlanner(Planner):
     """Plans one move a time, the next one whose path is not yet there, from where the one before it will end.
 
-    What it knows of its own plans is only what the executor's status cannot show yet: a fresh planner goes on from there.
+    All it needs to go on after a restart stands in the executor's status.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {
@@ -154,8 +154,8 @@ class ElementalMovePlanner(Planner):
         """Remember how the object is grasped while it still rests; what is sensed of a carried one comes late."""
         world, held, done = read.world.value, read.primitive.value.held, read.status.value.done
         if held < 0:
-            grasps = (m for m in self._window if m.verb is Verb.GRASP and m.id > done and m.object is not None)
-            self._grip = next(((m.object, grip_of(m.object, m.tool, world)) for m in grasps if m.object is not None), None)
+            ahead = [(m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done]
+            self._grip = next(((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None)
         elif self._grip is None or self._grip[0] != held:
             tool = self._motion.ik.tool_at(np.array(read.servo.value.position))
             self._grip = (held, grip_of(held, tool, world))

@@ -98,7 +98,7 @@ class CollisionChecker:
         distance = self._data.contact.dist[worst]
         pair = f"'{geom_name(self._model, first)}' and '{geom_name(self._model, second)}'"
         least = distance + short[worst]
-        return f"{pair} are {distance * 1e3:.1f} mm apart, {least * 1e3:.1f} mm is the least"
+        return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {least * 1e3:.1f} mm"
 
     def _shortfalls(self, q: Array, clearance: float | None) -> Array:
         """Return what each close pair lacks to its required distance, in m."""

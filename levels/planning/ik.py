@@ -20,6 +20,9 @@ RESTARTS = 40
 PATIENCE = 8
 """Starts in a row that bring no new solution and end the search, once there is one."""
 ITERATIONS = 25
+STALLED_ITERATIONS = 5
+STALLED_PART = 0.7
+"""A descent whose error has not come down to this part within that many iterations is given up."""
 POSITION_TOLERANCE_M = 1e-5
 ANGLE_TOLERANCE_RAD = 1e-5
 SAME_RAD = 1e-2
@@ -57,10 +60,14 @@ class InverseKinematics:
         """Return the configuration (joints,) at `target` that one descent from `start` finds, or None."""
         self._task.set_target(mink.SE3(np.concatenate([target.quaternion, target.position])))
         self._move_to(np.clip(start, self._inner_low, self._inner_high))
+        errors: list[float] = []
         for _ in range(ITERATIONS):
             error = self._task.compute_error(self._configuration)
             if max(abs(error[:3])) < POSITION_TOLERANCE_M and max(abs(error[3:])) < ANGLE_TOLERANCE_RAD:
                 return np.array(self._configuration.q[self._cell.qpos])
+            errors.append(float(np.linalg.norm(error)))
+            if len(errors) > STALLED_ITERATIONS and errors[-1] > STALLED_PART * errors[-1 - STALLED_ITERATIONS]:
+                return None
             try:
                 velocity = mink.solve_ik(
                     self._configuration, [self._task], 1.0, "daqp", 1e-6, limits=self._limits, constraints=self._frozen

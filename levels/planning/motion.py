@@ -13,7 +13,7 @@ from levels.planning.ik import SAME_RAD, InverseKinematics
 from levels.planning.line import straight_line
 from levels.planning.move import NAMES, Move
 from levels.planning.path import Path
-from levels.planning.path_planner import PathPlanner
+from levels.planning.path_planner import SEARCHES, PathPlanner
 from levels.planning.pose import Pose
 from levels.planning.situation import Situation
 from levels.scene import SceneConfig
@@ -37,17 +37,24 @@ class MotionPlanner:
         self.paths = PathPlanner(cell, scene.clearance, seed)
 
     def plan(
-        self, move: Move, start: Array, situation: Situation, attempt: int = 0, goal: Array | None = None
+        self,
+        move: Move,
+        start: Array,
+        situation: Situation,
+        attempt: int = 0,
+        goal: Array | None = None,
+        searches: int = SEARCHES,
     ) -> Path:
         """Return the path of `move` from `start` (joints,), rad.
 
         `attempt` counts tries in the same situation. With `goal` (joints,) the path ends there, so that paths planned
-        from there stay good. Raises `Refused`: UNREACHABLE when no configuration serves, NO_PATH when all are blocked.
+        from there stay good. `searches` as in `PathPlanner.plan`. Raises `Refused`: UNREACHABLE when no configuration
+        serves, NO_PATH when all are blocked.
         """
         self.lay_out(move, situation)
         if move.touches:
             return self._line(move, start, goal)
-        return self.path_to(move, start, self.goal(move, start) if goal is None else goal, attempt)
+        return self._path_to(move, start, self.goal(move, start) if goal is None else goal, attempt, searches)
 
     def lay_out(self, move: Move, situation: Situation) -> None:
         """Set the collision checker to `situation` with the contacts that `move` means."""
@@ -72,10 +79,9 @@ class MotionPlanner:
         why = self.checker.why(reachable[0])
         raise Refused(Error.NO_PATH, f"{NAMES[move.verb]} to {at(move.tool)}: {why}")
 
-    def path_to(self, move: Move, start: Array, goal: Array, attempt: int = 0) -> Path:
-        """Return a path between two configurations, as the checker is set. Raises `Refused` with NO_PATH."""
+    def _path_to(self, move: Move, start: Array, goal: Array, attempt: int, searches: int) -> Path:
         clearance = self._clearance_at(start)
-        path = self.paths.plan(start, goal, lambda q: self.checker.free(q, clearance), attempt)
+        path = self.paths.plan(start, goal, lambda q: self.checker.free(q, clearance), attempt, searches)
         if path is None:
             why = self.checker.why(start, clearance) or self.checker.why(goal, clearance) or "no free path was found"
             raise Refused(Error.NO_PATH, f"{NAMES[move.verb]} to {at(self.ik.tool_at(goal))}: {why}")

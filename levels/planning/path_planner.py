@@ -19,9 +19,10 @@ Array = NDArray[np.float64]
 Free = Callable[[Array], bool]
 
 CHECKS = 24_000
-"""Configurations that one search may check, all attempts together: what bounds its time."""
-ATTEMPTS = 6
-"""Searches with seeds of their own; the quickest path of them is taken."""
+"""Configurations that may be checked, all searches of a plan together: what bounds its time."""
+SEARCHES = 6
+"""Searches of one plan, each with a seed of its own; the quickest path found is taken."""
+LARGEST_SEED = 2**31 - 1
 STEP_PART = 0.5
 """No point of the arm moves farther between two checks than this part of the clearance."""
 LEAST_LEVER_M = 0.05
@@ -45,17 +46,20 @@ class PathPlanner:
         resolution = STEP_PART * clearance / float(np.sqrt(len(levers)))
         self._search = SampledSearch(low, high, levers, resolution)
 
-    def plan(self, start: Array, goal: Array, free: Free, attempt: int = 0) -> Path | None:
+    def plan(
+        self, start: Array, goal: Array, free: Free, attempt: int = 0, searches: int = SEARCHES
+    ) -> Path | None:
         """Return the quickest path found from `start` to `goal` (joints,), rad, or None.
 
-        `attempt` asks for other random numbers: for another try in the same world.
+        `attempt` asks for other random numbers: for another try in the same world. With fewer `searches` the path is
+        found sooner and is never quicker than with more.
         """
         if not (free(start) and free(goal)):
             return None
         straight = np.array([start, goal])
         if self._line_is_free(start, goal, free):
             return Path(straight, np.zeros(2))
-        paths = self._sampled(start, goal, free, attempt)
+        paths = self._sampled(start, goal, free, attempt, searches)
         return min(paths, key=self.duration, default=None)
 
     def rounded(self, waypoints: Array, free: Free) -> Path:
@@ -77,16 +81,16 @@ class PathPlanner:
         """Return the time of `path`, rest to rest, in s."""
         return duration(BlendedPath(*path), self._limits)
 
-    def _sampled(self, start: Array, goal: Array, free: Free, attempt: int) -> list[Path]:
+    def _sampled(self, start: Array, goal: Array, free: Free, attempt: int, searches: int) -> list[Path]:
         paths: list[Path] = []
         left = CHECKS
-        for k in range(ATTEMPTS):
-            seed = 1 + (self._seed + attempt * ATTEMPTS + k) % (2**31 - 1)
+        for k in range(SEARCHES):
+            seed = 1 + (self._seed + attempt * SEARCHES + k) % LARGEST_SEED
             polyline, checks = self._search.search(start, goal, free, seed, left)
             left -= checks
             if polyline is not None and len(polyline) <= WAYPOINTS:
                 paths.append(self.rounded(polyline, free))
-            if left <= 0:
+            if left <= 0 or len(paths) == searches:
                 break
         return paths
 

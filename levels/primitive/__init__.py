@@ -1,4 +1,4 @@
-"""The primitive level: paths become jerk-limited joint set points, one a cycle, their timing planned in the background."""
+"""The primitive level: paths become jerk-limited joint set points, one a cycle, timed in the background."""
 
 from levels.primitive.executor import PrimitiveExecutor
 from levels.primitive.planner import PrimitivePlanner

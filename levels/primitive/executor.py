@@ -23,12 +23,16 @@ from levels.primitive.gripper_work import GripperWork
 from levels.primitive.guard import Guard
 from levels.primitive.memory import Memory, recall
 from levels.primitive.params import PrimitiveParams
+from levels.primitive.path_motion import SetPoint
 from levels.primitive.path_work import PathWork, WorkRules
 from levels.primitive.plans import Plans
 from levels.primitive.segment import Segment, read_segment, window
 from levels.primitive.tracking import Tracking
 
 Work = PathWork | GripperWork
+
+DELAY_CYCLES = 3
+"""Cycles from the sensing of the world model to the set point commanded last: what moves has gone on meanwhile."""
 
 
 class PrimitiveExecutor(Executor):
@@ -52,8 +56,8 @@ class PrimitiveExecutor(Executor):
         super().__init__(context)
         self._params = read_params(PrimitiveParams, context.params)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self._rules = WorkRules(cell.limits, self._params, context.period_s)
-        self._guard = Guard(cell, context.scene, self._params.lookahead)
+        self._rules = WorkRules(context.robot.joints, cell.limits, self._params, context.period_s)
+        self._guard = Guard(cell, context.scene, self._params.lookahead, DELAY_CYCLES * context.period_s)
         self._gripper = context.robot.gripper
         self._tracking = Tracking()
         self._plans = Plans()
@@ -62,6 +66,7 @@ class PrimitiveExecutor(Executor):
         self._fault: Fault | None = None
         self._faulty = 0
         self._position = cell.home.copy()
+        self._rest = SetPoint(self._position, *np.zeros((2, len(cell.home))))
         self._blind_cycles = 0
         self._tick: int | None = None
 
@@ -168,7 +173,8 @@ class PrimitiveExecutor(Executor):
         if away.max() <= permitted:
             return None
         joint = int(away.argmax())
-        reason = f"joint {joint + 1} is {away[joint]:.4f} rad from its set point; at most {permitted} is valid"
+        name = self.context.robot.joints[joint]
+        reason = f"joint '{name}' is {away[joint]:.4f} rad from its set point; at most {permitted} is valid"
         return Fault(Error.FOLLOWING, reason)
 
     def _is_blind(self, read: Ports) -> bool:
@@ -183,7 +189,7 @@ class PrimitiveExecutor(Executor):
         for serial, kind in zip(serials, kinds, strict=False):
             begin = 0.0 if kind == SegmentKind.PATH else None
             if work is not None and serial == work.segment.id:
-                begin = work.begin_wanted
+                begin = work.begin_wanted if isinstance(work, PathWork) else None
             if serial > done and begin is not None and self._plans.lacks(serial, begin):
                 return serial, begin
         return 0, 0.0
@@ -194,9 +200,8 @@ class PrimitiveExecutor(Executor):
         # Out of step, no set point is better than one from where the arm may not be.
         command.due = tick + 2 * every if self._tracking.in_step else 0
         command.position[:] = self._position
-        moving = isinstance(work, PathWork) and self._tracking.in_step
-        command.velocity[:] = work.motion.set_point.velocity if moving else 0.0
-        command.acceleration[:] = work.motion.set_point.acceleration if moving else 0.0
+        _, velocity, acceleration = work.motion.set_point if isinstance(work, PathWork) else self._rest
+        command.velocity[:], command.acceleration[:] = velocity, acceleration
         if memory is not None:
             command.opening, command.force = memory.opening, memory.force
             command.held = memory.held if memory.held is not None else -1

@@ -27,34 +27,35 @@ FAR_STEP_RAD = 0.04
 CLEARANCE_PART = 0.5
 """Part of the planned clearance that must be left: sensed poses are not exact."""
 MOVING_M_S = 0.01
-"""A body slower than this is at rest."""
+"""An obstacle slower than this, along every axis, is at rest."""
 
 
 class Guard:
     """Watches one path at a time against the world model.
 
-    In every cycle it checks the near way, as far as `lookahead_s` reaches, with every body put where its velocity takes it
-    until the arm is there; and a few configurations of the whole remaining path against the bodies as they are. These
-    count only while no body moves: what moves may be gone by then. At most 13 checks a cycle.
+    In every cycle it checks the near way, as far as `lookahead_s` reaches, with every obstacle put where its velocity
+    takes it until the arm is there; and a few configurations of the whole remaining path against all bodies as they
+    are. These count only while no obstacle moves: what moves may be gone by then. At most 13 checks a cycle.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float) -> None:
+    def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
+        """Look `lookahead_s` ahead; `delay_s` is the time from the sensing of the world to the set point commanded."""
         self._checker = CollisionChecker(cell, scene)
         self._grasps = GraspFrame(cell)
         self._clearance = CLEARANCE_PART * scene.clearance
-        self._rows = len(scene.bodies)
+        self._rows, self._objects = len(scene.bodies), len(scene.objects)
+        self._by_themselves = (np.arange(self._rows) >= self._objects)[:, None].astype(float)
         self._lookahead_s = lookahead_s
+        self._delay_s = delay_s
         self._spacing_s = lookahead_s / NEAR_CHECKS
         self._phase = 0
         self._cursor = 0.0
         self._obstructed: float | None = None
         self._least = self._clearance
-        self._held: int | None = None
         self._ahead = np.zeros((self._rows, 3))
 
     def carry(self, row: int | None, q: Array, world: Message) -> None:
         """Take object `row` along with the tool, from where it is while the arm is at `q`; None: carry nothing."""
-        self._held = row
         if row is None:
             self._checker.hold(None)
         else:
@@ -71,31 +72,25 @@ class Guard:
         self._obstructed = None
         self._cursor = 0.0
 
-    def is_clear(self, path: BlendedPath, begin: float, trajectory: Trajectory | None, time_s: float, world: Message) -> bool:
-        """Say, within a cycle's share of the checks, whether nothing is in the way.
-
-        The arm is `time_s` along `trajectory`, or rests at `begin` without one.
-        """
-        velocity = world.velocity[: self._rows]
-        moving = np.linalg.norm(velocity, axis=1) > MOVING_M_S
-        if self._held is not None:
-            moving[self._held] = False
+    def is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message) -> bool:
+        """Say, within a cycle's share of the checks, whether nothing is in the way of an arm `time_s` along."""
+        begin = trajectory.at(time_s).s
+        obstacles = world.velocity[self._objects : self._rows]
+        still = bool((np.abs(obstacles) < MOVING_M_S).all())
         self._place(world)
         far_clear = self._far_is_clear(path, begin)
-        near_clear = True
-        if trajectory is not None:
-            near_clear = self._near_is_clear(path, trajectory, time_s, world, velocity * moving[:, None])
-        return near_clear and (far_clear or bool(moving.any()))
+        near_clear = self._near_is_clear(path, trajectory, time_s, world, still)
+        return near_clear and (far_clear or not still)
 
     def _near_is_clear(
-        self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message, velocity: Array
+        self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message, still: bool
     ) -> bool:
-        still = not velocity.any()
         self._phase = (self._phase + 1) % PHASES
         for k in range(NEAR_CHECKS):
             ahead_s = (k + (self._phase + 1) / PHASES) * self._spacing_s
             if not still:
-                np.multiply(velocity, ahead_s, out=self._ahead)
+                np.multiply(self._by_themselves, ahead_s + self._delay_s, out=self._ahead)
+                self._ahead *= world.velocity[: self._rows]
                 self._ahead += world.position[: self._rows]
                 self._checker.place(self._ahead, world.quaternion)
             if not self._free(path, trajectory.at(time_s + ahead_s).s):

@@ -19,7 +19,7 @@ class Memory:
 
 
 def recall(read: Ports, force: float) -> Memory:
-    """Return the memory of the level's own last messages; without any, the gripper stays as it is, with `force` in N."""
+    """Return what the level's own last messages say; without any, the gripper stays as it is, with `force` in N."""
     status, command = read.last_status, read.last_command
     if not (status.is_there and command.is_there and command.value.due):
         return Memory(opening=read.status.value.opening, force=force)

@@ -19,5 +19,8 @@ class PrimitiveParams(Table):
     bridging: Positive = Field(0.5, description="time in which such a distance is taken back, s")
     silent: Positive = Field(2.0, description="time without status from below that is an error, s")
     blind: Positive = Field(0.2, description="time without a new world model after which motion holds, s")
+    braking: float = Field(
+        1.5, ge=1.0, le=3.0, description="multiple of the planned acceleration and jerk limits that a hold may use"
+    )
     lookahead: Positive = Field(2.0, description="time ahead of the arm that the guard watches in every cycle, s")
     clear: Positive = Field(0.5, description="time that the way must be clear before held motion goes on, s")

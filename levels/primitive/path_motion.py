@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from levels.primitive.path import COINCIDENT_RAD, BlendedPath
-from levels.primitive.speed import JointLimits
+from levels.primitive.speed import BrakingLimits
 from levels.primitive.stop import make_stop
 from levels.primitive.trajectory import Trajectory
 
@@ -32,13 +32,13 @@ class PathMotion:
     The arm may begin a little beside the path: the distance is taken back over `bridging_s` while it moves.
     """
 
-    def __init__(self, path: BlendedPath, limits: JointLimits, bridging_s: float) -> None:
+    def __init__(self, path: BlendedPath, braking: BrakingLimits, bridging_s: float) -> None:
         self.path = path
         self.s = 0.0
         self.trajectory: Trajectory | None = None
         self.time_s = 0.0
         self.stopping = False
-        self._limits = limits
+        self._braking = braking
         self._bridging_s = bridging_s
         self._offset = np.zeros(path.joints)
         self._bridged_s = bridging_s
@@ -61,11 +61,11 @@ class PathMotion:
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
     def rest_at(self, position: Array) -> float:
-        """Rest at the begin of the path, beside it where `position` (joints,) is; return the largest distance, in rad."""
+        """Rest at the begin of the path, at `position` (joints,); return a joint's largest distance between them."""
         return self._rest(0.0, position)
 
     def rest_near(self, position: Array) -> float:
-        """Rest where the path is nearest to `position` (joints,); return the largest distance of a joint, in rad."""
+        """Rest where the path is nearest, at `position` (joints,); return a joint's largest distance between them."""
         points = self.path.sample(NEAREST_STEP_RAD)
         nearest = int(np.argmin(np.linalg.norm(points - position, axis=1)))
         return self._rest(self.path.length * nearest / max(len(points) - 1, 1), position)
@@ -77,10 +77,10 @@ class PathMotion:
         self.stopping = False
 
     def hold(self) -> None:
-        """Begin to ramp to rest on the path, as soon as the joint limits let it; call in every cycle."""
+        """Begin to ramp to rest on the path, as soon as the braking limits let it; call in every cycle."""
         if self.trajectory is None or self.stopping:
             return
-        stop = make_stop(self.path, self._limits, self.trajectory.at(self.time_s))
+        stop = make_stop(self.path, self._braking, self.trajectory.at(self.time_s))
         if stop is not None:
             self.trajectory, self.time_s, self.stopping = stop, 0.0, True
 
@@ -109,8 +109,9 @@ class PathMotion:
         np.subtract(position, self.path.evaluate(s).q, out=self._offset)
         distance = float(np.abs(self._offset).max())
         self._bridged_s = 0.0 if distance > COINCIDENT_RAD else self._bridging_s
-        for value, start in zip(self.set_point, (position, 0.0, 0.0), strict=True):
-            value[:] = start
+        self.set_point.position[:] = position
+        self.set_point.velocity.fill(0.0)
+        self.set_point.acceleration.fill(0.0)
         return distance
 
     def _come_to_rest(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from levels.primitive.params import PrimitiveParams
 from levels.primitive.path import BlendedPath
 from levels.primitive.path_motion import PathMotion
 from levels.primitive.segment import Segment
-from levels.primitive.speed import JointLimits
+from levels.primitive.speed import BrakingLimits, JointLimits, braking_limits
 from levels.primitive.tracking import Quiet
 from levels.primitive.trajectory import Trajectory
 
@@ -26,9 +27,15 @@ Array = NDArray[np.float64]
 class WorkRules:
     """What every piece of work needs of its level; `period_s` is the cycle, in s."""
 
+    joints: tuple[str, ...]
     limits: JointLimits
     params: PrimitiveParams
     period_s: float
+
+    @property
+    def braking(self) -> BrakingLimits:
+        """Limits of a hold."""
+        return braking_limits(self.limits, self.params.braking)
 
     def cycles(self, time_s: float) -> int:
         """Return the cycles that fill `time_s`."""
@@ -49,7 +56,7 @@ class PathWork:
 
     def __init__(self, segment: Segment, path: BlendedPath, guard: Guard, rules: WorkRules) -> None:
         self.segment = segment
-        self.motion = PathMotion(path, rules.limits, rules.params.bridging)
+        self.motion = PathMotion(path, rules.braking, rules.params.bridging)
         self.fault: Fault | None = None
         self.blocked = False
         self.astray = False
@@ -64,8 +71,8 @@ class PathWork:
         permitted = self._rules.params.astray
         distance = self.motion.rest_at(position)
         if distance > permitted:
-            reason = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests; at most {permitted} is valid"
-            self.fault = Fault(Error.LIMIT, reason)
+            begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
+            self.fault = Fault(Error.LIMIT, f"{begins}; at most {permitted} is valid")
 
     def begin_near(self, position: Array) -> None:
         """Be ready to go on from `position` (joints,), rad; blocked when that is off the path."""
@@ -79,13 +86,13 @@ class PathWork:
         `now_s` is the simulated time of the set point commanded last.
         """
         motion = self.motion
-        if not motion.resting and not motion.stopping:
-            clear = self._guard.is_clear(motion.path, motion.s, motion.trajectory, motion.time_s, world)
+        if motion.trajectory is not None and not motion.stopping:
+            clear = self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, world)
             self.blocked = not clear
             if hold or self.blocked:
                 motion.hold()
         elif motion.resting and trajectory is not None and not motion.finished and not self.astray:
-            clear = self._guard.is_clear(motion.path, motion.s, trajectory, 0.0, world)
+            clear = self._guard.is_clear(motion.path, trajectory, 0.0, world)
             self._set_out(hold, clear, trajectory, now_s)
         motion.advance(duration_s)
 
@@ -96,9 +103,9 @@ class PathWork:
         away = np.abs(status.position - self.motion.set_point.position)
         settled = self._quiet.settled(bool((away < self._rules.params.settled).all()))
         if self._quiet.overdue and not settled:
-            joint = int(away.argmax())
-            permitted = self._rules.params.settled
-            reason = f"joint {joint + 1} rests {away[joint]:.4f} rad from its goal; at most {permitted} is valid"
+            joint, permitted = int(away.argmax()), self._rules.params.settled
+            name = self._rules.joints[joint]
+            reason = f"joint '{name}' rests {away[joint]:.4f} rad from its goal; at most {permitted} is valid"
             self.fault = Fault(Error.FOLLOWING, reason)
         return settled
 
@@ -146,5 +153,6 @@ class PathWork:
 
 def too_late(segment: Segment, earliest: float) -> Fault:
     """Return the fault of a segment that could be done at `earliest`, in s, but is wanted before."""
+    earliest = ceil(earliest * 1e3) / 1e3  # what is read there must be met when it is asked for
     reason = f"segment {segment.id} is wanted by {segment.by:.3f} s; the earliest is {earliest:.3f} s"
     return Fault(Error.TOO_LATE, reason, earliest)

@@ -30,7 +30,8 @@ class PrimitivePlanner(Planner):
         super().__init__(context)
         limits = build_cell(context.robot, context.scene, context.clock_ns).limits
         self._positions = limits.position
-        self._rules = WorkRules(limits, read_params(PrimitiveParams, context.params), context.period_s)
+        params = read_params(PrimitiveParams, context.params)
+        self._rules = WorkRules(context.robot.joints, limits, params, context.period_s)
         self._made = (0, 0.0)
         self._answered_at = 0
 
@@ -67,8 +68,8 @@ class PrimitivePlanner(Planner):
         outside = np.argwhere((path.waypoints < low) | (path.waypoints > high))
         if len(outside):
             k, j = outside[0]
-            value = path.waypoints[k, j]
-            raise ValueError(f"waypoint {k}, joint {j + 1} at {value:.4f} rad; {low[j]:.4f} to {high[j]:.4f} is valid")
+            place = f"waypoint {k}, joint '{self.context.robot.joints[j]}' at {path.waypoints[k, j]:.4f} rad"
+            raise ValueError(f"{place}; {low[j]:.4f} to {high[j]:.4f} is valid")
         return path
 
     def _write(self, write: Message, segment: Segment, trajectory: Trajectory, start_s: float) -> Fault | None:

@@ -38,11 +38,15 @@ def window(command: Message) -> list[int]:
 
 
 def read_segment(command: Message, serial: int) -> Segment:
-    """Return the segment of that serial, which must be in the window. Raises `ValueError` for an unknown kind."""
+    """Return the segment of that serial, which must be in the window. Raises `ValueError` for an unknown kind
+    and for numbers that are not finite.
+    """
     record = command.segments[window(command).index(serial)]
     count, kind, held = int(record["count"]), int(record["kind"]), int(record["object"])
     if kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):
         raise ValueError(f"segment {serial}: kind {kind}; valid: 1 (path), 2 (gripper)")
+    if not np.isfinite([record["by"], record["opening"], record["force"]]).all():
+        raise ValueError(f"segment {serial}: by, opening or force is not finite")
     return Segment(
         id=serial,
         kind=SegmentKind(kind),

@@ -26,6 +26,19 @@ class JointLimits(Protocol):
     def jerk(self) -> Array: ...
 
 
+class BrakingLimits(NamedTuple):
+    """Limits of a hold, as `JointLimits`."""
+
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+
+
+def braking_limits(limits: JointLimits, factor: float) -> BrakingLimits:
+    """Return limits with `factor` times the acceleration and jerk: on a curve, planned motion may use all there is."""
+    return BrakingLimits(limits.velocity, factor * limits.acceleration, factor * limits.jerk)
+
+
 class SpeedLimits(NamedTuple):
     """Limits of ds/dt and its derivatives, in rad/s, rad/s2, rad/s3; acceleration 0: constant speed."""
 

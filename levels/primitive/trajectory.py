@@ -17,9 +17,8 @@ from levels.primitive.speed import JointLimits, SpeedLimits, boundary_speeds, sp
 
 Array = NDArray[np.float64]
 
-SHARES = (0.75, 0.6, 0.45)
-"""Parts of a curve's highest speed that are tried; the fastest trajectory is taken. None is 1: at full speed a curve
-takes all the acceleration there is, and no motion could come to rest on it."""
+SHARES = (1.0, 0.9, 0.75, 0.6)
+"""Parts of a curve's highest speed that are tried; the fastest trajectory is taken."""
 SHORTEST_S = 1e-12
 """Sections shorter than this are dropped."""
 

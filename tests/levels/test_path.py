@@ -62,7 +62,8 @@ def test_only_a_corner_without_blend_is_a_stop() -> None:
 def test_rounded_corner_stays_between_the_corner_and_its_chord() -> None:
     path = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.4, 0.0])
     q, _, _ = points(path, np.linspace(0.6, 1.4, 101))
-    assert (q[:, 0] <= 1.0).all() and (q[:, 1] >= 0.0).all()
+    assert (q[:, 0] <= 1.0).all()
+    assert (q[:, 1] >= 0.0).all()
     assert (q[:, 0] - q[:, 1] >= 0.6 - 1e-12).all()
 
 
@@ -78,8 +79,11 @@ def test_blends_that_touch_leave_no_line_between_them() -> None:
 def test_single_waypoint_is_a_path_of_length_zero() -> None:
     path = BlendedPath([[0.3, -0.4]], [0.7])
     point = path.evaluate(0.5)
-    assert path.length == 0.0 and path.stops == []
-    assert point.q == pytest.approx([0.3, -0.4]) and not point.dq_ds.any() and not point.d2q_ds2.any()
+    assert path.length == 0.0
+    assert path.stops == []
+    assert point.q == pytest.approx([0.3, -0.4])
+    assert not point.dq_ds.any()
+    assert not point.d2q_ds2.any()
     assert path.sample(0.1) == pytest.approx(np.array([[0.3, -0.4]]))
 
 
@@ -88,13 +92,14 @@ def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
     assert path.waypoints == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
     assert path.blend == pytest.approx([0.0, 0.2, 0.0])
     nowhere = BlendedPath([[1.0, 2.0]] * 3, [0.0, 0.5, 0.0])
-    assert nowhere.length == 0.0 and nowhere.evaluate(0.0).q == pytest.approx([1.0, 2.0])
+    assert nowhere.length == 0.0
+    assert nowhere.evaluate(0.0).q == pytest.approx([1.0, 2.0])
 
 
 def test_samples_are_no_further_apart_than_asked() -> None:
     sampled = BlendedPath(CORNERED, BLEND).sample(0.05)
     assert np.linalg.norm(np.diff(sampled, axis=0), axis=1).max() <= 0.05 + 1e-12
-    assert sampled[0] == pytest.approx(CORNERED[0]) and sampled[-1] == pytest.approx(CORNERED[-1])
+    assert sampled[[0, -1]] == pytest.approx(CORNERED[[0, -1]])
 
 
 @pytest.mark.parametrize(

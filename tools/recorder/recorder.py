@@ -61,7 +61,7 @@ class Recorder:
             self._words[System.FOLLOWER_TICK] = tick
 
     def follow(self, until: int | None = None) -> None:
-        """Record until the run is over, or until the descriptor `until` can be read: a line, or its other end is gone."""
+        """Record until the run is over; with a descriptor `until`, until that can be read or its other end is gone."""
         period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
         watched = [] if until is None else [until]
         while not select.select(watched, [], [], period_s)[0]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,8 @@ class SignalsFile:
         self._columns = {mailbox.name: columns_of(mailbox) for mailbox in layout.mailboxes}
         self._waiting: dict[str, list[np.ndarray]] = {name: [] for name in self._columns}
         head = [pa.field("mailbox", pa.string()), *(pa.field(name, pa.int64()) for name in HEAD)]
-        self._schema = pa.schema(head + [column.field for columns in self._columns.values() for column in columns])
+        fields = head + [column.field for columns in self._columns.values() for column in columns]
+        self._schema = pa.schema(fields, metadata={"layout": json.dumps(asdict(layout))})
         texts = [column.name for columns in self._columns.values() for column in columns if column.kind[1] == "S"]
         self._writer = pq.ParquetWriter(
             path,

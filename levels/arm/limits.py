@@ -1,0 +1,78 @@
+"""The limit gate: no torque passes that would break a torque, velocity or position limit within the cycle."""
+
+from __future__ import annotations
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from levels.cell import Bounds
+from levels.dynamics import Terms
+
+Array = NDArray[np.float64]
+
+SPEED_USED = 0.99
+"""Part of a velocity limit that the gate lets a joint reach: what its model leaves out within a cycle fits in the rest."""
+RANGE_KEPT_RAD = 0.002
+"""What the gate keeps from the ends of a joint's range, for the same reason."""
+
+
+HARD, SOFT = 0, 8
+"""Kinds of constraints of the solver."""
+
+
+class LimitGate:
+    """Cuts torques so that the next cycle ends within limits, from which the arm can still be stopped.
+
+    A joint may be as fast as it can brake, with `braking` (joints,), rad/s2, before the end of its range. The velocities
+    that follow from torques are predicted with the arm's own equation of motion. Torques that lead too far give way to the
+    nearest ones, in acceleration, that do not: a small quadratic program, in which the torque limits are the last word.
+    """
+
+    def __init__(self, bounds: Bounds, braking: Array, period_s: float) -> None:
+        self._torque = bounds.torque
+        self._fastest = SPEED_USED * bounds.velocity
+        self._low = bounds.position[:, 0] + RANGE_KEPT_RAD
+        self._high = bounds.position[:, 1] - RANGE_KEPT_RAD
+        self._braking = braking
+        self._period_s = period_s
+        joints = len(braking)
+        self._unity = np.eye(joints)
+        self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
+
+    def admit(self, torque: Array, q: Array, qd: Array, terms: Terms, friction: Array) -> tuple[Array, bool]:
+        """Return the torques (joints,), N m, that may pass at state `q`, `qd`, and whether anything was cut.
+
+        `terms` and `friction` are those of the state. `torque` must be finite.
+        """
+        passed = np.clip(torque, -self._torque, self._torque)
+        resisting = terms.bias + friction
+        gain = np.linalg.solve(terms.inertia, passed - resisting) * self._period_s
+        least = -self._speed_towards(q - self._low, -qd) - qd
+        most = self._speed_towards(self._high - q, qd) - qd
+        if (gain < least).any() or (gain > most).any():
+            passed = self._nearest(gain, least, most, terms.inertia, resisting)
+        return passed, not np.array_equal(passed, torque)
+
+    def _nearest(self, gain: Array, least: Array, most: Array, inertia: Array, resisting: Array) -> Array:
+        """Return the torques whose gain in velocity, rad/s a cycle, is nearest to `gain` between `least` and `most`."""
+        scale = self._fastest
+        per_torque = inertia * (scale / self._period_s) / self._torque[:, None]
+        offset = resisting / self._torque
+        upper = np.concatenate((most / scale, 1.0 - offset))
+        lower = np.concatenate((least / scale, -1.0 - offset))
+        nearest, _, status, _ = daqp.solve(self._unity, -gain / scale, per_torque, upper, lower, self._kinds)
+        if status < 0:
+            nearest = np.clip(gain, least, most) / scale
+        return np.clip((per_torque @ nearest + offset) * self._torque, -self._torque, self._torque)
+
+    def _speed_towards(self, distance: Array, speed: Array) -> Array:
+        """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.
+
+        With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and from there must stop within what is
+        left: v'^2 / 2 a <= distance - (v + v') T / 2.
+        """
+        half = 0.5 * self._braking * self._period_s
+        left = np.maximum(distance - 0.5 * speed * self._period_s, 0.0)
+        stoppable = np.sqrt(half * half + 2.0 * self._braking * left) - half
+        return np.minimum(stoppable, self._fastest)

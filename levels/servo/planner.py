@@ -1,0 +1,63 @@
+"""The planner of the servo level: the arm's inertia for the coming cycles."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from backplane.message import Message
+from levels.cell import build_cell
+from levels.dynamics import Dynamics, Payload
+from levels.level import Input, LevelContext, Planner, Ports
+from levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+
+Array = NDArray[np.float64]
+
+
+class ServoPlanner(Planner):
+    """Plans the inertia at the set point that is due next, with what the gripper holds, every time it is released."""
+
+    inputs = {
+        "command": Input(JOINT_SET_POINT, "above.command"),
+        "status": Input(SERVO_STATUS, "own.status"),
+        "scene": Input(SCENE, "own.scene"),
+    }
+    output = SERVO_PLAN
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self._dynamics = Dynamics(cell)
+        self._home, self._objects = cell.home, len(cell.object_qpos)
+        bodies = cell.bodies[: self._objects]
+        self._masses = cell.model.body_subtreemass[bodies].copy()
+        self._centres = cell.model.body_ipos[bodies].copy()
+        self._rotation = np.zeros(9)
+        self._rest = np.zeros(len(cell.home))
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Always: the arm is always somewhere else."""
+        return True
+
+    def plan(self, read: Ports, write: Message, tick: int) -> None:
+        """Fill a `SERVO_PLAN`."""
+        command: Message = read.command.value
+        held = command.held if command.due != 0 and read.scene.is_there and 0 <= command.held < self._objects else -1
+        payload = Payload(0.0, np.zeros(3)) if held < 0 else self._payload(read.scene.value, held)
+        write.inertia = self._dynamics.terms(self._position(read), self._rest, payload).inertia
+        write.held, write.payload_mass, write.payload_offset = held, payload.mass, payload.offset
+
+    def _position(self, read: Ports) -> Array:
+        """Return the joint positions to plan for: the set point due, else where the arm is, else home."""
+        if read.command.value.due != 0 and np.isfinite(read.command.value.position).all():
+            return np.asarray(read.command.value.position)
+        return np.asarray(read.status.value.position) if read.status.is_there else self._home
+
+    def _payload(self, scene: Message, held: int) -> Payload:
+        """Return mass and centre, in the frame of the tool, of an object as the scene shows it."""
+        mujoco.mju_quat2Mat(self._rotation, scene.quaternion[held])
+        centre = scene.position[held] + self._rotation.reshape(3, 3) @ self._centres[held]
+        mujoco.mju_quat2Mat(self._rotation, scene.tool_quaternion)
+        offset = self._rotation.reshape(3, 3).T @ (centre - scene.tool_position)
+        return Payload(float(self._masses[held]), offset)

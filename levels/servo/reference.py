@@ -1,0 +1,126 @@
+"""The set point of every servo cycle, between the set points that come from above.
+
+A set point is to be reached at its `due` tick; the next one is there by then. In between the motion is the cubic Hermite
+curve through positions and velocities, so it is C1. When none came in time the motion ramps to rest; when they come again it
+joins them smoothly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backplane.message import Message
+from levels.cell import Bounds, Limits
+from levels.servo.curves import Curve, Decay, Hermite, Motion, Ramp
+
+Array = NDArray[np.float64]
+
+HARDEST = 2.0
+"""Multiple of the acceleration limits up to which one curve may join two set points: planned motion, interpolated, needs
+a little more than 1."""
+JOINING_SPEED = 0.25
+"""Part of the velocity limits that joining may add to a motion."""
+ASTRAY_RAD = 0.005
+"""Distance from the reference beyond which an arm that was left alone is not pulled back at once."""
+
+FURTHEST_S = 2.0
+"""How far ahead a set point may be due: one beyond that is a broken command, not a slow level."""
+
+
+class Reference:
+    """Interpolates set points. Tick by tick: `at(command, tick)` gives the motion wanted at that tick.
+
+    `holding`: no fresh set point. `refused`: set points that were cut at the bounds, and cycles that saw one which is no motion.
+    """
+
+    def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
+        self._bounds, self._limits, self._tick_s = bounds, limits, tick_s
+        joints = len(limits.velocity)
+        self._nothing = Decay(np.zeros(joints), np.zeros(joints), limits.velocity, limits.acceleration)
+        self._due = 0
+        self.holding = True
+        self.refused = 0
+        self.start(np.zeros(joints), np.zeros(joints), 0)
+
+    def start(self, position: Array, velocity: Array, tick: int) -> None:
+        """Go on from a motion at `tick`, rad, rad/s: ramp to rest and hold."""
+        self._curve: Curve = Ramp(position.copy(), velocity.copy(), self._limits.acceleration)
+        self._from = tick
+        self._difference, self._differs_from = self._nothing, tick
+        self._end = (position, velocity)
+        self.holding = True
+
+    def meet(self, position: Array, velocity: Array, tick: int) -> None:
+        """Take the arm as it is found after cycles were missed, if it has strayed: from there back to the set points."""
+        now = self._motion(tick)
+        if np.max(np.abs(now.position - position)) < ASTRAY_RAD:
+            return
+        if self.holding or tick >= self._due:
+            self.start(position, velocity, tick)
+        else:
+            self._join(position, velocity, tick)
+
+    def at(self, command: Message, tick: int) -> Motion:
+        """Return the motion wanted at `tick`, given the newest `JOINT_SET_POINT`; its acceleration is the coming cycle's."""
+        due = command.due
+        if due != self._due and due > tick:
+            self._take(command, due, tick)
+        if not self.holding and tick >= self._due:
+            last = self._motion(self._due)
+            self.start(last.position, last.velocity, self._due)
+        return self._motion(tick)
+
+    def _take(self, command: Message, due: int, tick: int) -> None:
+        """Turn towards a new set point."""
+        finite = bool(np.isfinite(command.position).all() and np.isfinite(command.velocity).all())
+        if not finite or (due - tick) * self._tick_s > FURTHEST_S:
+            self.refused += 1
+            return
+        position, velocity = self._clamp(command.position, command.velocity)
+        now = self._motion(tick)
+        begin = min(tick, self._due) if not self.holding else tick
+        curve = self._bridge(begin, position, velocity, due)
+        joined = not self.holding and bool((curve.hardest() <= HARDEST * self._limits.acceleration).all())
+        if joined:
+            self._curve, self._from = curve, begin
+        else:
+            left_s = (due - tick) * self._tick_s
+            self._curve, self._from = Hermite(position - velocity * left_s, velocity, position, velocity, left_s), tick
+        self._due, self.holding = due, False
+        if not joined:
+            self._join(now.position, now.velocity, tick)
+
+    def _bridge(self, begin: int, position: Array, velocity: Array, due: int) -> Hermite:
+        """Return the curve from the present one at tick `begin` to a set point."""
+        start = self._curve.at((begin - self._from) * self._tick_s)
+        return Hermite(start.position, start.velocity, position, velocity, (due - begin) * self._tick_s)
+
+    def _join(self, position: Array, velocity: Array, tick: int) -> None:
+        """Let the difference between a motion at `tick` and the curve vanish."""
+        curve = self._curve.at((tick - self._from) * self._tick_s)
+        fastest = JOINING_SPEED * self._limits.velocity
+        self._difference = Decay(
+            position - curve.position, velocity - curve.velocity, fastest, self._limits.acceleration
+        )
+        self._differs_from = tick
+
+    def _motion(self, tick: int) -> Motion:
+        """Return the motion at `tick`; the acceleration is that of the middle of the coming cycle."""
+        curve_s = (tick - self._from) * self._tick_s
+        differs_s = (tick - self._differs_from) * self._tick_s
+        half_s = 0.5 * self._tick_s
+        curve, difference = self._curve.at(curve_s), self._difference.at(differs_s)
+        ahead, apart = self._curve.at(curve_s + half_s), self._difference.at(differs_s + half_s)
+        return Motion(
+            curve.position + difference.position,
+            curve.velocity + difference.velocity,
+            ahead.acceleration + apart.acceleration,
+        )
+
+    def _clamp(self, position: Array, velocity: Array) -> tuple[Array, Array]:
+        """Return a set point within the bounds; count it when it was not."""
+        inside = np.clip(position, self._bounds.position[:, 0], self._bounds.position[:, 1])
+        slow = np.clip(velocity, -self._bounds.velocity, self._bounds.velocity)
+        self.refused += not (np.array_equal(inside, position) and np.array_equal(slow, velocity))
+        return inside, slow

@@ -1,0 +1,173 @@
+"""Actions as elemental moves: of the ways to do an action, the quickest that can be gone to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from levels.errors import Refused
+from levels.messages import Error, Verb
+from levels.planning.motion import MotionPlanner, at
+from levels.planning.pose import Pose, pointing, pose
+from levels.planning.situation import Situation
+from levels.scene import SceneConfig
+from levels.task.grasps import DOWN, goals, grasps, standing
+from levels.task.program import Goto, Home, TaskConfig, Transfer
+from levels.task.rehearsal import Rehearsal
+
+Array = NDArray[np.float64]
+Option = TypeVar("Option")
+
+TURNS = 8
+"""Turns about the tool's z axis that are tried where only its direction is given."""
+WAYS = 16
+"""Ways to do a transfer that are tried to their end."""
+HALVINGS = 7
+"""Halvings in the search for what is reachable on the way to a place that is not."""
+
+
+class Spot(NamedTuple):
+    """A pose of the tool at an object, and a configuration (joints,), rad, straight above it."""
+
+    tool: Pose
+    above: Array
+
+
+class Way(NamedTuple):
+    """Where a transfer takes the object and where it puts it down."""
+
+    take: Spot
+    put: Spot
+
+
+def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehearsal:
+    """Return the whole program as moves, rehearsed. Raises `Refused` that names action, place and what is possible."""
+    rehearsal = start
+    for k, action in enumerate(program.action):
+        try:
+            if isinstance(action, Transfer):
+                rehearsal = transfer(rehearsal, k, action, scene)
+            elif isinstance(action, Goto):
+                rehearsal = goto(rehearsal, k, action)
+            elif isinstance(action, Home):
+                rehearsal = rehearsal.then(k, Verb.MOVE_JOINTS, joints=rehearsal.motion.cell.home)
+        except Refused as refused:
+            raise Refused(refused.code, f"action {k}, {action}: {refused}") from refused
+    return rehearsal
+
+
+def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
+    """Return the rehearsal behind a goto. Raises `Refused`."""
+    if action.joints is not None:
+        return rehearsal.then(k, Verb.MOVE_JOINTS, joints=np.array(action.joints))
+    assert action.position is not None, "a goto has joints or a position"
+    if action.quaternion is not None:
+        tools = [pose(action.position, action.quaternion)]
+    else:
+        turns = np.arange(TURNS) * 2.0 * np.pi / TURNS
+        tools = [pose(action.position, pointing(action.direction or DOWN, turn)) for turn in turns]
+    motion = rehearsal.motion
+    rehearsal.situation.lay_out(motion.checker, None)
+    spots = [Spot(tool, q) for tool in tools for q in motion.ik.solutions(tool, rehearsal.q, motion.checker.free)]
+    if not spots:
+        raise _nothing_at(motion, tools, rehearsal.q)
+    spots.sort(key=lambda spot: motion.ik.time_between(rehearsal.q, spot.above))
+    return _first(spots, lambda spot: rehearsal.then(k, Verb.MOVE, spot.tool, joints=spot.above))
+
+
+def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:
+    """Return the rehearsal behind a transfer. Raises `Refused`."""
+    row = scene.objects.index(action.object)
+    standing_goals = [
+        standing(rehearsal.motion.cell, rehearsal.situation, action.object, row, goal)
+        for goal in goals(action, rehearsal.situation.object_pose(row))
+    ]
+    ways = _ways(rehearsal, row, standing_goals, action.lift)
+    return _first(ways[:WAYS], lambda way: _transferred(rehearsal, k, row, way, action.lift))
+
+
+def _transferred(rehearsal: Rehearsal, k: int, row: int, way: Way, lift: float) -> Rehearsal:
+    """Return the rehearsal behind the eight moves of a transfer. Raises `Refused`."""
+    take, put = way
+    for spot, verb, carried in ((take, Verb.GRASP, None), (put, Verb.RELEASE, row)):
+        above = spot.tool.raised(lift)
+        rehearsal = rehearsal.then(k, Verb.MOVE, above, carried, spot.above)
+        rehearsal = rehearsal.then(k, Verb.APPROACH, spot.tool, row)
+        rehearsal = rehearsal.then(k, verb, spot.tool, row)
+        rehearsal = rehearsal.then(k, Verb.DEPART, above, row)
+    return rehearsal
+
+
+def _ways(rehearsal: Rehearsal, row: int, standing_goals: list[Pose], lift: float) -> list[Way]:
+    """Return ways to do a transfer, the quickest to move first. Raises `Refused` when there is none."""
+    motion, situation, here = rehearsal.motion, rehearsal.situation, rehearsal.q
+    seen = situation.object_pose(row)
+    takes = _takes(rehearsal, row, lift)
+    ways: list[Way] = []
+    puts: dict[bytes, list[Spot]] = {}
+    for take in takes:
+        grip = take.tool.inverse() @ seen
+        for goal in standing_goals:
+            tool = goal @ grip.inverse()
+            key = np.round(np.concatenate(tool), 6).tobytes()
+            if key not in puts:
+                puts[key] = _spots(motion, situation.holding(row, grip), row, tool, here, lift)
+            ways += [Way(take, put) for put in puts[key]]
+    if not ways:
+        raise _nothing_at(motion, [goal @ (takes[0].tool.inverse() @ seen).inverse() for goal in standing_goals], here)
+    pace = motion.ik.time_between
+    return sorted(ways, key=lambda way: pace(here, way.take.above) + pace(way.take.above, way.put.above))
+
+
+def _takes(rehearsal: Rehearsal, row: int, lift: float) -> list[Spot]:
+    """Return where object `row` can be taken, at the lowest height at which it can. Raises `Refused`."""
+    motion, situation, here = rehearsal.motion, rehearsal.situation, rehearsal.q
+    refusal: Refused | None = None
+    for tools in grasps(motion.cell, situation, row):
+        takes = [spot for tool in tools for spot in _spots(motion, situation, row, tool, here, lift)]
+        if takes:
+            return takes
+        refusal = refusal or _nothing_at(motion, tools, here)
+        if refusal.code == Error.UNREACHABLE:
+            break
+    assert refusal is not None, "there is at least one height"
+    raise refusal
+
+
+def _spots(motion: MotionPlanner, situation: Situation, row: int, tool: Pose, here: Array, lift: float) -> list[Spot]:
+    """Return the free configurations above `tool` from which the arm can come down to it."""
+    situation.lay_out(motion.checker, None)
+    above = motion.ik.solutions(tool.raised(lift), here, motion.checker.free)
+    situation.lay_out(motion.checker, row)
+    ends = [(q, motion.ik.reach(tool, q)) for q in above]
+    return [Spot(tool, q) for q, end in ends if end is not None and motion.checker.free(end)]
+
+
+def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
+    """Return the first rehearsal that succeeds. Raises the `Refused` of the first option when none does."""
+    refusals: list[Refused] = []
+    for option in options:
+        try:
+            return do(option)
+        except Refused as refused:
+            refusals.append(refused)
+    raise refusals[0]
+
+
+def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refused:
+    """Return the refusal for poses of which the arm reaches none, or none freely."""
+    for tool in tools:
+        for q in motion.ik.reachable(tool, here):
+            if why := motion.checker.why(q):
+                return Refused(Error.NO_PATH, why)
+    begin, end = motion.ik.tool_at(here), tools[0]
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        reached = bool(motion.ik.reachable(Pose(begin.towards(end, middle).position, end.quaternion), here))
+        low, high = (middle, high) if reached else (low, middle)
+    reach = at(begin.towards(end, low))
+    return Refused(Error.UNREACHABLE, f"out of reach; on the way there {reach} is in reach")

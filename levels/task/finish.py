@@ -1,0 +1,41 @@
+"""When each move of a program will be done, at the latest: the pipeline of the levels, worked out move by move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from levels.messages import SEGMENTS, WINDOW
+from levels.planning.move import Move
+from levels.task.params import TaskParams
+
+
+class Rehearsed(NamedTuple):
+    """A move and the time, in s, that its motion takes at most; 0 for the gripper's."""
+
+    move: Move
+    duration_s: float
+
+
+def finish_times(moves: Sequence[Rehearsed], visible_s: float, cycle_s: float, needs: TaskParams) -> list[float]:
+    """Return for every move the simulated time, in s, by which the task level knows that it is done.
+
+    `visible_s` is when the first window of moves becomes visible below, `cycle_s` the task level's cycle. A move begins
+    when the one before it is done, its path is planned, and the window of segments has had room for it; each news
+    waits at most one cycle to be read and one to be seen. Nothing must stand in the way.
+    """
+    below = needs.cycle_below
+    done: list[float] = []
+    planned = visible_s
+    for k, (move, duration_s) in enumerate(moves):
+        shown = visible_s
+        if k >= WINDOW:
+            shown = max(visible_s, done[k - WINDOW] + 2.0 * below + 2.0 * cycle_s)
+        if move.is_motion:
+            planned = max(planned, shown) + needs.planning_below + below
+        at_hand = max(planned, shown) if move.is_motion else shown
+        room = done[k - SEGMENTS] + below if k >= SEGMENTS else 0.0
+        handed_down = max(at_hand, room) + 2.0 * below
+        begun = max(handed_down, done[k - 1] if k else 0.0) + needs.beginning
+        done.append(begun + (duration_s if move.is_motion else needs.gripping) + needs.settling)
+    return [time_s + 2.0 * below + cycle_s for time_s in done]

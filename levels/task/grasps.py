@@ -1,0 +1,99 @@
+"""Where the gripper may take an object, and where an object comes to stand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from levels.cell import Cell
+from levels.errors import Refused
+from levels.messages import Error
+from levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
+from levels.planning.situation import Situation
+from levels.task.program import Transfer
+from levels.touches import below as below_body
+from levels.touches import geom_name, geoms_of
+
+Array = NDArray[np.float64]
+
+DOWN = (0.0, 0.0, -1.0)
+QUARTERS = (0, 1, -1, 2)
+"""Quarter turns between object and gripper, in the order in which they are tried."""
+HEIGHT_STEP_M = 0.01
+"""Grasps above the object's origin are this far apart: a tall object is taken higher, so that the palm stays clear."""
+SET_DOWN_M = 0.0005
+"""Gap between an object and its support when the gripper opens."""
+FARTHEST_M = 10.0
+STANDING_M = 0.02
+"""A goal whose height is farther than this from standing on a support is a mistake of the program."""
+
+
+def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
+    """Yield, from the lowest height up, the poses of the tool that take object `row` from above.
+
+    The fingers close along the tool's y axis, across the object's x or y axis.
+    """
+    seen = situation.object_pose(row)
+    yaws = [yaw_of(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTERS]
+    height = 0.0
+    while height == 0.0 or seen.position[2] + height < _top(cell, situation, row):
+        yield [Pose(seen.raised(height).position, pointing(DOWN, -yaw)) for yaw in yaws]
+        height += HEIGHT_STEP_M
+
+
+def goals(action: Transfer, at: Pose) -> Iterator[Pose]:
+    """Yield poses in which the object may be put down: as it stands now, turned about the vertical."""
+    yaw = yaw_of(at.quaternion)
+    turns = [action.yaw - yaw] if action.yaw is not None else [quarter * np.pi / 2.0 for quarter in QUARTERS]
+    for turn in turns:
+        quaternion = np.zeros(4)
+        mujoco.mju_mulQuat(quaternion, turned_about_z(turn), at.quaternion)
+        yield pose(action.to, quaternion)
+
+
+def standing(cell: Cell, situation: Situation, name: str, row: int, goal: Pose) -> Pose:
+    """Return `goal` at the height at which object `row`, called `name`, stands on the support below it.
+
+    Raises `Refused` for a goal over no support, or far above or below one.
+    """
+    model, data = cell.model, _laid_out(cell, situation.with_body(row, goal))
+    geom = np.full(1, -1, dtype=np.int32)
+    body = int(cell.bodies[row])
+    mujoco.mj_ray(model, data, goal.position, np.array(DOWN), None, 1, body, geom)
+    x, y, z = goal.position
+    if geom[0] not in cell.supports:
+        supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.supports) or "none"
+        below = f"over '{geom_name(model, int(geom[0]))}'" if geom[0] >= 0 else "over nothing"
+        raise Refused(Error.UNREACHABLE, f"at [{x:.3f}, {y:.3f}] '{name}' would be {below}; supports: {supports}")
+    parts = geoms_of(model, below_body(model, cell.bodies[[row]]))
+    gap = min(mujoco.mj_geomDistance(model, data, int(part), int(geom[0]), FARTHEST_M, None) for part in parts)
+    if abs(gap) > STANDING_M:
+        side = "above" if gap > 0 else "deep in"
+        place = f"{abs(gap) * 1e3:.0f} mm {side} '{geom_name(model, int(geom[0]))}'"
+        raise Refused(Error.UNREACHABLE, f"at z = {z:.3f} '{name}' would be {place}; valid z: {z - gap:.3f}")
+    return goal.raised(SET_DOWN_M - gap)
+
+
+def _laid_out(cell: Cell, situation: Situation) -> mujoco.MjData:
+    """Return data of the cell with the bodies as in `situation`."""
+    data = cell.start()
+    for row, address in enumerate(cell.object_qpos):
+        data.qpos[address : address + 7] = np.concatenate(situation.object_pose(row))
+    for row, mocap in enumerate(cell.mocap, start=len(cell.object_qpos)):
+        data.mocap_pos[mocap], data.mocap_quat[mocap] = situation.object_pose(row)
+    mujoco.mj_kinematics(cell.model, data)
+    return data
+
+
+def _top(cell: Cell, situation: Situation, row: int) -> float:
+    """Return the height of the highest point of object `row`, from its bounding boxes, in m."""
+    model, data = cell.model, _laid_out(cell, situation)
+    parts = geoms_of(model, below_body(model, cell.bodies[[row]]))
+    # A box's extent along z: its half sizes, seen along the third row of its rotation.
+    vertical = data.geom_xmat[parts].reshape(-1, 3, 3)[:, 2, :]
+    centre, half = model.geom_aabb[parts, :3], model.geom_aabb[parts, 3:]
+    heights = data.geom_xpos[parts, 2] + np.sum(vertical * centre, axis=1) + np.sum(np.abs(vertical) * half, axis=1)
+    return float(np.max(heights))

@@ -1,0 +1,101 @@
+"""The planner of the task level: the whole program as elemental moves, or the reason why it cannot be done."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from backplane.message import Message, MessageType
+from levels.cell import build_cell
+from levels.errors import Refused
+from levels.level import Input, LevelContext, Planner, Ports
+from levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
+from levels.params import read_params
+from levels.planning.situation import Situation
+from levels.task.finish import finish_times
+from levels.task.params import TaskParams
+from levels.task.program import read_program
+
+AT_REST_M_S = 0.01
+"""An object slower than this lies still: its place can be planned with."""
+
+
+class TaskPlanner(Planner):
+    """Plans the program once, as soon as the arm is known to be somewhere and the objects lie still.
+
+    Everything that cannot be done is refused before anything moves, with what could be done instead.
+    """
+
+    inputs: ClassVar[Mapping[str, Input]] = {
+        "status": Input(TASK_STATUS, "own.status"),
+        "servo": Input(SERVO_STATUS, "servo.status"),
+        "world": Input(WORLD_MODEL, "world.model"),
+    }
+    output: ClassVar[MessageType] = TASK_PLAN
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        # mink and OMPL take a second and much memory to import: the process of a planner pays, no other.
+        from levels.planning.motion import MotionPlanner
+
+        self._program = read_program(context.task, context.robot, context.scene)
+        self._needs = read_params(TaskParams, context.params)
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self._motion = MotionPlanner(cell, context.scene, context.seed)
+        self._planned = False
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Say whether the program is still to be planned and the world can be planned with."""
+        known = read.status.is_there and read.status.value.moves
+        if not self._program.action or self._planned or known:
+            return False
+        if not (read.servo.is_there and read.world.is_there):
+            return False
+        objects = len(self.context.scene.objects)
+        speeds = np.linalg.norm(read.world.value.velocity[:objects], axis=1)
+        return bool(np.all(speeds < AT_REST_M_S))
+
+    def plan(self, read: Ports, write: Message, tick: int) -> None:
+        """Decompose the whole program into `write`, or refuse it there."""
+        self._planned = True
+        write.clear()
+        write.id = 1
+        try:
+            self._decompose(read, write, tick)
+        except Refused as refused:
+            write.error, write.reason, write.count = refused.code, str(refused), 0
+
+    def _decompose(self, read: Ports, write: Message, tick: int) -> None:
+        from levels.task.actions import rehearse
+        from levels.task.rehearsal import Rehearsal
+
+        world = read.world.value
+        situation = Situation(np.array(world.position), np.array(world.quaternion))
+        start = Rehearsal(self._motion, np.array(read.servo.value.target), situation)
+        moves = rehearse(self._program, self.context.scene, start).moves
+        if len(moves) > MOVES:
+            raise Refused(Error.LIMIT, f"the program has {len(moves)} elemental moves; at most {MOVES} are valid")
+        # Planned within its cycles, the plan is read at once and handed down, to be visible a cycle later.
+        visible_s = (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
+        finish_s = finish_times(moves, visible_s, self.context.period_s, self._needs)
+        for k, (move, _) in enumerate(moves):
+            last = k + 1 == len(moves) or moves[k + 1].move.action != move.action
+            by_s = self._time_below(move.action, finish_s[k], write) if last else 0.0
+            move._replace(by_s=by_s).write_to(write.moves[k])
+        write.count = len(moves)
+
+    def _time_below(self, action: int, finish_s: float, write: Message) -> float:
+        """Return the time by which the last move of an action must be done below; 0: there is none.
+
+        Raises `Refused` with the earliest time that can be promised.
+        """
+        by_s = self._program.action[action].by
+        if by_s is None:
+            return 0.0
+        if finish_s > by_s:
+            write.earliest = finish_s
+            text = f"action {action}, {self._program.action[action]}, by {by_s:g} s: the earliest is {finish_s:.2f} s"
+            raise Refused(Error.TOO_LATE, text)
+        return by_s - self.context.period_s

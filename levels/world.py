@@ -1,0 +1,82 @@
+"""The world model: global memory of objects and obstacles, updated from sensing and read by every planner."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from backplane.message import Message
+from levels.level import Executor, Input, LevelContext, Ports
+from levels.messages import SCENE, WORLD_MODEL
+from levels.params import read_params
+from levels.robot import Positive, Table
+
+Array = NDArray[np.float64]
+
+
+class WorldParams(Table):
+    """When a body counts as moving."""
+
+    moved: Positive = Field(0.002, description="distance from where it rested at which a body moves, m")
+    turned: Positive = Field(0.02, description="angle from how it rested at which a body moves, rad")
+    slow: Positive = Field(0.005, description="speed below which a moving body may be resting, m/s")
+    resting: Positive = Field(0.2, description="time of being slow after which it rests, s")
+
+
+class WorldModel(Executor):
+    """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body starts or stops moving.
+
+    The revision is the tick of the last such change, so it rises across a restart of this board too.
+    """
+
+    inputs = {"scene": Input(SCENE, "servo.scene")}
+    outputs = {"model": WORLD_MODEL}
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._params = read_params(WorldParams, context.params)
+        bodies = context.sizes["bodies"]
+        self._position, self._quaternion = np.zeros((bodies, 3)), np.zeros((bodies, 4))
+        self._rest_position, self._rest_quaternion = np.zeros((bodies, 3)), np.zeros((bodies, 4))
+        self._moving = np.zeros(bodies, dtype=bool)
+        self._slow_s = np.zeros(bodies)
+        self._seen_tick = -1
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Take over a new scene; without one, poses stay and velocities are zero."""
+        if not read.scene.is_new:
+            write.model.velocity[:] = 0.0
+            return
+        scene: Message = read.scene.value
+        if self._seen_tick < 0:
+            self._rest_position[:], self._rest_quaternion[:] = scene.position, scene.quaternion
+            write.model.revision = tick
+        else:
+            elapsed_s = (tick - self._seen_tick) * self.context.tick_s
+            self._follow(scene, write.model, elapsed_s, tick)
+        self._position[:], self._quaternion[:] = scene.position, scene.quaternion
+        write.model.position, write.model.quaternion = scene.position, scene.quaternion
+        self._seen_tick = tick
+
+    def _follow(self, scene: Message, model: Message, elapsed_s: float, tick: int) -> None:
+        """Estimate velocities, and see who starts and who stops."""
+        params = self._params
+        velocity = (scene.position - self._position) / elapsed_s
+        slow = np.linalg.norm(velocity, axis=1) < params.slow
+        slow &= turn(self._quaternion, scene.quaternion) < params.turned * elapsed_s / params.resting
+        self._slow_s[:] = np.where(slow, self._slow_s + elapsed_s, 0.0)
+        away = np.linalg.norm(scene.position - self._rest_position, axis=1) > params.moved
+        away |= turn(self._rest_quaternion, scene.quaternion) > params.turned
+        stops = self._moving & (self._slow_s >= params.resting)
+        starts = ~self._moving & away
+        self._rest_position[stops], self._rest_quaternion[stops] = scene.position[stops], scene.quaternion[stops]
+        self._moving ^= stops | starts
+        model.velocity = np.where(self._moving[:, None], velocity, 0.0)
+        if stops.any() or starts.any():
+            model.revision = tick
+
+
+def turn(first: Array, second: Array) -> Array:
+    """Return the angles (n,), rad, between orientations (n, 4); q and -q are the same orientation."""
+    return np.asarray(2.0 * np.arccos(np.clip(np.abs(np.sum(first * second, axis=1)), 0.0, 1.0)))

@@ -1,0 +1,92 @@
+"""The paper's timing model against the paper's own numbers (figs 2 to 4, section 3.4)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from levels import timing
+
+MS = 1_000_000
+READ = WRITE = UPDATE = PLANNER_EXCHANGE = 1 * MS
+EXECUTE = (1 * MS, 2 * MS, 3 * MS)
+PLAN = 6 * MS
+WORST_PLAN_CYCLES = 3
+
+
+def residual(cycle_ns: int, executions_ns: tuple[int, ...]) -> float:
+    return timing.residual_bound_ns(cycle_ns, executions_ns, [READ + WRITE])
+
+
+def test_figure_2_one_processor_with_8_ms_cycles_plans_in_time() -> None:
+    left = residual(8 * MS, EXECUTE)
+    assert left == 3 * MS
+    assert timing.plan_fits_tight(PLAN + UPDATE, WORST_PLAN_CYCLES, left, 0)
+    assert timing.plan_cycles_tight(PLAN + UPDATE, left, 0) == 3
+
+
+def test_figure_3_one_processor_with_6_ms_cycles_has_no_plan_within_three_cycles() -> None:
+    left = residual(6 * MS, EXECUTE)
+    assert left == 1 * MS
+    assert not timing.plan_fits_tight(PLAN + UPDATE, WORST_PLAN_CYCLES, left, 0)
+    assert timing.plan_cycles_tight(PLAN + UPDATE, left, 0) == 8
+
+
+def test_figure_4_two_processors_with_6_ms_cycles_plan_in_time() -> None:
+    assert timing.fits_cycle(max(EXECUTE), PLANNER_EXCHANGE + READ + WRITE, 6 * MS)
+    assert timing.plan_fits_loose(PLAN + UPDATE, 2, 6 * MS)
+
+
+def test_figure_4_with_a_longer_executor_has_no_time_to_talk_to_its_planner() -> None:
+    assert timing.fits_cycle(4 * MS, READ + WRITE, 6 * MS)
+    assert not timing.fits_cycle(4 * MS, PLANNER_EXCHANGE + READ + WRITE, 6 * MS)
+
+
+def test_context_switches_come_off_the_residual_twice() -> None:
+    assert timing.plan_fits_tight(5.9 * MS, 2, 3 * MS, 0)
+    assert not timing.plan_fits_tight(5.9 * MS, 2, 3 * MS, 0.1 * MS)
+    assert timing.plan_cycles_tight(PLAN, 0.2 * MS, 0.1 * MS) is None
+
+
+def test_residual_is_what_the_worst_execution_and_the_worst_communication_leave() -> None:
+    alpha = timing.residual_bound_ns(8 * MS, [1 * MS, 3 * MS], [2 * MS, 1 * MS])
+    assert alpha == 3 * MS
+    assert timing.residual_is_sure(3 * MS, alpha)
+    assert not timing.residual_is_sure(3.1 * MS, alpha)
+    assert not timing.residual_is_sure(0, alpha)
+
+
+def test_residual_deviation_is_zero_only_for_equal_cycles() -> None:
+    assert timing.residual_deviation_ns([3, 3, 3], [1, 1, 1]) == 0
+    assert timing.residual_deviation_ns([2, 4], [1, 1]) == pytest.approx(1.0)
+
+
+def test_system_responds_within_as_many_longest_cycles_as_there_are_levels() -> None:
+    machine, goal = [2.5 * MS, 20 * MS], [250 * MS, 1000 * MS]
+    assert timing.system_response_ns(machine, goal) == 1272.5 * MS
+    assert timing.system_response_bound_ns(machine + goal) == 4000 * MS
+    assert timing.system_response_ns(machine, goal) <= timing.system_response_bound_ns(machine + goal)
+
+
+def test_cycle_starts_never_drift() -> None:
+    starts = [timing.cycle_start_ns(17, 2_500_000, k) for k in range(400_001)]
+    assert {b - a for a, b in pairwise(starts)} == {2_500_000}
+    assert starts[-1] == 17 + 1_000 * 1_000_000_000
+
+
+def test_response_time_is_the_sum_of_its_parts_in_both_couplings() -> None:
+    assert timing.response_time_ns(3 * MS, 2 * MS, 3 * MS) == 8 * MS
+    talk = timing.communication_ns(2 * MS, 0.5 * MS)
+    assert timing.response_time_tight_ns(3 * MS, talk, 2.3 * MS, 0.1 * MS) == pytest.approx(8 * MS)
+
+
+def test_executor_must_leave_something_of_the_cycle() -> None:
+    assert timing.executes_in_time(7 * MS, 8 * MS)
+    assert not timing.executes_in_time(8 * MS, 8 * MS)
+
+
+def test_plan_update_that_takes_much_of_a_cycle_asks_for_a_processor_of_its_own() -> None:
+    assert timing.plan_update_share(1 * MS, 8 * MS) == pytest.approx(0.125)
+    assert not timing.coupling_may_be_tight(1 * MS, 8 * MS)
+    assert timing.coupling_may_be_tight(1 * MS, 20 * MS)

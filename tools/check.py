@@ -1,0 +1,18 @@
+"""`rack check`: validate a config and show what it makes."""
+
+from __future__ import annotations
+
+from tools.answer import ConfigName, Json, Settings, print_json
+
+
+def check(config: ConfigName, settings: Settings = [], as_json: Json = False) -> None:  # noqa: B006  typer copies it
+    """Validate a config: slots, cores, rates, mailboxes with their bus addresses, and the timing they imply.
+
+    Every mistake is shown at once, one a line.
+    """
+    from boards.config import load, shared_out, wire
+    from tools.inventory import Inventory
+
+    found = load(config, settings)
+    inventory = Inventory.of(found, wire(found), shared_out(found))
+    print_json(inventory.document()) if as_json else print(inventory.text())

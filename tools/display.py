@@ -1,0 +1,98 @@
+"""What a run shows while it lasts: a live table on a terminal, a line a second elsewhere, nothing beside JSON."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.live import Live
+
+from boards.events import Event
+from tools.live_table import line_of, table_of
+from tools.snapshot import Snapshot
+
+QUIET = ("launch", "start", "end")
+"""Events that the view itself shows."""
+
+
+class Display(Protocol):
+    """Shows a run. `period_s` is the time between looks."""
+
+    period_s: float
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the rack as it is now."""
+
+    def tell(self, event: Event) -> None:
+        """Show an event."""
+
+
+class LiveDisplay:
+    """A table that changes in place."""
+
+    period_s = 0.2
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Draw the table anew."""
+        self._live.update(table_of(snapshot), refresh=True)
+
+    def tell(self, event: Event) -> None:
+        """Print the event above the table."""
+        if event.kind not in QUIET:
+            self._live.console.print(_line(event), style="yellow", highlight=False, markup=False)
+
+
+class PlainDisplay:
+    """A line a second."""
+
+    period_s = 1.0
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Print the rack as one line, once a second and at the end."""
+        now = time.monotonic()
+        if now >= self._next or snapshot.run == "stopped":
+            self._next = now + self.period_s
+            print(line_of(snapshot), flush=True)
+
+    def tell(self, event: Event) -> None:
+        """Print the event."""
+        if event.kind not in QUIET:
+            print(_line(event), flush=True)
+
+
+class SilentDisplay:
+    """Nothing: stdout is for one JSON document."""
+
+    period_s = 0.5
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show nothing."""
+
+    def tell(self, event: Event) -> None:
+        """Show nothing; the event is in the log."""
+
+
+def _line(event: Event) -> str:
+    return f"{event.kind}: {event.text}" if not event.board else f"{event.kind}: {event.board}: {event.text}"
+
+
+@contextmanager
+def display_for(silent: bool) -> Iterator[Display]:
+    """Give the display that fits where stdout goes."""
+    console = Console()
+    if silent:
+        yield SilentDisplay()
+    elif console.is_terminal:
+        with Live(console=console, auto_refresh=False) as live:
+            yield LiveDisplay(live)
+    else:
+        yield PlainDisplay()

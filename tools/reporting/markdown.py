@@ -1,0 +1,103 @@
+"""A report as text for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+Report = dict[str, Any]
+
+TIMES = [
+    *("task", "R", "cycles", "missed", "skipped", "late p50", "p99", "max", "exec p50", "p99", "max"),
+    *("comm p99", "residual min", "alpha", "plan age max"),
+]
+
+
+def markdown(report: Report) -> str:
+    """Return report.md of a report."""
+    return "\n".join(_lines(report)) + "\n"
+
+
+def _lines(report: Report) -> Iterator[str]:
+    outcome = report["outcome"] or {"cause": "no outcome: the launcher was killed", "reason": "", "faults": []}
+    yield f"# {report['rack']}: {outcome['cause']}{': ' + outcome['reason'] if outcome['reason'] else ''}"
+    yield ""
+    yield (
+        f"{report['simulated_s']:.2f} s simulated in {report['wall_s']:.2f} s, {report['mode']}, "
+        f"{report['missed']} missed, {report['skipped']} skipped cycles. Digest `{report['digest']}`."
+    )
+    yield from (f"- fault: {fault}" for fault in outcome["faults"])
+    if report["recording"] != "complete":
+        yield f"- recording: {report['recording']}"
+    yield from (f"- {count} rows of {name} were lost" for name, count in report["rows_lost"].items())
+    yield from _task(report["task"])
+    yield from _motion(report["motion"])
+    yield from _times(report["tasks"])
+    yield from _response(report["system_response"])
+
+
+def _task(task: Report | None) -> Iterator[str]:
+    if task is not None:
+        done = f"{task['action']} of {task['actions']} actions, {task['moves_done']} of {task['moves']} elemental moves"
+        yield from ("", f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}.")
+
+
+def _motion(motion: Report | None) -> Iterator[str]:
+    if motion is not None:
+        yield (
+            f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS, {motion['tracking_peak_mrad']:.3f} peak; "
+            f"{motion['touches']} touches, {motion['clipped_cycles']} cycles clipped."
+        )
+
+
+def _times(tasks: dict[str, Report]) -> Iterator[str]:
+    yield from ("", "## Cycles, ms", "")
+    yield from _table(
+        TIMES,
+        [_times_row(name, task) for name, task in tasks.items()],
+    )
+
+
+def _times_row(name: str, task: Report) -> list[str]:
+    counts = [str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")]
+    late, execution = task["lateness_ms"], task["execution_ms"]
+    return [
+        name,
+        f"{task['slice_ms']:g}",
+        *counts,
+        *(_ms(late, key) for key in ("p50", "p99", "max")),
+        *(_ms(execution, key) for key in ("p50", "p99", "max")),
+        _ms(task["communication_ms"], "p99"),
+        _ms(task["residual_ms"], "min"),
+        "-" if task["alpha_ms"] is None else f"{task['alpha_ms']:.3f}",
+        _ms(task.get("plan_age_ms"), "max"),
+    ]
+
+
+def _ms(distribution: Report | None, key: str) -> str:
+    return "-" if distribution is None else f"{distribution[key]:.3f}"
+
+
+def _response(response: Report | None) -> Iterator[str]:
+    if response is None:
+        return
+    yield from ("", "## System response, ms of simulated time", "")
+    bounds = f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
+    yield f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its cycle."
+    yield ""
+    rows = [
+        [way, _ms(found["measured_ms"], "p50"), _ms(found["measured_ms"], "max"), f"{found['bound_ms']:g}"]
+        for way, found in (("command, down", response["command"]), ("status, up", response["status"]))
+    ]
+    yield from _table(["way", "measured p50", "measured max", "bound"], rows)
+
+
+def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    yield _row(head, widths)
+    yield "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+    yield from (_row(row, widths) for row in rows)
+
+
+def _row(cells: list[str], widths: list[int]) -> str:
+    return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"

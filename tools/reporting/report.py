@@ -1,0 +1,89 @@
+"""report.json and report.md of one run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from backplane.layout import Layout, TaskSpec
+from backplane.message import State
+from boards.config import RackConfig, loads
+from tools.recording import Recording
+from tools.reporting.markdown import markdown
+from tools.reporting.motion import motion
+from tools.reporting.response import system_response
+from tools.reporting.timing import plan_age_ms, task_times
+from tools.snapshot import TASK_STATUS
+
+Report = dict[str, Any]
+
+
+def write_report(folder: Path) -> tuple[Report, str]:
+    """Make the report of the run in `folder`, write it there, and return it as data and as text."""
+    report = report_of(Recording(folder))
+    text = markdown(report)
+    (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    (folder / "report.md").write_text(text)
+    return report, text
+
+
+def report_of(recording: Recording) -> Report:
+    """Return the report of a recorded run as plain data."""
+    config, layout = loads(recording.config), recording.layout
+    ended = next((event for event in recording.events if event["kind"] == "outcome"), {})
+    outcome = ended.get("outcome", {})
+    counted = ended.get("tasks", {})
+    return {
+        "rack": config.name,
+        "folder": str(recording.folder),
+        "mode": config.clock.mode,
+        "speed": config.clock.speed,
+        "clock_ms": config.clock.period_ms,
+        "worked": ended.get("worked", False),
+        "outcome": outcome or None,
+        "digest": outcome.get("digest"),
+        "simulated_s": round(outcome.get("ticks", 0) * layout.clock_ns * 1e-9, 6),
+        "wall_s": round(ended.get("wall_s", 0.0), 6),
+        "clock_skipped": ended.get("clock_skipped", 0),
+        "missed": sum(task.get("missed", 0) for task in counted.values()),
+        "skipped": sum(task.get("skipped", 0) for task in counted.values()),
+        "tasks": {task.name: _task(recording, config, layout, task, counted) for task in layout.tasks},
+        "system_response": system_response(recording, config, layout),
+        "task": _task_outcome(recording, layout),
+        "motion": motion(recording, layout),
+        "recording": ended.get("recording", "none"),
+        "rows_lost": {name: count for name, count in recording.lost.items() if count},
+    }
+
+
+def _task(
+    recording: Recording, config: RackConfig, layout: Layout, task: TaskSpec, counted: dict[str, dict[str, int]]
+) -> Report:
+    period_ns = layout.clock_ns if config.clock.mode == "lockstep" else round(layout.clock_ns / config.clock.speed)
+    cycles = recording.cycles.get(task.name, recording.no_cycles)
+    entry: Report = {
+        "role": task.role,
+        "slot": task.slot,
+        "rate_hz": 1e9 / (task.every * layout.clock_ns),
+        **counted.get(task.name, {}),
+        **task_times(task, cycles, period_ns),
+    }
+    plan = f"{task.board}.plan"
+    if task.role == "executor" and plan in recording.mailboxes:
+        made, visible_at = recording.signal(plan, "tick"), recording.signal(plan, "visible_at")
+        entry["plan_age_ms"] = plan_age_ms(cycles["tick"], made, visible_at, layout.clock_ns * 1e-6)
+    return entry
+
+
+def _task_outcome(recording: Recording, layout: Layout) -> Report | None:
+    """Return what the level that knows the whole task said last."""
+    mailbox = next((m.name for m in layout.mailboxes if m.message == TASK_STATUS), None)
+    if mailbox is None or mailbox not in recording.mailboxes:
+        return None
+
+    def last(field: str) -> Any:
+        return recording.signal(mailbox, field)[-1]
+
+    counts = {name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")}
+    return {"state": State(int(last("state"))).name.lower(), "reason": str(last("reason")), **counts}

@@ -1,0 +1,57 @@
+"""`rack run`: launch a rack, watch it, record it, report."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.answer import ConfigName, Json, Settings, print_json
+
+Lockstep = Annotated[bool, typer.Option("--lockstep", help="a tick begins when every task due has finished: exact")]
+Seconds = Annotated[
+    float | None, typer.Option(metavar="S", min=0.0, help="simulated time to run for; default: until the task ends")
+]
+Speed = Annotated[
+    float | None, typer.Option(metavar="X", help="run this many times faster than real time, or slower: 0.5")
+]
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
+NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
+
+
+def run(
+    config: ConfigName,
+    lockstep: Lockstep = False,
+    seconds: Seconds = None,
+    speed: Speed = None,
+    settings: Settings = [],  # noqa: B006  typer copies it
+    out: Out = None,
+    no_record: NoRecord = False,
+    as_json: Json = False,
+) -> None:
+    """Run a rack until its task ends, and report on it.
+
+    The exit status is 0 when the task was done and no fault is latched.
+    """
+    from boards.config import load
+    from tools.display import display_for
+    from tools.folders import folder_of
+    from tools.running import run_rack
+
+    overrides = list(settings)
+    overrides += ["clock.mode=lockstep"] if lockstep else []
+    overrides += [f"clock.speed={speed}"] if speed is not None else []
+    found = load(config, overrides)
+    folder = None if no_record else folder_of(out, found.name)
+    with display_for(silent=as_json) as display:
+        result = run_rack(found, seconds, folder, display)
+    if folder is None:
+        report, text = result.document(), result.text()
+    else:
+        from tools.reporting.report import write_report
+
+        report, text = write_report(folder)
+    print_json(report) if as_json else print(text)
+    sys.exit(0 if result.worked else 1)

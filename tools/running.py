@@ -1,0 +1,127 @@
+"""One run: launched, watched, recorded, and ended, whatever way it ends."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from backplane.segment import Segment
+from backplane.words import Block, System
+from boards.config.schema import RackConfig
+from boards.outcome import Outcome
+from boards.rack import Rack
+from tools.answer import Failure
+from tools.display import Display
+from tools.event_log import EventLog
+from tools.recorder.process import RecorderProcess
+from tools.snapshot import Viewer
+
+COUNTED = (
+    *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),
+    *("READS", "READ_BYTES", "WRITES", "WRITE_BYTES", "CORRUPT", "BUS_ERRORS"),
+)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A run that has ended: its outcome, and what every task's control block counted."""
+
+    rack: str
+    outcome: Outcome
+    wall_s: float
+    clock_skipped: int
+    tasks: dict[str, dict[str, int]]
+    recording: str
+
+    @property
+    def worked(self) -> bool:
+        """Whether the run did what it was for."""
+        return self.outcome.worked
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {**asdict(self), "worked": self.worked}
+
+    def text(self) -> str:
+        """Return the outcome as text for people."""
+        end = self.outcome
+        lines = [f"{self.rack}: {end.cause} after {end.ticks} ticks{': ' + end.reason if end.reason else ''}"]
+        lines += [f"fault: {fault}" for fault in end.faults]
+        return "\n".join([*lines, f"digest {end.digest}"])
+
+
+def run_rack(config: RackConfig, seconds: float | None, folder: Path | None, display: Display) -> RunResult:
+    """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`, if there is one.
+
+    Raises what `Rack` raises, and `Failure` when the recorder cannot attach; a rack that did not get as far as
+    that leaves no folder.
+    """
+    log = EventLog(display)
+    with _recorder(folder) as recorder:
+        with Rack(config, log.add) as rack:
+            if folder is not None and recorder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / "config.toml").write_text(config.text())
+                log.open(folder / "events.jsonl")
+                if not recorder.attach(config.name, folder):
+                    raise Failure(recorder.finish())
+            started = time.monotonic()
+            outcome = _watch(rack, seconds, display)
+            wall_s, segment = time.monotonic() - started, rack.segment
+        recording = recorder.finish() if recorder is not None else "none"
+    skipped = segment.words[System.CLOCK_SKIPPED]
+    result = RunResult(config.name, outcome, wall_s, skipped, _counters(segment), recording)
+    log.end(result.document())
+    return result
+
+
+def _watch(rack: Rack, seconds: float | None, display: Display) -> Outcome:
+    with _stopped_by_signals(rack):
+        rack.start(seconds)
+        viewer = Viewer(rack.segment)
+        while rack.watch(display.period_s):
+            display.show(viewer.look())
+        display.show(viewer.look())
+    if rack.outcome is None:
+        raise Failure("the run ended without an outcome")
+    return rack.outcome
+
+
+@contextmanager
+def _stopped_by_signals(rack: Rack) -> Iterator[None]:
+    """Turn the first SIGINT or SIGTERM into an orderly end; the second one ends the command at once."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        for ended in kept:
+            signal.signal(ended, signal.default_int_handler)
+        rack.stop(f"{signal.Signals(number).name} received")
+
+    kept = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _recorder(folder: Path | None) -> Iterator[RecorderProcess | None]:
+    recorder = RecorderProcess() if folder is not None else None
+    try:
+        yield recorder
+    finally:
+        if recorder is not None:
+            recorder.finish()
+
+
+def _counters(segment: Segment) -> dict[str, dict[str, int]]:
+    return {
+        task.name: {name.lower(): segment.block(task.name)[Block[name]] for name in COUNTED}
+        for task in segment.layout.tasks
+    }
