@@ -31,11 +31,6 @@ class SystemClock:
         """True when the run is over."""
         return self._words[_STATE] == Run.STOPPED
 
-    @property
-    def is_running(self) -> bool:
-        """True from the first tick until the run is over."""
-        return self._words[_STATE] == Run.RUNNING
-
     def now(self) -> int:
         """Return the tick that has come by time; in lockstep, the newest tick given out.
 
@@ -53,6 +48,8 @@ class SystemClock:
 def ticks_of(rate_hz: float, clock_ns: int, what: str) -> int:
     """Return the period, in ticks, of a rate. Raises `ClockError` with the nearest rates when off the grid."""
     clock_hz = 1e9 / clock_ns
+    if not rate_hz > 0:
+        raise ClockError(f"{what}: {rate_hz:g} Hz is no rate; permitted: {clock_hz:g} Hz or a whole part of it")
     ticks = clock_hz / rate_hz
     every = round(ticks)
     if every >= 1 and abs(ticks - every) <= 1e-6 * ticks:

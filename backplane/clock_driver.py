@@ -38,6 +38,10 @@ class ClockDriver:
             if task.is_due(tick, last):
                 task.release(tick)
 
+    def run(self) -> None:
+        """Give out ticks until the run is over or the launcher is gone."""
+        raise NotImplementedError
+
     def is_over(self, tick: int) -> bool:
         """Say whether the run ends before `tick`."""
         words = self.words
@@ -68,8 +72,9 @@ class RealtimeDriver(ClockDriver):
         words = self.words
         period, epoch = words[System.PERIOD_NS], words[System.EPOCH_NS]
         beat = max(1, int(CHECK_S * 1e9) // period)
+        # The grid begins a little after the clock: tick 0 has its grid point too.
+        tick, last = self._sleep_until_next(-1, epoch, period), -1
         words[System.STATE] = Run.RUNNING
-        tick, last = 0, -1
         while not self.is_over(tick):
             self.release(tick, last)
             if tick // beat != last // beat and not self.launcher_is_alive:

@@ -19,10 +19,13 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, bytes]]:
     found = {}
     for spec in segment.layout.mailboxes:
         slots = Slots(segment, spec)
-        serial = slots.box[Box.HEAD]
-        while serial and slots.fetch(serial) and slots.visible_at(serial) >= until:
+        serial = head = slots.box[Box.HEAD]
+        oldest = max(0, head - slots.depth)
+        while serial > oldest and slots.visible_at(serial) >= until:
             serial -= 1
-        found[spec.name] = (serial, slots.chain if serial else bytes(8))
+        # A message that is overwritten or damaged has no hash to show.
+        whole = serial > 0 and slots.fetch(serial)
+        found[spec.name] = (serial, slots.chain if whole else bytes(8))
     return found
 
 

@@ -8,9 +8,6 @@ a hang.
 
 from __future__ import annotations
 
-from contextlib import suppress
-from types import TracebackType
-
 import posix_ipc
 
 from backplane.byte_lock import ByteLock
@@ -24,39 +21,31 @@ WAIT_S = 0.002
 
 
 class MailboxLock:
-    """Mutual exclusion on one mailbox, with a bounded wait; as a context it tells whether it was obtained."""
+    """Mutual exclusion on one mailbox, with a bounded wait."""
 
     def __init__(self, segment: Segment, name: str, wait_s: float = WAIT_S) -> None:
         self._semaphore = lock_semaphore(segment.rack, name)
         self._owner = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.OWNER)
         self._wait_s = wait_s
-        self._is_owner = False
 
     def acquire(self) -> bool:
         """Take the lock within its bound; False when its holder lives and keeps it."""
-        # A wait that has passed its bound may have been for a dead holder: the owner's lock is free then. And
-        # who comes through the semaphore behind a holder that was overtaken between its two steps is no owner.
-        with suppress(posix_ipc.BusyError):
+        try:
             self._semaphore.acquire(self._wait_s)
-        self._is_owner = self._owner.take()
-        return self._is_owner
+        except posix_ipc.BusyError:
+            # Free when whoever took the semaphore is dead. Of several waiters one gets it.
+            return self._owner.take()
+        # Not free when a waiter whose bound had passed came between the two steps: it is the owner then.
+        return self._owner.take()
 
     def release(self) -> None:
-        """Give the lock back."""
-        self._is_owner = False
+        """Give the lock back. Only its owner may."""
         self._owner.give_back()
         self._semaphore.release()
 
     def close(self) -> None:
         """Give the descriptor back."""
         self._owner.close()
-
-    def __enter__(self) -> bool:
-        return self.acquire()
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._is_owner:
-            self.release()
 
 
 class LockWriter(Writer):
@@ -68,11 +57,13 @@ class LockWriter(Writer):
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`; return False when its time has passed or the lock's bound cut it off."""
-        with self._lock as locked:
-            if not locked:
-                self.bus_errors += 1
-                return False
+        if not self._lock.acquire():
+            self.bus_errors += 1
+            return False
+        try:
             self._slots.publish(tick, tick if now is None else now, tick if basis is None else basis)
+        finally:
+            self._lock.release()
         return now is None or now < tick + self.spec.delay
 
     def close(self) -> None:
@@ -91,5 +82,9 @@ class LockReader(Reader):
     def read(self, tick: int) -> Reading:
         """Return the newest message, or BUS_ERROR with the last good one when the bound cut the wait off."""
         self.accesses += 1
-        with self._lock as locked:
-            return self._newest() if locked else self._cut_off()
+        if not self._lock.acquire():
+            return self._cut_off()
+        try:
+            return self._newest()
+        finally:
+            self._lock.release()

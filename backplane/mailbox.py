@@ -170,4 +170,3 @@ class Reader:
         if head == self._serial:
             return self._readings[Verdict.OLD if head else Verdict.NONE]
         return self._take(head)
-

@@ -45,11 +45,21 @@ class Field:
 
 @dataclass(frozen=True)
 class MessageType:
-    """A named, versioned layout. `fields` stand in the order of their bytes."""
+    """A named, versioned layout. `fields` stand in the order of their bytes.
+
+    Raises `MailboxError` for a field that no `Message` could show.
+    """
 
     name: str
     version: int
     fields: tuple[Field, ...]
+
+    def __post_init__(self) -> None:
+        names = [f.name for f in self.fields]
+        wrong = [n for n in names if names.count(n) > 1 or n.startswith("_") or hasattr(Message, n)]
+        if wrong:
+            why = "permitted: once each, no leading '_', no attribute of Message"
+            raise MailboxError(f"message '{self.name}': field '{wrong[0]}': {why}")
 
     def dtype(self, sizes: Mapping[str, int]) -> np.dtype:
         """Return the numpy dtype with every symbolic size filled in.

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 
 def start_time(pid: int) -> int:
     """Return when a process started, in kernel clock ticks since boot; 0 when there is none or it is a zombie."""
     try:
-        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
-            # The command name, in parentheses, may itself hold spaces and parentheses.
-            fields = file.read().rpartition(")")[2].split()
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except (FileNotFoundError, ProcessLookupError):
         return 0
+    # The command name, in parentheses, may itself hold spaces and parentheses.
+    fields = stat.rpartition(")")[2].split()
     return 0 if fields[0] in "ZX" else int(fields[19])
 
 

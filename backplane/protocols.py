@@ -1,4 +1,4 @@
-"""The three mailbox protocols by name: one writer class and one reader class each."""
+"""The three mailbox protocols by name: one writer class and one reader class each, and one reader for all."""
 
 from __future__ import annotations
 
@@ -28,3 +28,9 @@ def open_writer(segment: Segment, name: str) -> Writer:
 def open_reader(segment: Segment, name: str) -> Reader:
     """Open a mailbox for reading under its protocol."""
     return READERS[segment.layout.mailbox(name).protocol](segment, name)
+
+
+def open_observer(segment: Segment, name: str) -> Reader:
+    """Open a mailbox for reading without ever taking its lock: for the clock and the host side."""
+    is_locked = segment.layout.mailbox(name).protocol == "lock"
+    return DoubleBufferReader(segment, name) if is_locked else open_reader(segment, name)

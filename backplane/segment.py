@@ -1,7 +1,8 @@
 """The backplane's memory: one POSIX shared-memory segment a rack.
 
 The Rack makes and unlinks it; everyone else attaches by the rack's name and finds the layout and
-the resolved config in the segment itself.
+the resolved config in the segment itself. It gets its name when it is complete: a launcher killed before
+that leaves nothing, and nobody ever finds half a segment.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ import mmap
 import os
 import time
 from dataclasses import asdict
-from typing import Self
+from pathlib import Path
+from typing import Any, Self
 
 import posix_ipc
 
-from backplane.address_map import AddressMap, pages
+from backplane.address_map import HEAD_SIZE, AddressMap, pages
 from backplane.errors import SegmentError
 from backplane.layout import FieldSpec, Layout, MailboxSpec, TaskSpec
 from backplane.process import is_alive, start_time
@@ -24,22 +26,17 @@ from backplane.words import Block, Head, System
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 1
 PREFIX = "nasrem-rack."
-SHM_FOLDER = "/dev/shm"
-
-
-def shm_name(rack: str) -> str:
-    """Return the POSIX name of a rack's segment."""
-    return f"/{PREFIX}{rack}"
+SHM_FOLDER = Path("/dev/shm")
+"""Where the C library keeps what `shm_open` names."""
 
 
 class Segment:
     """An attached segment: `layout`, `config` (TOML text), `map`, and its memory as `words` and `bytes`."""
 
-    def __init__(self, rack: str, shm: posix_ipc.SharedMemory) -> None:
+    def __init__(self, rack: str, fd: int, size: int) -> None:
         self.rack = rack
-        self.fd = shm.fd
-        self._map = mmap.mmap(shm.fd, shm.size)
-        self.bytes = memoryview(self._map)
+        self.fd = fd
+        self.bytes = memoryview(mmap.mmap(fd, size))
         self.words = self.bytes.cast("q")
         self.layout: Layout
         self.config: str
@@ -54,22 +51,31 @@ class Segment:
         texts = [json.dumps(asdict(layout)).encode(), config.encode()]
         places = AddressMap(layout)
         size = pages(places.size + sum(len(t) for t in texts))
-        name = shm_name(layout.rack)
         try:
-            shm = posix_ipc.SharedMemory(name, posix_ipc.O_CREX, mode=0o600, size=size)
-        except posix_ipc.ExistentialError:
-            raise SegmentError(_in_use(layout.rack)) from None
+            fd = os.open(SHM_FOLDER, os.O_TMPFILE | os.O_RDWR, 0o600)
+        except OSError as error:
+            raise SegmentError(f"rack '{layout.rack}': {SHM_FOLDER}: {error.strerror}") from None
         try:
             # A full /dev/shm would otherwise show as SIGBUS at the first touch of a page.
-            os.posix_fallocate(shm.fd, 0, size)
+            os.posix_fallocate(fd, 0, size)
+            segment = cls(layout.rack, fd, size)
+            segment.layout, segment.config, segment.map = layout, config, places
+            segment._fill_head(texts)
+            segment._take_name()
         except OSError as error:
-            os.close(shm.fd)
-            posix_ipc.unlink_shared_memory(name)
+            os.close(fd)
+            if isinstance(error, FileExistsError):
+                raise SegmentError(_in_use(layout.rack)) from None
             raise SegmentError(f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}") from None
-        segment = cls(layout.rack, shm)
-        segment.layout, segment.config, segment.map = layout, config, places
-        segment._fill_head(texts)
         return segment
+
+    def _take_name(self) -> None:
+        folder = os.open(SHM_FOLDER, os.O_PATH)
+        try:
+            # With a folder's descriptor the link is made to what the path leads to, not to the path.
+            os.link(f"/proc/self/fd/{self.fd}", shm_path(self.rack).name, src_dir_fd=folder, dst_dir_fd=folder)
+        finally:
+            os.close(folder)
 
     def _fill_head(self, texts: list[bytes]) -> None:
         address = self.map.size
@@ -95,27 +101,38 @@ class Segment:
 
         Raises `SegmentError` when there is none, or its owner, size or version is not what it must be.
         """
+        segment = cls.open(rack)
         try:
-            shm = posix_ipc.SharedMemory(shm_name(rack))
-        except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
-            running = ", ".join(racks()) or "none"
-            why = "belongs to another user" if isinstance(error, posix_ipc.PermissionsError) else "is not there"
-            raise SegmentError(f"rack '{rack}' {why}; racks: {running}") from None
-        owner, least = os.fstat(shm.fd).st_uid, max(Head) * 8 + 8
-        if os.getuid() not in (owner, 0) or shm.size < least:
-            os.close(shm.fd)
-            raise SegmentError(f"rack '{rack}': owner {owner}, {shm.size} bytes: not a segment of this user's")
-        segment = cls(rack, shm)
-        segment._read_head(shm.size)
+            segment._read_head()
+        except SegmentError:
+            segment.close()
+            raise
         return segment
 
-    def _read_head(self, size: int) -> None:
+    @classmethod
+    def open(cls, rack: str) -> Self:
+        """Open a rack's segment, of whatever version: its head tells who launched it, its layout is not read.
+
+        Raises `SegmentError` when there is none, or it is another user's or no segment.
+        """
+        try:
+            shm = posix_ipc.SharedMemory(_shm_name(rack))
+        except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
+            why = "belongs to another user" if isinstance(error, posix_ipc.PermissionsError) else "is not there"
+            raise SegmentError(f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}") from None
+        owner = os.fstat(shm.fd).st_uid
+        if os.getuid() not in (owner, 0) or shm.size < HEAD_SIZE:
+            os.close(shm.fd)
+            raise SegmentError(f"rack '{rack}': owner {owner}, {shm.size} bytes: not a segment of this user's")
+        return cls(rack, shm.fd, shm.size)
+
+    def _read_head(self) -> None:
         if self.words[Head.MAGIC] != MAGIC or self.words[Head.VERSION] != VERSION:
             raise SegmentError(
                 f"rack '{self.rack}': layout version {self.words[Head.VERSION]}; this program attaches to {VERSION}"
             )
-        if self.words[Head.SIZE] != size:
-            raise SegmentError(f"rack '{self.rack}': {size} bytes; its head says {self.words[Head.SIZE]}")
+        if self.words[Head.SIZE] != len(self.bytes):
+            raise SegmentError(f"rack '{self.rack}': {len(self.bytes)} bytes; its head says {self.words[Head.SIZE]}")
         self.layout = _layout(json.loads(self._text(Head.LAYOUT_AT)))
         self.config = self._text(Head.CONFIG_AT)
         self.map = AddressMap(self.layout)
@@ -140,8 +157,18 @@ class Segment:
 
     @property
     def launcher_is_alive(self) -> bool:
-        """Whether the process that made the segment still runs."""
-        return is_alive(self.words[Head.LAUNCHER_PID], self.words[Head.LAUNCHER_START])
+        """Whether the process that made the segment, of whatever version, still runs."""
+        words = self.words
+        return words[Head.MAGIC] == MAGIC and is_alive(words[Head.LAUNCHER_PID], words[Head.LAUNCHER_START])
+
+    @property
+    def has_its_name(self) -> bool:
+        """Whether the rack's name still means this segment: it may be removed, and made again by another launch."""
+        try:
+            named = shm_path(self.rack).stat()
+        except FileNotFoundError:
+            return False
+        return os.path.samestat(named, os.fstat(self.fd))
 
     def close(self) -> None:
         """Give the file descriptor back; the mapping goes with the last view on it."""
@@ -152,27 +179,41 @@ class Segment:
 
 def racks() -> list[str]:
     """Return the names of the racks that have a segment, whether they run or not."""
-    return sorted(n.removeprefix(PREFIX) for n in os.listdir(SHM_FOLDER) if n.startswith(PREFIX))
+    return sorted(path.name.removeprefix(PREFIX) for path in SHM_FOLDER.glob(f"{PREFIX}*"))
 
 
 def unlink(rack: str) -> None:
-    """Remove a rack's segment by name; no error when it is gone already."""
+    """Remove a rack's segment by name; no error when it is gone already.
+
+    Raises `SegmentError` when it is another user's.
+    """
     try:
-        posix_ipc.unlink_shared_memory(shm_name(rack))
+        posix_ipc.unlink_shared_memory(_shm_name(rack))
     except posix_ipc.ExistentialError:
         return
+    except posix_ipc.PermissionsError:
+        raise SegmentError(f"rack '{rack}' belongs to another user, who alone may remove it") from None
+
+
+def shm_path(rack: str) -> Path:
+    """Return where the file system shows a rack's segment."""
+    return SHM_FOLDER / f"{PREFIX}{rack}"
+
+
+def _shm_name(rack: str) -> str:
+    return f"/{PREFIX}{rack}"
 
 
 def _in_use(rack: str) -> str:
     return f"rack '{rack}' has a segment already: it runs, or was killed; see 'rack list', 'rack clean'"
 
 
-def _field(entry: dict) -> FieldSpec:
+def _field(entry: dict[str, Any]) -> FieldSpec:
     shape, fields = tuple(entry["shape"]), tuple(_field(f) for f in entry["fields"])
     return FieldSpec(**{**entry, "shape": shape, "fields": fields})
 
 
-def _layout(entry: dict) -> Layout:
+def _layout(entry: dict[str, Any]) -> Layout:
     boxes = [
         MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": tuple(_field(f) for f in m["fields"])})
         for m in entry["mailboxes"]

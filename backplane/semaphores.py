@@ -9,6 +9,7 @@ from __future__ import annotations
 import posix_ipc
 
 from backplane.layout import Layout
+from backplane.segment import PREFIX, SHM_FOLDER
 
 _OPEN: dict[str, posix_ipc.Semaphore] = {}
 """Semaphores open in this process; forked boards inherit them."""
@@ -41,6 +42,13 @@ def unlink(layout: Layout) -> None:
         _unlink(name)
 
 
+def unlink_all(rack: str) -> None:
+    """Remove every semaphore name of a rack whose layout is not known."""
+    # The C library keeps semaphores beside the segments, with a prefix of its own. No rack's name holds a dot.
+    for path in SHM_FOLDER.glob(f"sem.{PREFIX}{rack}.*"):
+        _unlink(f"/{path.name.removeprefix('sem.')}")
+
+
 def wake_semaphore(rack: str, task: str) -> posix_ipc.Semaphore:
     """Return the open semaphore that wakes a task."""
     return _opened(_wake(rack, task))
@@ -63,15 +71,15 @@ def _opened(name: str) -> posix_ipc.Semaphore:
 
 
 def _clock(rack: str) -> str:
-    return f"/nasrem-rack.{rack}.clock"
+    return f"/{PREFIX}{rack}.clock"
 
 
 def _wake(rack: str, task: str) -> str:
-    return f"/nasrem-rack.{rack}.wake.{task}"
+    return f"/{PREFIX}{rack}.wake.{task}"
 
 
 def _lock(rack: str, mailbox: str) -> str:
-    return f"/nasrem-rack.{rack}.lock.{mailbox}"
+    return f"/{PREFIX}{rack}.lock.{mailbox}"
 
 
 def _unlink(name: str) -> None:

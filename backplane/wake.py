@@ -1,12 +1,13 @@
 """Waiting for the next cycle: `waituntil(next-cycle)` of the paper's pseudo-code.
 
-A board blocks on its semaphore ("signal"), or busy-waits on the tick ("poll") where a context switch is
+A board blocks on its semaphore ("signal"), or busy-waits on its release ("poll") where a context switch is
 too large a part of its cycle and it has a core of its own.
 """
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 
 import posix_ipc
 
@@ -16,12 +17,19 @@ from backplane.segment import Segment
 from backplane.semaphores import wake_semaphore
 from backplane.words import Block, Head
 
+_RELEASED = int(Block.RELEASED)
 CHECK_S = 0.25
 """A wait that takes longer looks whether the launcher still lives."""
+SPINS = 100_000
+"""Looks at a release between two looks at the rest of the world: some milliseconds."""
 
 
 class NextCycle:
-    """The releases of one task, on the grid. A late task skips the releases that passed, and counts them."""
+    """The releases of one task, on the grid. A late task skips the releases that passed, and counts them.
+
+    An executor's release has passed when the next one has come. A planner's has passed with the time slice of its
+    plan: until then it is taken late, as of its own tick, for its result depends on ticks alone all the same.
+    """
 
     def __init__(self, segment: Segment, task: str, poll: bool = False) -> None:
         self._spec = segment.layout.task(task)
@@ -30,6 +38,7 @@ class NextCycle:
         self._semaphore = wake_semaphore(segment.rack, task)
         self._launcher = segment.words[Head.LAUNCHER_PID], segment.words[Head.LAUNCHER_START]
         self._poll = poll
+        self._slack = self._spec.every * (self._spec.within_cycles - 1)
         self._last = self._block[Block.RELEASED]
         self._not_before = 0
         self.skipped = 0
@@ -39,22 +48,24 @@ class NextCycle:
 
         Sets `skipped` to the releases that passed since the last one.
         """
-        every = self._spec.every
         while not self._clock.is_stopped:
-            tick = self._clock.tick
-            release = tick - tick % every
-            if release > self._last and release >= self._not_before and self._clock.is_running:
-                self.skipped = self._count_skipped(release)
-                self._last = release
-                return release
+            # The task's own release, not the clock's tick: in lockstep its turn may come later in a tick.
+            newest = self._block[_RELEASED]
+            if newest > self._last and newest >= self._not_before:
+                return self._take(newest)
             if not (self._spin() if self._poll else self._block_on_semaphore()):
                 return None
         return None
 
-    def _count_skipped(self, release: int) -> int:
+    def _take(self, newest: int) -> int:
+        """Take the oldest release that has not passed."""
+        every = self._spec.every
         expected = max(self._last + 1, self._not_before)
-        expected += -expected % self._spec.every
-        return (release - expected) // self._spec.every
+        expected += -expected % every
+        release = max(expected, newest - self._slack)
+        self.skipped = (release - expected) // every
+        self._last = release
+        return release
 
     def _block_on_semaphore(self) -> bool:
         try:
@@ -64,9 +75,12 @@ class NextCycle:
         return True
 
     def _spin(self) -> bool:
-        tick = self._clock.tick
-        for _ in range(100_000):
-            if self._clock.tick != tick or self._clock.is_stopped:
+        block, last = self._block, self._last
+        for _ in range(SPINS):
+            if block[_RELEASED] > last:
+                # Who does not wait on its semaphore takes the posts all the same: they must not add up for weeks.
+                with suppress(posix_ipc.BusyError):
+                    self._semaphore.acquire(0)
                 return True
         os.sched_yield()
         return is_alive(*self._launcher)

@@ -16,6 +16,7 @@ from boards.clock_board import ClockWiring, run_clock
 from boards.executor_task import ExecutorTask
 from boards.planner_task import PlannerTask
 from boards.processor import die_with_parent, name_process, set_priority, take_processor
+from boards.task import Task
 from boards.wiring import TaskWiring
 from levels.errors import LevelError
 from levels.level import Executor, Planner
@@ -43,30 +44,35 @@ def run_task_board(segment: Segment, wiring: TaskWiring, ready: int) -> int:
 
     `ready` is an eventfd that counts the boards whose self-test has passed.
     """
-    spec = segment.layout.task(wiring.task)
     block = segment.block(wiring.task)
     block[Block.PID] = os.getpid()
     block[Block.STATE] = TaskState.STARTING
+    try:
+        _run_level(segment, wiring, ready)
+    except BaseException:
+        block[Block.STATE] = TaskState.FAILED
+        UtilityLines(segment).assert_sysfail(segment.layout.task(wiring.task).slot)
+        raise
+    block[Block.STATE] = TaskState.ENDED
+    return 0
+
+
+def _run_level(segment: Segment, wiring: TaskWiring, ready: int) -> None:
+    spec, block = segment.layout.task(wiring.task), segment.block(wiring.task)
     level = load(wiring.target)(wiring.context)
     try:
         level.self_test()
         UtilityLines(segment).release_sysfail(spec.slot)
         processor = take_processor(spec)
         block[Block.CORE], block[Block.PRIORITY] = processor.core, processor.priority
-        kind = ExecutorTask if isinstance(level, Executor) else PlannerTask
-        task = kind(segment, wiring, level)
+        task = _task(segment, wiring, level)
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(ready, 1)
         task.run()
-    except BaseException:
-        block[Block.STATE] = TaskState.FAILED
-        raise
     finally:
         # Ordinary scheduling for what is left: closing files must not hold up another board's cycle.
         set_priority(0)
         level.close()
-    block[Block.STATE] = TaskState.ENDED
-    return 0
 
 
 def run_clock_board(segment: Segment, wiring: ClockWiring) -> int:
@@ -77,7 +83,14 @@ def run_clock_board(segment: Segment, wiring: ClockWiring) -> int:
     return 0
 
 
+def _task(segment: Segment, wiring: TaskWiring, level: Executor | Planner) -> Task:
+    if isinstance(level, Executor):
+        return ExecutorTask(segment, wiring, level)
+    return PlannerTask(segment, wiring, level)
+
+
 def load(target: str) -> type[Executor] | type[Planner]:
     """Return the class that "package.module:Class" names; the config has checked that it is there."""
     module, _, name = target.partition(":")
-    return getattr(importlib.import_module(module), name)
+    found: type[Executor] | type[Planner] = getattr(importlib.import_module(module), name)
+    return found

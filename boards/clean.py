@@ -2,34 +2,49 @@
 
 from __future__ import annotations
 
-import posix_ipc
-
 from backplane import semaphores
+from backplane.byte_lock import ByteLock
 from backplane.errors import SegmentError
 from backplane.segment import Segment, racks, unlink
+from backplane.words import Head
 
 
 def remove_dead(rack: str) -> bool:
     """Remove a rack's segment when nobody runs it; return whether there was one to remove.
 
-    Raises `SegmentError` when its launcher lives.
+    Raises `SegmentError` when its launcher lives, or it is another user's.
     """
     if rack not in racks():
         return False
     try:
-        segment = Segment.attach(rack)
+        segment = Segment.open(rack)
     except SegmentError:
-        # Half made, or of another version: nobody of this program can be running it.
+        # Too small for a head: nobody can be running it.
         unlink(rack)
         return True
+    try:
+        return _remove(segment)
+    finally:
+        segment.close()
+
+
+def _remove(segment: Segment) -> bool:
+    rack = segment.rack
     if segment.launcher_is_alive:
         raise SegmentError(
-            f"rack '{rack}' runs already, launched by process {segment.launcher}; stop it, or give this one another name"
+            f"rack '{rack}' runs already, launched by process {segment.launcher}; stop it, or choose another name"
         )
-    semaphores.unlink(segment.layout)
-    unlink(rack)
-    segment.close()
-    return True
+    removal = ByteLock(segment, 8 * Head.MAGIC)
+    try:
+        # Of two programs that find the same dead rack one removes it. Without this the slower one would remove
+        # what the faster one has launched under the name since.
+        if not removal.take() or not segment.has_its_name:
+            return False
+        semaphores.unlink_all(rack)
+        unlink(rack)
+        return True
+    finally:
+        removal.close()
 
 
 def clean() -> tuple[list[str], list[str]]:
@@ -39,6 +54,6 @@ def clean() -> tuple[list[str], list[str]]:
         try:
             if remove_dead(rack):
                 removed.append(rack)
-        except (SegmentError, posix_ipc.PermissionsError):
+        except SegmentError:
             in_use.append(rack)
     return removed, in_use

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from backplane.clock_driver import ClockDriver, Ended, LockstepDriver, RealtimeDriver
 from backplane.message import State
-from backplane.protocols import open_reader
+from backplane.protocols import open_observer
 from backplane.segment import Segment
 from backplane.words import System
 
@@ -39,7 +39,7 @@ class EndOfRun:
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
         self._stop_tick = wiring.stop_tick or None
         self._linger = wiring.linger
-        self._reader = open_reader(segment, wiring.ends_run) if wiring.ends_run else None
+        self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
 
     def __call__(self, tick: int) -> int | None:
         """Return the tick at which the run stops; None as long as that is open."""

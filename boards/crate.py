@@ -41,6 +41,9 @@ class Crate:
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
         self._poll = select.poll()
         self._poll.register(line, select.POLLIN)
+        # The line alone does not tell that the launcher is gone: a process it has forked may hold its end open.
+        self._launcher = os.pidfd_open(os.getppid())
+        self._poll.register(self._launcher, select.POLLIN)
 
     def run(self) -> None:
         """Serve the Rack until it is gone, then see that no board is left."""
@@ -48,7 +51,7 @@ class Crate:
             for fd, _ in self._poll.poll():
                 if fd in self._boards:
                     self._reap(fd)
-                elif (request := self._line.receive()) is None:
+                elif fd == self._launcher or (request := self._line.receive()) is None:
                     self._leave()
                     return
                 else:
@@ -68,10 +71,10 @@ class Crate:
                 self._segment = Segment.attach(rack)
                 semaphores.open_all(self._segment.layout)
                 self._line.send(Opened())
-            case PowerOn(name, TaskWiring() as wiring):
-                self._fork(name, lambda segment: run_task_board(segment, wiring, self._ready))
-            case PowerOn(name, ClockWiring() as wiring):
-                self._fork(name, lambda segment: run_clock_board(segment, wiring))
+            case PowerOn(name, TaskWiring() as task):
+                self._fork(name, lambda segment: run_task_board(segment, task, self._ready))
+            case PowerOn(name, ClockWiring() as clock):
+                self._fork(name, lambda segment: run_clock_board(segment, clock))
             case PowerOff():
                 self._kill()
 
@@ -82,7 +85,7 @@ class Crate:
         if pid == 0:
             self._line.socket.close()
             # No way out of the child but this one: the crate's own code must not run twice.
-            status = 70
+            status = os.EX_SOFTWARE
             try:
                 status = enter(crate, name, self._segment, board)
             finally:
@@ -109,6 +112,7 @@ class Crate:
     def _leave(self) -> None:
         """The Rack is gone: the boards see it and end; what has not ended in time is killed."""
         self._poll.unregister(self._line)
+        self._poll.unregister(self._launcher)
         deadline = time.monotonic() + LEAVE_S
         while self._boards and (left := deadline - time.monotonic()) > 0:
             self._reap_ended(int(left * 1000) + 1)

@@ -6,12 +6,15 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from boards.channel import Channel
+from boards.crate_messages import PowerOff
+from boards.errors import LaunchError
 
 PROJECT = Path(__file__).resolve().parent.parent
-SINGLE_THREADED = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """The crate must not have threads when it forks, and a board's mathematics belong on its own core."""
 
 
@@ -25,7 +28,8 @@ class CrateLine:
         self._printed = os.memfd_create("boards")
         self._read_to = 0
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "boards.crate", str(theirs.fileno()), str(self.ready)],
+            # Unbuffered: a board leaves by no way that would write out what it has printed.
+            [sys.executable, "-u", "-m", "boards.crate", str(theirs.fileno()), str(self.ready)],
             pass_fds=(theirs.fileno(), self.ready),
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
@@ -46,6 +50,18 @@ class CrateLine:
         whole = data[: data.rfind(b"\n") + 1]
         self._read_to += len(whole)
         return whole.decode(errors="replace").splitlines()
+
+    def send(self, request: object) -> None:
+        """Hand a request to the crate. Raises `LaunchError`, with what it has printed, when it is gone."""
+        try:
+            self.line.send(request)
+        except OSError:
+            raise LaunchError("\n".join(self.printed()) or "the crate has ended") from None
+
+    def power_off(self) -> None:
+        """Have the crate kill every board; no error when it is gone itself."""
+        with suppress(LaunchError):
+            self.send(PowerOff())
 
     def close(self, timeout_s: float) -> None:
         """Close the line, whereupon the crate ends its boards and itself; kill it should it not."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 
-from backplane.layout import TaskSpec
 from backplane.segment import Segment
 from backplane.words import Block, Run, System
 
@@ -12,28 +11,29 @@ BEATS = 4
 """Cycles without a sign of life: three gave a false trip in 24,000 at 400 Hz."""
 LEAST_S = 1.0
 """The launcher itself is an ordinary process on a machine full of real-time ones: it looks no closer than this."""
+CLOCK = "clock"
 LOCKSTEP_S = 60.0
 """In lockstep a plan takes as long as it takes; time stands still meanwhile."""
 
 
 class Heartbeat:
-    """Watches the control blocks of all tasks."""
+    """Watches the control blocks of all tasks, and the clock: without it nothing is ever due."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
         self._blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
-        self._bounds = {task.name: self._bound_s(task) for task in segment.layout.tasks}
-        self._seen = {name: (-1, time.monotonic()) for name in self._blocks}
+        self._bounds = {t.name: self._bound_of(t.every * (t.within_cycles + BEATS)) for t in segment.layout.tasks}
+        self._bounds[CLOCK] = self._bound_of(BEATS)
+        self._seen = {name: (-1, time.monotonic()) for name in self._bounds}
         self._reported: set[str] = set()
 
-    def _bound_s(self, task: TaskSpec) -> float:
+    def _bound_of(self, ticks: int) -> float:
         if self._words[System.LOCKSTEP]:
             return LOCKSTEP_S
-        cycles = task.every * (task.within_cycles + BEATS)
-        return max(LEAST_S, cycles * self._words[System.PERIOD_NS] * 1e-9)
+        return max(LEAST_S, ticks * self._words[System.PERIOD_NS] * 1e-9)
 
     def hanging(self) -> list[str]:
-        """Return the tasks that have come to hang since the last call."""
+        """Return the tasks that have come to hang since the last call; "clock" is the system clock."""
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
@@ -41,6 +41,8 @@ class Heartbeat:
             # A task that has nothing to do is alive: its newest release is finished.
             if block[Block.DONE] != self._seen[name][0] or block[Block.DONE] == block[Block.RELEASED]:
                 self._seen[name] = block[Block.DONE], now
+        if self._words[System.TICK] != self._seen[CLOCK][0]:
+            self._seen[CLOCK] = self._words[System.TICK], now
         found = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]
         self._reported.update(found)
         return found

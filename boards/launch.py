@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-
 from dataclasses import dataclass
 
 from backplane.layout import Layout
 from backplane.message import State
-from backplane.protocols import open_reader
+from backplane.protocols import open_observer
 from backplane.segment import Segment
 from backplane.words import Block
 from boards.clock_board import ClockWiring
@@ -62,7 +61,7 @@ class Launch:
         """Return state and reason of the level that ends the run, as last written."""
         if self.ends_run is None:
             return "", ""
-        status = open_reader(segment, self.ends_run).peek()
+        status = open_observer(segment, self.ends_run).peek()
         if not status.is_there:
             return State.IDLE.name.lower(), ""
         return State(status.value.state).name.lower(), status.value.reason

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from time import monotonic_ns
 
 from backplane.segment import Segment
+from backplane.trace import Flag
 from backplane.words import Block
 from boards.processor import set_priority
 from boards.task import Task
@@ -30,7 +31,7 @@ class PlannerTask(Task):
         self.inputs.read(tick)
         read = monotonic_ns()
         if not self.planner.wanted(self.inputs.values, tick):
-            self._pass(tick)
+            self._pass(tick, start, read)
             return
         # From here the time slice is the plan's: the clock releases nothing until its end.
         self.next_cycle.hold_until(tick + self.slice)
@@ -41,15 +42,16 @@ class PlannerTask(Task):
         with self._critical_section():
             in_time = self.outputs.write(tick, self.clock.now(), self.inputs)
         self.block[Block.PLANS] += 1
-        self.finish(tick, start, read, processed, tick + self.slice, in_time)
+        self.finish(tick, start, read, processed, tick + self.slice, in_time, Flag.PLANNED)
 
-    def _pass(self, tick: int) -> None:
-        """Let a release go by without a plan. A decision that comes too late counts as a miss."""
-        block = self.block
-        block[Block.CYCLES] += 1
-        block[Block.SKIPPED] += self.next_cycle.skipped
-        block[Block.MISSED] += self.clock.now() >= tick + self.spec.every
-        block[Block.DONE] = tick
+    def _pass(self, tick: int, start: int, read: int) -> None:
+        """Let a release go by without a plan; trace it when it came too late, or others were skipped."""
+        in_time = self.clock.now() < tick + self.slice
+        if not in_time or self.next_cycle.skipped:
+            self.finish(tick, start, read, monotonic_ns(), tick + self.slice, in_time)
+            return
+        self.block[Block.CYCLES] += 1
+        self.block[Block.DONE] = tick
         self.tell_clock()
 
     @contextmanager

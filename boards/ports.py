@@ -23,6 +23,16 @@ class InputPorts:
         for values, port, read in self._slots:
             values[port] = read(tick)
 
+    @property
+    def bus_errors(self) -> int:
+        """Reads so far that their bound cut off."""
+        return sum([reader.bus_errors for reader in self.readers.values()])
+
+    @property
+    def corrupt(self) -> int:
+        """Reads so far that found a damaged message."""
+        return sum([reader.corrupt for reader in self.readers.values()])
+
     def basis(self, port: str, tick: int) -> int:
         """Return the tick on which the information of a port rests; `tick` where there is none."""
         reader = self.readers.get(port)
@@ -40,6 +50,11 @@ class OutputPorts:
         """Return the outgoing message of a port, if there is such a port."""
         writer = self.writers.get(port)
         return writer.message if writer else None
+
+    @property
+    def bus_errors(self) -> int:
+        """Writes so far that their bound cut off."""
+        return sum([writer.bus_errors for writer in self.writers.values()])
 
     def write(self, tick: int, now: int, inputs: InputPorts) -> bool:
         """Write every mailbox; False when one came too late.

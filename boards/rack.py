@@ -19,8 +19,8 @@ from backplane.words import Block, Run, System, TaskState
 from boards.clean import remove_dead
 from boards.config import load
 from boards.config.schema import RackConfig
-from boards.crate_messages import Ended, Forked, Open, Opened, PowerOff, PowerOn, Preload
 from boards.crate_line import CrateLine
+from boards.crate_messages import Ended, Forked, Open, Opened, PowerOn, Preload
 from boards.errors import LaunchError
 from boards.events import Event, EventKind
 from boards.heartbeat import Heartbeat
@@ -73,19 +73,19 @@ class Rack:
         """
         self._crate = crate = CrateLine()
         # The crate imports while the config is being wired: on two cores that is half a second saved.
-        crate.line.send(Preload(modules(self.config), tuple(sys.path)))
+        crate.send(Preload(modules(self.config), tuple(sys.path)))
         self._plan = plan = Launch.of(self.config)
         remove_dead(self.config.name)
         self.segment = Segment.create(plan.layout, self.config.text())
         self._set_clock()
         semaphores.create(plan.layout)
-        crate.line.send(Open(self.config.name))
+        crate.send(Open(self.config.name))
         self._tell("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
         self._expect(Opened)
         # The crate has them open and every board inherits them: with no name nothing can be left behind.
         semaphores.unlink(plan.layout)
         for wiring in plan.tasks:
-            crate.line.send(PowerOn(wiring.task, wiring))
+            crate.send(PowerOn(wiring.task, wiring))
         self._await_ready(len(plan.tasks))
         for note in plan.notes(self.segment):
             self._tell("ready", "", note)
@@ -113,7 +113,7 @@ class Rack:
         """Power on the clock: the run begins. It lasts `seconds` of simulated time, or until the task ends."""
         clock = self._plan.clock(seconds)
         self._heartbeat = Heartbeat(self.segment)
-        self._line.line.send(PowerOn("clock", clock))
+        self._line.send(PowerOn("clock", clock))
         self._tell("start", "clock", self.config.clock.mode)
 
     def run(self, seconds: float | None = None) -> Outcome:
@@ -160,7 +160,8 @@ class Rack:
     def _expect(self, kind: type) -> None:
         there = _wait([self._line.line.fileno()], LAUNCH_S)
         if not there or not isinstance(self._line.line.receive(), kind):
-            raise LaunchError("\n".join(self._line.printed()) or f"the crate did not open the segment in {LAUNCH_S:g} s")
+            late = f"the crate did not open the segment in {LAUNCH_S:g} s"
+            raise LaunchError("\n".join(self._line.printed()) or late)
 
     def _lose(self, kind: EventKind, board: str, text: str) -> None:
         self._faults.append(text)
@@ -172,7 +173,9 @@ class Rack:
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
         state, reason = self._plan.final_state(self.segment)
-        cause = self._cause or self._plan.cause_of(state)
+        # A stop may also be requested from outside, by a word in the segment.
+        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._plan.cause_of(state))
+        self._let_go()
         self.outcome = Outcome(cause, stop, state, reason, digest(self.segment, stop), tuple(self._faults))
         self._tell("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
 
@@ -181,15 +184,23 @@ class Rack:
         if self._crate is None:
             return
         crate, self._crate = self._crate, None
-        if hasattr(self, "segment"):
-            self.segment.words[System.STATE] = Run.STOPPED
+        try:
+            if hasattr(self, "segment"):
+                self._let_go()
             if self._faults:
-                crate.line.send(PowerOff())
-        crate.close(LEAVE_S)
-        if hasattr(self, "segment"):
-            semaphores.unlink(self.segment.layout)
-            unlink(self.segment.rack)
-            self.segment.close()
+                crate.power_off()
+            # A crate that has no boards yet may still be importing for them.
+            crate.close(LEAVE_S if self._pids else 0)
+        finally:
+            if hasattr(self, "segment"):
+                semaphores.unlink(self.segment.layout)
+                unlink(self.segment.rack)
+                self.segment.close()
+
+    def _let_go(self) -> None:
+        """Tell the boards and the clock that the run is over."""
+        self.segment.words[System.STOP_REQUEST] = 1
+        self.segment.words[System.STATE] = Run.STOPPED
 
     def _tell(self, kind: EventKind, board: str, text: str) -> None:
         running = hasattr(self, "segment") and self.segment.words[System.STATE] != Run.STARTING

@@ -13,9 +13,11 @@ from backplane.words import Block, TaskState
 from boards.ports import InputPorts, OutputPorts
 from boards.wiring import TaskWiring
 
-_DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE = (
-    int(w) for w in (Block.DONE, Block.CYCLES, Block.MISSED, Block.SKIPPED, Block.LEVEL_STATE)
+# Plain integers for the hot path.
+_DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _CORRUPT, _BUS_ERRORS = (
+    int(Block[name]) for name in ("DONE", "CYCLES", "MISSED", "SKIPPED", "LEVEL_STATE", "CORRUPT", "BUS_ERRORS")
 )
+_MISS, _SKIP, _BUS_ERROR, _DAMAGED = (int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT))
 
 
 class Task:
@@ -30,6 +32,7 @@ class Task:
         self.outputs = OutputPorts(segment, wiring.outputs)
         self.trace = TraceWriter(segment, wiring.task)
         self.status = self.outputs.message("status")
+        self._bus_errors = self._corrupt = 0
         self._lockstep_clock = clock_semaphore(segment.rack) if self.clock.is_lockstep else None
 
     def run(self) -> None:
@@ -48,7 +51,9 @@ class Task:
         if self._lockstep_clock is not None:
             self._lockstep_clock.release()
 
-    def finish(self, tick: int, start: int, read: int, processed: int, deadline: int, in_time: bool) -> None:
+    def finish(
+        self, tick: int, start: int, read: int, processed: int, deadline: int, in_time: bool, flags: int = 0
+    ) -> None:
         """Close a cycle: trace it, count it, say that it is done. `deadline` is a tick, the others times in ns."""
         end = monotonic_ns()
         block, skipped, lockstep = self.block, self.next_cycle.skipped, self.clock.is_lockstep
@@ -57,7 +62,7 @@ class Task:
         record[0] = tick
         record[1] = start if lockstep else self.clock.time_of(tick)
         record[2], record[3], record[4], record[5] = start, read, processed, end
-        record[6] = missed * Flag.MISSED | (skipped > 0) * Flag.SKIPPED
+        record[6] = flags | missed * _MISS | (skipped > 0) * _SKIP | self._trouble()
         record[7] = block[_LEVEL_STATE] = self.status.state if self.status is not None else 0
         self.trace.write()
         block[_CYCLES] += 1
@@ -68,6 +73,15 @@ class Task:
         if not block[_CYCLES] & 63:
             self.count_bus()
 
+    def _trouble(self) -> int:
+        """Count what went wrong on the bus since the last cycle; return it as trace flags."""
+        bus_errors, corrupt = self.inputs.bus_errors + self.outputs.bus_errors, self.inputs.corrupt
+        new_errors, new_corrupt = bus_errors - self._bus_errors, corrupt - self._corrupt
+        self._bus_errors, self._corrupt = bus_errors, corrupt
+        self.block[_BUS_ERRORS] += new_errors
+        self.block[_CORRUPT] += new_corrupt
+        return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
+
     def count_bus(self) -> None:
         """Bring the bus accounts of the control block up to date; not needed in every cycle."""
         readers, writers = self.inputs.readers.values(), self.outputs.writers.values()
@@ -76,5 +90,3 @@ class Task:
         block[Block.READ_BYTES] = sum(r.transfers * r.spec.size for r in readers)
         block[Block.WRITES] = sum(w.serial for w in writers)
         block[Block.WRITE_BYTES] = sum(w.serial * w.spec.size for w in writers)
-        block[Block.CORRUPT] = sum(r.corrupt for r in readers)
-        block[Block.BUS_ERRORS] = sum(r.bus_errors for r in readers)

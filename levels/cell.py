@@ -16,7 +16,7 @@ from levels.errors import RobotError
 from levels.limits import Bounds, Limits, joint_bounds, planned_limits
 from levels.mjcf import compile_spec, load_spec
 from levels.motors import fit_gripper, fit_motors, listed
-from levels.robot import GripperConfig, RobotConfig
+from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 from levels.touches import below, geom_name, geoms_of, touch_matrix, unmeant
 
@@ -32,8 +32,8 @@ SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 class Cell:
     """A compiled cell. Indices are addresses in `model`; every array with one entry a joint is (joints,).
 
-    - `model`: torque motors on every joint of the arm, a force motor on the gripper; its keyframe 0 is the start: the arm
-      at home, the gripper open.
+    - `model`: torque motors on every joint of the arm, a force motor on the gripper; its keyframe 0 is the start: the
+      arm at home, the gripper open.
     - `qpos`, `dof`, `actuators`: the arm's joints in qpos, in qvel, and their motors in ctrl.
     - `home`: joint positions at the start, rad. `tool`: site id.
     - `gripper_*`: None for an arm without one; `gripper_open` and `gripper_closed` are joint positions, m or rad.
@@ -108,7 +108,8 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
     for name in robot.joints:
         joint = spec.joint(name)
         if joint is None:
-            raise RobotError(f"robot.joints: no joint '{name}' in the model; it has: {listed([j.name for j in spec.joints])}")
+            have = listed([j.name for j in spec.joints])
+            raise RobotError(f"robot.joints: no joint '{name}' in the model; it has: {have}")
         if joint.type not in SCALAR_JOINTS:
             kind = joint.type.name.removeprefix("mjJNT_").lower()
             raise RobotError(f"robot.joints: '{name}' is a {kind} joint; valid: hinge, slide")
@@ -144,8 +145,7 @@ def index(
     """Find everything that the config names in the compiled model. Raises `RobotError`."""
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = below(model, model.jnt_bodyid[joints])
-    joint = cell_index.gripper_joint(model, robot, moved)
-    gripper: GripperConfig | None = robot.gripper
+    gripper, joint = robot.gripper, cell_index.gripper_joint(model, robot, moved)
     bodies = cell_index.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects, obstacles = bodies[: len(scene.objects)], bodies[len(scene.objects) :]
     arm_geoms, gripper_geoms = geoms_of(model, moved), cell_index.hand_geoms(model, joint)
@@ -161,9 +161,9 @@ def index(
         tool=cell_index.tool_site(model, robot.tool, moved),
         gripper_qpos=None if joint is None else int(model.jnt_qposadr[joint]),
         gripper_dof=None if joint is None else int(model.jnt_dofadr[joint]),
-        gripper_actuator=gripper and int(model.actuator(gripper.actuator).id),
-        gripper_open=gripper and gripper.open,
-        gripper_closed=gripper and gripper.closed,
+        gripper_actuator=None if gripper is None else int(model.actuator(gripper.actuator).id),
+        gripper_open=None if gripper is None else gripper.open,
+        gripper_closed=None if gripper is None else gripper.closed,
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,
@@ -177,7 +177,7 @@ def index(
 
 
 def start_qpos(cell: Cell) -> NDArray[np.float64]:
-    """Return qpos of the start: arm at home, gripper open with the fingers geared to it, the rest as the model has it."""
+    """Return qpos of the start: arm at home, gripper and the fingers geared to it open, the rest as in the model."""
     m = cell.model
     qpos = np.array(m.qpos0)
     qpos[cell.qpos] = cell.home
@@ -202,7 +202,7 @@ def check_start(cell: Cell, robot: RobotConfig) -> None:
             raise RobotError(f"robot.home: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid")
     data = cell.start()
     if not np.isfinite(data.qacc).all():
-        raise RobotError(f"model '{robot.model}': the acceleration at home is not finite; check masses, inertias, gravity")
+        raise RobotError(f"model '{robot.model}': acceleration at home is not finite; check masses, inertias, gravity")
     for pair in unmeant(data, cell.touch):
         first, second = (geom_name(cell.model, geom) for geom in pair)
         raise RobotError(

@@ -66,7 +66,7 @@ def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.i
     for body, joint in zip(bodies, joints, strict=True):
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             raise RobotError(f"scene.objects: body '{model.body(body).name}' has no free joint; give it <freejoint/>")
-    return joints.astype(int)
+    return np.asarray(joints, dtype=int)
 
 
 def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
@@ -75,4 +75,4 @@ def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int
         if model.body_mocapid[body] < 0:
             name = model.body(body).name
             raise RobotError(f"scene.obstacles: body '{name}' cannot move by itself; give it mocap='true'")
-    return model.body_mocapid[bodies].astype(int)
+    return np.asarray(model.body_mocapid[bodies], dtype=int)

@@ -1,6 +1,6 @@
 """The arm's equation of motion, as a controller knows it: torque = M(q) qdd + bias(q, qd) + friction.
 
-Evaluated on data of its own, with contacts and constraints off: a pure function of its arguments, not of the simulation.
+Evaluated on data of its own, with contacts and constraints off: a pure function of its arguments, not of a simulation.
 (`qfrc_bias` of a simulation belongs to the state before its last step.)
 """
 
@@ -18,7 +18,7 @@ from levels.cell import Cell
 Array = NDArray[np.float64]
 
 FRICTION_SPEED = 0.01
-"""Joint speed, rad/s, at which dry friction is fed forward with 3/4 of its value: a step at rest would excite the arm."""
+"""Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at rest would excite the arm."""
 
 OFF = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR
 

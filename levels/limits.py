@@ -1,4 +1,4 @@
-"""Limits of an arm's joints, from the config and the model: what motion is planned within, and what is never exceeded."""
+"""Limits of an arm's joints, from config and model: what motion is planned within, and what is never exceeded."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Bounds:
 class Limits:
     """What motion is planned within: the bounds, less some room to track it, and the config's smoothness.
 
-    `position` (joints, 2), rad; `velocity`, `acceleration`, `jerk` (joints,), both ways, rad/s, rad/s2, rad/s3; `torque`
-    (joints,), N m.
+    `position` (joints, 2), rad; `velocity`, `acceleration`, `jerk` (joints,), both ways, rad/s, rad/s2, rad/s3;
+    `torque` (joints,), N m.
     """
 
     position: NDArray[np.float64]

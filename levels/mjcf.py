@@ -1,4 +1,4 @@
-"""Read an MJCF file that may come from a stranger: every mistake in it is one `RobotError`, in bounded time and memory."""
+"""Read an MJCF file that may come from a stranger: every mistake is one `RobotError`, in bounded time and memory."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ GRIDS = (("nrow", "ncol"), ("width", "height"))
 def load_spec(path: Path) -> mujoco.MjSpec:
     """Return the parsed, not yet compiled, MJCF file.
 
-    Raises `RobotError` for a file that is missing, malformed, too large, includes what is outside its own folder, holds a
-    NaN, or has a time step that is none.
+    Raises `RobotError` for a file that is missing, malformed, too large, includes what is outside its own folder, holds
+    a NaN, or has a time step that is none.
     """
     path = Path(path)
     screen(path, path.resolve().parent, set())

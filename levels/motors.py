@@ -15,8 +15,8 @@ JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], NDArray[np.float64]]:
     """Replace the drives of the arm's joints in `spec`; return the motors' names and torque limits (joints,), N m.
 
-    A limit comes from `robot.torque`, else it is the tightest of the joint's actuatorfrcrange and its actuators' ranges.
-    Raises `RobotError` when neither has one.
+    A limit comes from `robot.torque`, else it is the tightest of the joint's actuatorfrcrange and the ranges of its
+    actuators. Raises `RobotError` when neither has one.
     """
     drives = [a for a in spec.actuators if drives_arm(spec, a, robot)]
     limits = np.array([torque_limit(spec, name, k, robot, drives) for k, name in enumerate(robot.joints)])
@@ -25,7 +25,7 @@ def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], NDAr
     for name, joint, limit in zip(names, robot.joints, limits, strict=True):
         drive = spec.joint(joint)
         drive.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        # With actgravcomp the motor would carry a torque that nobody commanded; as a passive force it is in the model's bias.
+        # With actgravcomp the motor would carry a torque that nobody commanded; a passive force is in the model's bias.
         drive.actgravcomp = False
         add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, joint, limit)
     return names, limits
@@ -42,7 +42,7 @@ def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
         raise RobotError(f"robot.gripper.actuator: '{gripper.actuator}' is not in the model; actuators: {have}")
     kind, target = old.trntype, old.target
     if kind not in (*JOINT_DRIVES, mujoco.mjtTrn.mjTRN_TENDON):
-        raise RobotError(f"robot.gripper.actuator: '{gripper.actuator}' drives neither a joint nor a tendon: {kind.name}")
+        raise RobotError(f"robot.gripper.actuator: '{gripper.actuator}' is a {kind.name}; valid: on a joint or tendon")
     remove(spec, [old])
     add_motor(spec, gripper.actuator, kind, target, gripper.force)
 

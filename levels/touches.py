@@ -30,8 +30,8 @@ def touch_matrix(
 ) -> NDArray[np.bool_]:
     """Return (ngeom, ngeom): True where a contact of two geoms is one that no task means.
 
-    A task means an object on a support, an object in the gripper, the parts of one object and the fingers on each other.
-    Every other contact of arm or object is a touch; what the rest of the cell does among itself is not looked at.
+    A task means an object on a support, an object in the gripper, the parts of one object and the fingers on each
+    other. Every other contact of arm or object is a touch; what the rest of the cell does among itself is not looked at.
     """
     touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     ours = np.union1d(arm, objects)
@@ -52,4 +52,4 @@ def unmeant(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return (n, 2): the pairs of geoms in contacts that no task means."""
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
-    return pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0.0)]
+    return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0.0)])

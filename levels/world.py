@@ -27,7 +27,7 @@ class WorldParams(Table):
 class WorldModel(Executor):
     """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body starts or stops moving.
 
-    The revision is the tick of the last such change, so it rises across a restart of this board too.
+    The revision is the tick behind the last such change, so it rises across a restart of this board too.
     """
 
     inputs = {"scene": Input(SCENE, "servo.scene")}
@@ -51,7 +51,7 @@ class WorldModel(Executor):
         scene: Message = read.scene.value
         if self._seen_tick < 0:
             self._rest_position[:], self._rest_quaternion[:] = scene.position, scene.quaternion
-            write.model.revision = tick
+            write.model.revision = tick + 1
         else:
             elapsed_s = (tick - self._seen_tick) * self.context.tick_s
             self._follow(scene, write.model, elapsed_s, tick)
@@ -74,7 +74,7 @@ class WorldModel(Executor):
         self._moving ^= stops | starts
         model.velocity = np.where(self._moving[:, None], velocity, 0.0)
         if stops.any() or starts.any():
-            model.revision = tick
+            model.revision = tick + 1
 
 
 def turn(first: Array, second: Array) -> Array:

@@ -6,9 +6,9 @@ from tools.answer import ConfigName, Json, Settings, print_json
 
 
 def check(config: ConfigName, settings: Settings = [], as_json: Json = False) -> None:  # noqa: B006  typer copies it
-    """Validate a config: slots, cores, rates, mailboxes with their bus addresses, and the timing they imply.
+    """Validate a config and show what it makes.
 
-    Every mistake is shown at once, one a line.
+    Slots, cores, rates, mailboxes with their bus addresses, and the timing that follows; or every mistake, one a line.
     """
     from boards.config import load, shared_out, wire
     from tools.inventory import Inventory

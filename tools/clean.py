@@ -6,7 +6,10 @@ from tools.answer import Json, print_json
 
 
 def clean(as_json: Json = False) -> None:
-    """Remove the shared memory of racks that nobody runs; a rack in use is never touched."""
+    """Remove what killed racks left in shared memory.
+
+    A rack in use is never touched.
+    """
     from boards.clean import clean as remove
 
     removed, in_use = remove()

@@ -7,9 +7,11 @@ import sys
 import typer
 
 from tools.answer import Failure, fail
+from tools.bench.command import bench
 from tools.check import check
 from tools.clean import clean
 from tools.list import list_racks
+from tools.record import record
 from tools.report import report
 from tools.run import run
 from tools.status import status
@@ -29,7 +31,9 @@ app.command("list")(list_racks)
 app.command()(status)
 app.command()(stop)
 app.command()(clean)
+app.command()(record)
 app.command()(report)
+app.command()(bench)
 
 
 def main() -> None:
@@ -37,7 +41,7 @@ def main() -> None:
     if sys.platform != "linux":
         sys.exit(f"rack runs on Linux alone, not on {sys.platform}: it needs /dev/shm, pidfds and SCHED_FIFO")
     try:
-        app()
+        app(prog_name="rack")
     except Failure as failure:
         fail(str(failure), failure.status)
     except Exception as error:

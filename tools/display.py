@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from rich.console import Console
 from rich.live import Live
 
 from boards.events import Event
-from tools.live_table import line_of, table_of
+from tools.live_table import console, line_of, table_of
 from tools.snapshot import Snapshot
 
 QUIET = ("launch", "start", "end")
@@ -88,11 +87,11 @@ def _line(event: Event) -> str:
 @contextmanager
 def display_for(silent: bool) -> Iterator[Display]:
     """Give the display that fits where stdout goes."""
-    console = Console()
+    terminal = console()
     if silent:
         yield SilentDisplay()
-    elif console.is_terminal:
-        with Live(console=console, auto_refresh=False) as live:
+    elif terminal.is_terminal:
+        with Live(console=terminal, auto_refresh=False) as live:
             yield LiveDisplay(live)
     else:
         yield PlainDisplay()

@@ -6,7 +6,10 @@ from tools.answer import Json, print_json
 
 
 def list_racks(as_json: Json = False) -> None:
-    """List the racks that have a segment on this machine, running or left behind."""
+    """List the racks on this machine.
+
+    Those that run, and those that a killed launcher has left.
+    """
     from backplane.segment import racks
     from tools.survey import describe
 

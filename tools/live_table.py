@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from tools.snapshot import Progress, Snapshot, TaskRow
 
-COLUMNS = ("slot", "task", "core", "scheduling", "rate", "tick", "cycles", "missed", "skipped", "exec", "late", "state")
+COLUMNS = (
+    *("slot", "task", "core", "sched", "Hz", "tick", "cycles", "missed", "skipped"),
+    *("exec ms", "late ms", "state"),
+)
+"""Headings; `exec` and `late` are the longest since the last look."""
+TEXTS = ("task", "sched", "state")
+NARROWEST = 110
+"""Columns of characters that the table takes where no terminal says otherwise."""
 
 
 def table_of(snapshot: Snapshot) -> RenderableType:
-    """Return the whole view of a rack: head line, boards, progress."""
-    parts: list[RenderableType] = [_head(snapshot), _boards(snapshot.tasks)]
+    """Return the whole view of a rack: head line, boards, what they complain of, progress."""
+    reasons = [Text(f"{row.task}: {row.reason}", style="red") for row in snapshot.tasks if row.reason]
+    parts: list[RenderableType] = [_head(snapshot), _boards(snapshot.tasks), *reasons]
     if snapshot.progress is not None:
         parts.append(_bar(snapshot.progress))
     return Group(*parts)
+
+
+def console() -> Console:
+    """Return the console for tables on stdout."""
+    found = Console()
+    return found if found.is_terminal else Console(width=NARROWEST)
 
 
 def line_of(snapshot: Snapshot) -> str:
@@ -44,8 +58,7 @@ def _head(snapshot: Snapshot) -> Text:
 def _boards(rows: tuple[TaskRow, ...]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name in COLUMNS:
-        table.add_column(name, justify="left" if name in ("task", "scheduling", "state") else "right", no_wrap=True)
-    table.add_column("reason", overflow="ellipsis", no_wrap=True)
+        table.add_column(name, justify="left" if name in TEXTS else "right", no_wrap=True)
     for row in rows:
         table.add_row(*_cells(row))
     return table
@@ -57,7 +70,7 @@ def _cells(row: TaskRow) -> list[str | Text]:
         row.task,
         str(row.core),
         f"FIFO {row.priority}" if row.priority else "other",
-        f"{row.rate_hz:g} Hz",
+        f"{row.rate_hz:g}",
         str(row.tick),
         str(row.cycles),
         Text(str(row.missed), style="red" if row.missed else ""),
@@ -65,12 +78,11 @@ def _cells(row: TaskRow) -> list[str | Text]:
         _ms(row.exec_ms),
         _ms(row.lateness_ms),
         Text(row.state, style={"error": "red", "failed": "red", "done": "green"}.get(row.state, "")),
-        row.reason,
     ]
 
 
 def _ms(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f} ms"
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _bar(progress: Progress) -> RenderableType:

@@ -13,7 +13,10 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run,
 
 
 def report(run: RunFolder, as_json: Json = False) -> None:
-    """Make report.json and report.md of a run anew, from its trace and signals, and show it."""
+    """Report on a run, from its recording.
+
+    Makes report.json and report.md anew.
+    """
     from tools.reporting.report import write_report
 
     data, text = write_report(run)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from backplane.layout import TaskSpec
 from backplane.lines import UtilityLines
 from backplane.message import State
@@ -20,7 +18,7 @@ TASK_STATUS = "task_status"
 
 @dataclass(frozen=True)
 class TaskRow:
-    """One task now. Times are of the cycles since the last row, in ms; None when there were none.
+    """One task now. Times are the longest of the newest cycles looked at, in ms; None before the first.
 
     `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling.
     """
@@ -74,6 +72,7 @@ class Viewer:
         self._segment = segment
         self._lines = UtilityLines(segment)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+        self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
         written = {m.name: m.message for m in segment.layout.mailboxes}
         self._statuses = {
             task.name: open_reader(segment, f"{task.name}.status")
@@ -106,7 +105,7 @@ class Viewer:
 
     def _row(self, task: TaskSpec) -> TaskRow:
         block = self._segment.block(task.name)
-        cycles = self._traces[task.name].drain().rows
+        exec_ms, lateness_ms = self._times_ms(task.name)
         state, reason = TaskState(block[Block.STATE]).name.lower(), ""
         if task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
             state, reason = State(status.value.state).name.lower(), status.value.reason
@@ -122,17 +121,21 @@ class Viewer:
             plans=block[Block.PLANS],
             missed=block[Block.MISSED],
             skipped=block[Block.SKIPPED],
-            exec_ms=_longest_ms(cycles["process_ns"] - cycles["read_ns"]),
-            lateness_ms=_longest_ms(cycles["start_ns"] - cycles["release_ns"]),
+            exec_ms=exec_ms,
+            lateness_ms=lateness_ms,
             reason=reason,
         )
+
+    def _times_ms(self, task: str) -> tuple[float | None, float | None]:
+        """Return the longest execution and lateness of the cycles since the last look that saw any."""
+        cycles = self._traces[task].drain().rows
+        if len(cycles):
+            execution, lateness = cycles["process_ns"] - cycles["read_ns"], cycles["start_ns"] - cycles["release_ns"]
+            self._times[task] = float(execution.max()) * 1e-6, float(lateness.max()) * 1e-6
+        return self._times[task]
 
     def _progress(self) -> Progress | None:
         if self._whole is None or not (status := self._whole.peek()).is_there:
             return None
         at = status.value
         return Progress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
-
-
-def _longest_ms(durations_ns: np.ndarray) -> float | None:
-    return float(durations_ns.max()) * 1e-6 if len(durations_ns) else None

@@ -13,11 +13,14 @@ def status(
     rack: Annotated[str | None, typer.Argument(metavar="[RACK]", help="rack; may be left out when one runs")] = None,
     as_json: Json = False,
 ) -> None:
-    """Show every board of a running rack: state, cycles, misses, times, and how far the task is."""
+    """Show every board of a running rack.
+
+    State, cycles, misses, times, and how far the task is.
+    """
     from dataclasses import asdict
 
     from backplane.segment import Segment, racks
-    from tools.live_table import table_of
+    from tools.live_table import console, table_of
     from tools.snapshot import Viewer
 
     running = racks()
@@ -27,6 +30,4 @@ def status(
     if as_json:
         print_json(asdict(found))
         return
-    from rich.console import Console
-
-    Console().print(table_of(found))
+    console().print(table_of(found))

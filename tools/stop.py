@@ -14,7 +14,10 @@ def stop(
     wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="seconds to wait for the rack's end")] = 10.0,
     as_json: Json = False,
 ) -> None:
-    """Have a running rack end at its next tick, and wait until it is gone."""
+    """End a run and wait until it is gone.
+
+    The run ends at its next tick, in order: its report is made.
+    """
     from tools.stopping import stop_rack
 
     if not stop_rack(rack, wait):

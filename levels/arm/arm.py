@@ -24,9 +24,9 @@ class Sensed(NamedTuple):
 class Arm(Protocol):
     """An arm with torque-driven joints and a force-driven gripper.
 
-    `tick` is the tick that its state belongs to. `torque` (joints,), N m, and `grip_force`, N, are what it was given last,
-    behind the limit gate; `clipped` counts the cycles in which the gate cut a command, `touches` the contacts that no task
-    means, and `first_touch` says which was the first. `fault` is empty, or says why the arm has stopped for good.
+    `tick` is the tick that its state belongs to. `torque` (joints,), N m, and `grip_force`, N, are what it was given
+    last, behind the limit gate; `clipped` counts the cycles in which the gate cut a command, `touches` the contacts that
+    no task means, and `first_touch` says which was the first. `fault` is empty, or says why the arm has stopped for good.
     """
 
     tick: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.dynamics import Terms
+from levels.dynamics import Dynamics
 
 Array = NDArray[np.float64]
 
@@ -19,8 +19,8 @@ class Brake:
     This is "safe stop 2" of IEC 61800-5-2. `stiffness`, rad/s, is the bandwidth of the hold.
     """
 
-    def __init__(self, braking: Array, stiffness: float = 20.0) -> None:
-        self._braking = braking
+    def __init__(self, braking: Array, dynamics: Dynamics, stiffness: float = 20.0) -> None:
+        self._braking, self._dynamics = braking, dynamics
         self._stiffness = stiffness
         self._rest: Array | None = None
 
@@ -28,10 +28,11 @@ class Brake:
         """Let the arm move again."""
         self._rest = None
 
-    def torque(self, q: Array, qd: Array, terms: Terms) -> Array:
+    def torque(self, q: Array, qd: Array) -> Array:
         """Return the torques (joints,), N m, that stop or hold the arm at state `q`, `qd`."""
         if self._rest is None:
             self._rest = q.copy()
         np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
         wanted = self._stiffness**2 * (self._rest - q) - 2.0 * self._stiffness * qd
-        return np.asarray(terms.inertia @ np.clip(wanted, -self._braking, self._braking) + terms.bias)
+        inertia, bias = self._dynamics.terms(q, qd)
+        return np.asarray(inertia @ np.clip(wanted, -self._braking, self._braking) + bias)

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from levels.cell import Bounds
-from levels.dynamics import Terms
+from levels.dynamics import Dynamics
 
 Array = NDArray[np.float64]
 
 SPEED_USED = 0.99
-"""Part of a velocity limit that the gate lets a joint reach: what its model leaves out within a cycle fits in the rest."""
+"""Part of a velocity limit that the gate lets a joint reach; what its model leaves out in a cycle fits in the rest."""
 RANGE_KEPT_RAD = 0.002
 """What the gate keeps from the ends of a joint's range, for the same reason."""
 
@@ -24,41 +24,51 @@ HARD, SOFT = 0, 8
 class LimitGate:
     """Cuts torques so that the next cycle ends within limits, from which the arm can still be stopped.
 
-    A joint may be as fast as it can brake, with `braking` (joints,), rad/s2, before the end of its range. The velocities
-    that follow from torques are predicted with the arm's own equation of motion. Torques that lead too far give way to the
-    nearest ones, in acceleration, that do not: a small quadratic program, in which the torque limits are the last word.
+    A joint may be as fast as it can brake, with `braking` (joints,), rad/s2, before the end of its range. The
+    velocities that follow from torques are predicted with the arm's equation of motion. Torques that lead too far give
+    way to the nearest ones, in acceleration, that do not: a small quadratic program, in which the torque limits are the
+    last word.
     """
 
-    def __init__(self, bounds: Bounds, braking: Array, period_s: float) -> None:
+    def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
         self._torque = bounds.torque
         self._fastest = SPEED_USED * bounds.velocity
         self._low = bounds.position[:, 0] + RANGE_KEPT_RAD
         self._high = bounds.position[:, 1] - RANGE_KEPT_RAD
         self._braking = braking
         self._period_s = period_s
+        self._dynamics = dynamics
         joints = len(braking)
+        self._inertia, self._resisting = np.eye(joints), np.zeros(joints)
         self._unity = np.eye(joints)
         self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
 
-    def admit(self, torque: Array, q: Array, qd: Array, terms: Terms, friction: Array) -> tuple[Array, bool]:
+    def admit(self, torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
         """Return the torques (joints,), N m, that may pass at state `q`, `qd`, and whether anything was cut.
 
-        `terms` and `friction` are those of the state. `torque` must be finite.
+        `torque` must be finite.
         """
-        passed = np.clip(torque, -self._torque, self._torque)
-        resisting = terms.bias + friction
-        gain = np.linalg.solve(terms.inertia, passed - resisting) * self._period_s
+        passed: Array = np.clip(torque, -self._torque, self._torque)
         least = -self._speed_towards(q - self._low, -qd) - qd
         most = self._speed_towards(self._high - q, qd) - qd
+        gain = np.clip(self._gain(passed, q, qd), least, most)
+        # Light joints change speed so much within a cycle that only its middle tells where it ends.
+        gain = self._gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
         if (gain < least).any() or (gain > most).any():
-            passed = self._nearest(gain, least, most, terms.inertia, resisting)
+            passed = self._nearest(gain, least, most)
         return passed, not np.array_equal(passed, torque)
 
-    def _nearest(self, gain: Array, least: Array, most: Array, inertia: Array, resisting: Array) -> Array:
+    def _gain(self, torque: Array, q: Array, qd: Array) -> Array:
+        """Return what torques add to the velocities in one cycle, rad/s, as the state `q`, `qd` has it."""
+        self._inertia, bias = self._dynamics.terms(q, qd)
+        self._resisting = bias + self._dynamics.friction(qd)
+        return np.asarray(np.linalg.solve(self._inertia, torque - self._resisting) * self._period_s)
+
+    def _nearest(self, gain: Array, least: Array, most: Array) -> Array:
         """Return the torques whose gain in velocity, rad/s a cycle, is nearest to `gain` between `least` and `most`."""
         scale = self._fastest
-        per_torque = inertia * (scale / self._period_s) / self._torque[:, None]
-        offset = resisting / self._torque
+        per_torque = self._inertia * (scale / self._period_s) / self._torque[:, None]
+        offset = self._resisting / self._torque
         upper = np.concatenate((most / scale, 1.0 - offset))
         lower = np.concatenate((least / scale, -1.0 - offset))
         nearest, _, status, _ = daqp.solve(self._unity, -gain / scale, per_torque, upper, lower, self._kinds)
@@ -69,8 +79,8 @@ class LimitGate:
     def _speed_towards(self, distance: Array, speed: Array) -> Array:
         """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.
 
-        With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and from there must stop within what is
-        left: v'^2 / 2 a <= distance - (v + v') T / 2.
+        With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and from there must stop within what
+        is left: v'^2 / 2 a <= distance - (v + v') T / 2.
         """
         half = 0.5 * self._braking * self._period_s
         left = np.maximum(distance - 0.5 * speed * self._period_s, 0.0)

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 class ObstacleMotion:
-    """The moves of one obstacle, one after the other; a move that starts before the last has ended cuts it off there."""
+    """The moves of one obstacle, one after the other; a move that starts before the last has ended cuts that off."""
 
     def __init__(self, start: Array, moves: tuple[MotionConfig, ...]) -> None:
         """Take the place `start` (3,), m, and the obstacle's moves."""

@@ -21,8 +21,8 @@ from levels.scene import SceneConfig
 Array = NDArray[np.float64]
 
 PATIENCE_TICKS = 4
-"""Ticks for which the drives go on with the last command when none comes; then they brake. As many missed beats make the
-supervisor call a board dead."""
+"""Ticks for which the drives go on with the last command when none comes; then they brake. After as many missed beats
+the supervisor calls a board dead."""
 
 
 class SimulatedArm:
@@ -37,8 +37,8 @@ class SimulatedArm:
         self._clock_ns = clock_ns
         self._substeps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
         self._dynamics = Dynamics(cell)
-        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9)
-        self._brake = Brake(cell.limits.acceleration)
+        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, self._dynamics)
+        self._brake = Brake(cell.limits.acceleration, self._dynamics)
         self._monitor = ContactMonitor(cell)
         obstacles = cell.bodies[len(cell.object_qpos) :]
         names = scene.obstacles
@@ -130,14 +130,13 @@ class SimulatedArm:
         """Pass the command, or the brake's, through the limit gate to the motors."""
         d, cell = self._data, self._cell
         q, qd, _, _ = self.sense()
-        terms, friction = self._dynamics.terms(q, qd), self._dynamics.friction(qd)
         valid = bool(np.isfinite(self._command).all())
         if valid and self._waited < PATIENCE_TICKS:
             self._brake.release()
             wanted = self._command
         else:
-            wanted = self._brake.torque(q, qd, terms)
-        passed, cut = self._gate.admit(wanted, q, qd, terms, friction)
+            wanted = self._brake.torque(q, qd)
+        passed, cut = self._gate.admit(wanted, q, qd)
         self.clipped += cut or not valid
         np.copyto(self.torque, passed)
         d.ctrl[cell.actuators] = passed

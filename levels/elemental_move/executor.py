@@ -61,7 +61,7 @@ class ElementalMoveExecutor(Executor):
         if not self._started:
             self._go_on(read, write, segments)
         status = read.status.value
-        self._plans.take(read.plan, self._done)
+        self._plans.take(read.plan, self._done, self._handed_down)
         self._take_window(read.command.value, status, segments)
         if not self._error:
             self._take_done(status, segments)
@@ -202,13 +202,13 @@ class ElementalMoveExecutor(Executor):
         report.current = int(under_way["move"]) if under_way is not None else 0
         at = np.flatnonzero(command.moves["id"][: command.count] == report.current) if report.current else ()
         report.verb = int(command.moves["verb"][at[0]]) if len(at) else Verb.NONE
-        self._report_plans(status, report)
+        self._report_plans(command, status, report)
         report.replan = self._request
         report.start = status.position
 
-    def _report_plans(self, status: Message, report: Message) -> None:
+    def _report_plans(self, command: Message, status: Message, report: Message) -> None:
         """Say how far plans are at hand: from there the planner goes on."""
-        report.planned = self._plans.newest(self._handed_down)
+        report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
         end = self._plans.end(report.planned)
         if report.planned <= self._done and status.resting:
             report.end = status.position

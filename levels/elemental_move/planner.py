@@ -18,7 +18,7 @@ from levels.messages import (
     MOVE_PLAN,
     MOVE_STATUS,
     PRIMITIVE_STATUS,
-    SERVO_STATUS,
+    SCENE,
     TASK_COMMAND,
     WORLD_MODEL,
     Error,
@@ -28,7 +28,7 @@ from levels.messages import (
 from levels.params import read_params
 from levels.planning.move import Move, read_window
 from levels.planning.path import Path
-from levels.planning.pose import Pose
+from levels.planning.pose import Pose, pose
 from levels.planning.situation import Situation
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ class ElementalMovePlanner(Planner):
         "command": Input(TASK_COMMAND, "above.command"),
         "status": Input(MOVE_STATUS, "own.status"),
         "primitive": Input(PRIMITIVE_STATUS, "below.status"),
-        "servo": Input(SERVO_STATUS, "servo.status"),
+        "scene": Input(SCENE, "servo.scene"),
         "world": Input(WORLD_MODEL, "world.model"),
     }
     output: ClassVar[MessageType] = MOVE_PLAN
@@ -74,7 +74,7 @@ class ElementalMovePlanner(Planner):
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Say whether a path is asked for, is blocked, or is not yet there."""
-        ports = (read.command, read.status, read.primitive, read.servo, read.world)
+        ports = (read.command, read.status, read.primitive, read.scene, read.world)
         if not all(port.is_there for port in ports):
             return False
         self._window = read_window(read.command.value)
@@ -151,14 +151,15 @@ class ElementalMovePlanner(Planner):
         self._published = [p for p in kept if not lost or p.move.id < lost[0]]
 
     def _note_grip(self, read: Ports) -> None:
-        """Remember how the object is grasped while it still rests; what is sensed of a carried one comes late."""
+        """Remember how the object will be grasped while it still rests; after a restart, see how it is held."""
         world, held, done = read.world.value, read.primitive.value.held, read.status.value.done
         if held < 0:
             ahead = [(m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done]
             self._grip = next(((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None)
         elif self._grip is None or self._grip[0] != held:
-            tool = self._motion.ik.tool_at(np.array(read.servo.value.position))
-            self._grip = (held, grip_of(held, tool, world))
+            scene = read.scene.value
+            tool = pose(scene.tool_position, scene.tool_quaternion)
+            self._grip = (held, grip_of(held, tool, scene))
 
     def _may_try(self, job: Job, revision: int, tick: int) -> bool:
         """Say whether a job may be tried: at once, or again when the world has changed or time has passed."""
@@ -188,6 +189,6 @@ class ElementalMovePlanner(Planner):
             self._published.append(published)
 
 
-def grip_of(row: int, tool: Pose, world: Message) -> Pose:
-    """Return the pose of object `row` in the frame of a tool at `tool`."""
-    return tool.inverse() @ Pose(np.array(world.position[row]), np.array(world.quaternion[row]))
+def grip_of(row: int, tool: Pose, seen: Message) -> Pose:
+    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a SCENE or a WORLD_MODEL."""
+    return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])

@@ -19,6 +19,8 @@ RESTARTS = 40
 """Random starts for one pose, at most: of 200 random poses of the PUMA, 20 starts missed one."""
 PATIENCE = 8
 """Starts in a row that bring no new solution and end the search, once there is one."""
+MOST_SOLUTIONS = 8
+"""Solutions of one pose, at most: a redundant arm has infinitely many."""
 ITERATIONS = 25
 STALLED_ITERATIONS = 5
 STALLED_PART = 0.7
@@ -100,7 +102,7 @@ class InverseKinematics:
             idle = idle + 1 if known else 0
             if q is not None and not known:
                 found.append(q)
-            if found and idle >= PATIENCE:
+            if len(found) == MOST_SOLUTIONS or (found and idle >= PATIENCE):
                 break
         return sorted(found, key=lambda q: self.time_between(reference, q))
 

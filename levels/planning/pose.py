@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+SAME = 1e-6
+"""Poses closer than this, in m and in rad, are one pose."""
 PARALLEL = 1e-9
 """Two unit directions whose cross product is shorter than this are parallel."""
 
@@ -35,6 +37,10 @@ class Pose(NamedTuple):
     def raised(self, height: float) -> Pose:
         """Return the pose moved by `height`, in m, along the world's z axis."""
         return Pose(self.position + np.array([0.0, 0.0, height]), self.quaternion)
+
+    def is_near(self, other: Pose) -> bool:
+        """Say whether the two are one pose, but for rounding."""
+        return bool(np.all(np.abs(self.position - other.position) < SAME)) and self.angle_to(other) < SAME
 
     def angle_to(self, other: Pose) -> float:
         """Return the angle between the two orientations, in rad."""

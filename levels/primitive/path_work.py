@@ -128,15 +128,15 @@ class PathWork:
         return now_s + self.motion.remaining_s + self._rules.latency_s
 
     def _set_out(self, hold: bool, clear: bool, trajectory: Trajectory, now_s: float) -> None:
-        self.blocked = self.blocked or not clear
         self._clear_cycles = self._clear_cycles + 1 if clear else 0
         wanted = self._rules.cycles(self._rules.params.clear) if self.blocked else 1
-        if hold or self._clear_cycles < wanted:
+        self.blocked = self._clear_cycles < wanted
+        if hold or self.blocked:
             return
         timed = self._timed(trajectory, now_s)
         if timed is not None:
             self.motion.follow(timed)
-            self.blocked = self._fresh = False
+            self._fresh = False
             self._clear_cycles = 0
 
     def _timed(self, trajectory: Trajectory, now_s: float) -> Trajectory | None:

@@ -59,7 +59,7 @@ class PrimitivePlanner(Planner):
             fault = self._write(write, segment, trajectory, start_s)
         except (ValueError, ArithmeticError) as error:
             fault = Fault(Error.LIMIT, f"segment {serial}: {error}")
-        write.error, write.reason, _ = fault or (0, "", 0.0)
+        write.error, write.reason, write.earliest = fault or (0, "", write.earliest)
 
     def _path(self, segment: Segment) -> BlendedPath:
         """Return the segment's path. Raises `ValueError` for one that cannot be, or leaves a joint's range."""

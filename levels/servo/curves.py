@@ -49,7 +49,7 @@ class Hermite:
 
 
 class Ramp:
-    """From a velocity to rest, all joints at the same time, so that they stay on the line of that velocity; then rest."""
+    """From a velocity to rest, all joints at the same time, so that they stay on that velocity's line; then rest."""
 
     def __init__(self, start: Array, velocity: Array, acceleration: Array) -> None:
         """Brake no joint harder than its `acceleration`, rad/s2."""
@@ -68,7 +68,7 @@ class Ramp:
 
 
 class Decay:
-    """A difference in position and velocity that vanishes: the quintic that ends with all derivatives zero; then zero."""
+    """A difference in position and velocity that vanishes: the quintic that ends with all derivatives zero; then 0."""
 
     def __init__(self, position: Array, velocity: Array, fastest: Array, hardest: Array) -> None:
         """Take as long as is needed to add no more than about `fastest`, rad/s, and `hardest`, rad/s2, to a motion."""
@@ -76,8 +76,8 @@ class Decay:
         linear = 3.94 * np.abs(velocity)
         by_acceleration = (linear + np.sqrt(linear**2 + 4.0 * 5.774 * hardest * np.abs(position))) / (2.0 * hardest)
         self.duration_s = float(max(np.max(1.875 * np.abs(position) / fastest), np.max(by_acceleration)))
-        w = velocity * self.duration_s
-        self._coefficients = (position, w, -10.0 * position - 6.0 * w, 15.0 * position + 8.0 * w, -6.0 * position - 3.0 * w)
+        p, w = position, velocity * self.duration_s
+        self._coefficients = (p, w, -10.0 * p - 6.0 * w, 15.0 * p + 8.0 * w, -6.0 * p - 3.0 * w)
         self._zero = np.zeros_like(position)
 
     def at(self, time_s: float) -> Motion:

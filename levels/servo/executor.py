@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 class ServoExecutor(Executor):
     """Follows joint set points with torques, and lets the arm's time pass.
 
-    torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction, with M from the planner.
-    A cycle first simulates the ticks since the last one, so that the arm's time is the clock's also when cycles are missed.
+    torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction; M is the planner's. A
+    cycle first simulates the ticks since the last one, so that the arm's time is the clock's when cycles are missed, too.
     """
 
     inputs = {

@@ -1,8 +1,8 @@
 """The set point of every servo cycle, between the set points that come from above.
 
-A set point is to be reached at its `due` tick; the next one is there by then. In between the motion is the cubic Hermite
-curve through positions and velocities, so it is C1. When none came in time the motion ramps to rest; when they come again it
-joins them smoothly.
+A set point is to be reached at its `due` tick; the next one is there by then. In between the motion is the cubic
+Hermite curve through positions and velocities, so it is C1. When none came in time the motion ramps to rest; when they
+come again it joins them smoothly.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from levels.servo.curves import Curve, Decay, Hermite, Motion, Ramp
 Array = NDArray[np.float64]
 
 HARDEST = 2.0
-"""Multiple of the acceleration limits up to which one curve may join two set points: planned motion, interpolated, needs
-a little more than 1."""
+"""Multiple of the acceleration limits up to which one curve may join two set points: planned motion, interpolated,
+needs a little more than 1."""
 JOINING_SPEED = 0.25
 """Part of the velocity limits that joining may add to a motion."""
 ASTRAY_RAD = 0.005
@@ -31,7 +31,8 @@ FURTHEST_S = 2.0
 class Reference:
     """Interpolates set points. Tick by tick: `at(command, tick)` gives the motion wanted at that tick.
 
-    `holding`: no fresh set point. `refused`: set points that were cut at the bounds, and cycles that saw one which is no motion.
+    `holding`: no fresh set point. `refused`: set points that were cut at the bounds, and cycles that saw one which is no
+    motion.
     """
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
@@ -52,7 +53,7 @@ class Reference:
         self.holding = True
 
     def meet(self, position: Array, velocity: Array, tick: int) -> None:
-        """Take the arm as it is found after cycles were missed, if it has strayed: from there back to the set points."""
+        """Take the arm as it is found after missed cycles, if it has strayed: from there back to the set points."""
         now = self._motion(tick)
         if np.max(np.abs(now.position - position)) < ASTRAY_RAD:
             return
@@ -62,7 +63,7 @@ class Reference:
             self._join(position, velocity, tick)
 
     def at(self, command: Message, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, given the newest `JOINT_SET_POINT`; its acceleration is the coming cycle's."""
+        """Return the motion wanted at `tick`, given the newest `JOINT_SET_POINT`; the acceleration is the next cycle's."""
         due = command.due
         if due != self._due and due > tick:
             self._take(command, due, tick)

@@ -107,15 +107,16 @@ def _ways(rehearsal: Rehearsal, row: int, standing_goals: list[Pose], lift: floa
     seen = situation.object_pose(row)
     takes = _takes(rehearsal, row, lift)
     ways: list[Way] = []
-    puts: dict[bytes, list[Spot]] = {}
+    puts: list[tuple[Pose, list[Spot]]] = []
     for take in takes:
         grip = take.tool.inverse() @ seen
         for goal in standing_goals:
             tool = goal @ grip.inverse()
-            key = np.round(np.concatenate(tool), 6).tobytes()
-            if key not in puts:
-                puts[key] = _spots(motion, situation.holding(row, grip), row, tool, here, lift)
-            ways += [Way(take, put) for put in puts[key]]
+            same = next((spots for known, spots in puts if known.is_near(tool)), None)
+            if same is None:
+                same = _spots(motion, situation.holding(row, grip), row, tool, here, lift)
+                puts.append((tool, same))
+            ways += [Way(take, put) for put in same]
     if not ways:
         raise _nothing_at(motion, [goal @ (takes[0].tool.inverse() @ seen).inverse() for goal in standing_goals], here)
     pace = motion.ik.time_between

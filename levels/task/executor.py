@@ -12,6 +12,9 @@ from levels.level import Executor, Input, LevelContext, Ports
 from levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, WINDOW, Error
 from levels.task.program import read_program
 
+ROUNDING_S = 1e-9
+"""Ticks times the clock's period are not exact: a time just reached is not late."""
+
 
 class TaskExecutor(Executor):
     """Reports the program done, or the error that ended it: refused, failed below, or late."""
@@ -63,7 +66,7 @@ class TaskExecutor(Executor):
         now_s, done = tick * self.context.tick_s, self._actions_done(plan)
         for k in range(done, len(self._actions)):
             by_s = self._actions[k].by
-            if by_s is not None and now_s > by_s and not self._error:
+            if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
                 reason = f"action {k}, {self._actions[k]}, was not done by {by_s:g} s"
                 self._error, self._reason = Error.TOO_LATE, reason
 

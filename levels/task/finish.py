@@ -32,10 +32,13 @@ def finish_times(moves: Sequence[Rehearsed], visible_s: float, cycle_s: float, n
         if k >= WINDOW:
             shown = max(visible_s, done[k - WINDOW] + 2.0 * below + 2.0 * cycle_s)
         if move.is_motion:
-            planned = max(planned, shown) + needs.planning_below + below
+            # The planner goes from plan to plan; only a move that it has waited for costs it a cycle more.
+            planned = max(planned, shown + below) + needs.planning_below
         at_hand = max(planned, shown) if move.is_motion else shown
         room = done[k - SEGMENTS] + below if k >= SEGMENTS else 0.0
-        handed_down = max(at_hand, room) + 2.0 * below
-        begun = max(handed_down, done[k - 1] if k else 0.0) + needs.beginning
-        done.append(begun + (duration_s if move.is_motion else needs.gripping) + needs.settling)
+        arrives = max(at_hand, room) + 2.0 * below
+        begun = max(arrives + needs.beginning, done[k - 1] if k else 0.0)
+        end = begun + (duration_s + needs.settling if move.is_motion else needs.gripping)
+        # A move with a time is stretched to end just before it: what comes behind it begins no sooner.
+        done.append(max(end, move.by_s - 2.0 * below))
     return [time_s + 2.0 * below + cycle_s for time_s in done]

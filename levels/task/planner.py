@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +14,7 @@ from levels.level import Input, LevelContext, Planner, Ports
 from levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
 from levels.params import read_params
 from levels.planning.situation import Situation
-from levels.task.finish import finish_times
+from levels.task.finish import Rehearsed, finish_times
 from levels.task.params import TaskParams
 from levels.task.program import read_program
 
@@ -74,28 +74,31 @@ class TaskPlanner(Planner):
         world = read.world.value
         situation = Situation(np.array(world.position), np.array(world.quaternion))
         start = Rehearsal(self._motion, np.array(read.servo.value.target), situation)
-        moves = rehearse(self._program, self.context.scene, start).moves
+        moves = self._with_times(rehearse(self._program, self.context.scene, start).moves)
         if len(moves) > MOVES:
             raise Refused(Error.LIMIT, f"the program has {len(moves)} elemental moves; at most {MOVES} are valid")
         # Planned within its cycles, the plan is read at once and handed down, to be visible a cycle later.
         visible_s = (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
         finish_s = finish_times(moves, visible_s, self.context.period_s, self._needs)
+        self._promise(moves, finish_s, write)
         for k, (move, _) in enumerate(moves):
-            last = k + 1 == len(moves) or moves[k + 1].move.action != move.action
-            by_s = self._time_below(move.action, finish_s[k], write) if last else 0.0
-            move._replace(by_s=by_s).write_to(write.moves[k])
+            move.write_to(write.moves[k])
         write.count = len(moves)
 
-    def _time_below(self, action: int, finish_s: float, write: Message) -> float:
-        """Return the time by which the last move of an action must be done below; 0: there is none.
+    def _with_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
+        """Give the last move of each action the time by which it must be done below, to be known here in time."""
+        timed = list(moves)
+        for k, (move, duration_s) in enumerate(moves):
+            by_s = self._program.action[move.action].by
+            if by_s is not None and (k + 1 == len(moves) or moves[k + 1].move.action != move.action):
+                timed[k] = Rehearsed(move._replace(by_s=by_s - self.context.period_s), duration_s)
+        return timed
 
-        Raises `Refused` with the earliest time that can be promised.
-        """
-        by_s = self._program.action[action].by
-        if by_s is None:
-            return 0.0
-        if finish_s > by_s:
-            write.earliest = finish_s
-            text = f"action {action}, {self._program.action[action]}, by {by_s:g} s: the earliest is {finish_s:.2f} s"
-            raise Refused(Error.TOO_LATE, text)
-        return by_s - self.context.period_s
+    def _promise(self, moves: Sequence[Rehearsed], finish_s: Sequence[float], write: Message) -> None:
+        """Raise `Refused` with the earliest time that can be promised, when an action cannot be done by its time."""
+        for (move, _), earliest_s in zip(moves, finish_s, strict=True):
+            action = self._program.action[move.action]
+            if move.by_s and action.by is not None and earliest_s > action.by:
+                write.earliest = earliest_s
+                text = f"action {move.action}, {action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"
+                raise Refused(Error.TOO_LATE, text)

@@ -14,7 +14,7 @@ from levels.scene import SceneConfig
 CLOCK_NS = 2_500_000
 ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"
 
-BLOCK = '<body name="block" pos=".6 0 .049"><freejoint/><geom name="block" type="box" size=".05 .05 .05" mass="1"/></body>'
+BLOCK = '<body name="block" pos=".6 0 .049"><freejoint/><geom name="block" type="box" size=".05 .05 .05"/></body>'
 """A free body, for the start of `PENDULUM`'s world; its weight presses it 1 mm into the floor."""
 
 PENDULUM = """
@@ -24,7 +24,7 @@ PENDULUM = """
   <worldbody>
     {first}
     <geom name="floor" type="plane" size="2 2 .1"/>
-    <body name="upper" pos="0 0 1">
+    <body name="upper" pos="0 0 .7">
       <joint name="shoulder" axis="0 1 0" range="-2 2" damping=".5"/>
       <geom name="upper" type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
       <body name="lower" pos=".45 0 0">

@@ -103,7 +103,7 @@ def test_a_tendon_drive_is_replaced_when_the_config_gives_torque_limits(tmp_path
 
 
 def test_sensors_and_keyframes_of_replaced_actuators_go_with_them(tmp_path: Path) -> None:
-    robot = pendulum(tmp_path, '<motor name="m" joint="shoulder" ctrlrange="-9 9"/><motor joint="elbow" ctrlrange="-9 9"/>')
+    robot = pendulum(tmp_path, MOTORS.replace("<motor", '<motor name="m"', 1))
     text = robot.model.read_text()
     extra = '<keyframe><key ctrl="1 2"/></keyframe><sensor><actuatorfrc actuator="m"/></sensor></mujoco>'
     robot.model.write_text(text.replace("</mujoco>", extra))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
@@ -12,23 +10,13 @@ from levels.primitive.path import BlendedPath
 from levels.primitive.speed import SpeedLimits, boundary_speeds, braking_limits, reachable_speed, speed_limits
 from levels.primitive.stop import make_stop
 from levels.primitive.trajectory import Motion, Trajectory, duration, make_trajectory
+from tests.levels.arms import cell
 
 EXACT = 1e-6
 """Rounding, relative to a limit."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    jerk: np.ndarray
-
-
-ARM = Limits(
-    np.array([1.92, 1.51, 2.4, 5.34, 5.09, 5.74]),
-    np.array([4.0, 3.5, 6.0, 12.0, 12.0, 12.0]),
-    np.array([40.0, 35.0, 60.0, 120.0, 120.0, 120.0]),
-)
+ARM = cell("puma560").limits
 
 
 def random_path(seed: int, corners: int, scale: float = 0.6, stops: bool = False) -> BlendedPath:

@@ -9,7 +9,7 @@ Report = dict[str, Any]
 
 TIMES = [
     *("task", "R", "cycles", "missed", "skipped", "late p50", "p99", "max", "exec p50", "p99", "max"),
-    *("comm p99", "residual min", "alpha", "plan age max"),
+    *("comm p99", "residual min", "deviation", "alpha", "plan age max"),
 ]
 
 
@@ -19,12 +19,13 @@ def markdown(report: Report) -> str:
 
 
 def _lines(report: Report) -> Iterator[str]:
-    outcome = report["outcome"] or {"cause": "no outcome: the launcher was killed", "reason": "", "faults": []}
+    outcome = report["outcome"] or {"cause": "no outcome recorded", "reason": "", "faults": []}
     yield f"# {report['rack']}: {outcome['cause']}{': ' + outcome['reason'] if outcome['reason'] else ''}"
     yield ""
     yield (
         f"{report['simulated_s']:.2f} s simulated in {report['wall_s']:.2f} s, {report['mode']}, "
-        f"{report['missed']} missed, {report['skipped']} skipped cycles. Digest `{report['digest']}`."
+        f"{report['missed']} missed, {report['skipped']} skipped cycles."
+        f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
     )
     yield from (f"- fault: {fault}" for fault in outcome["faults"])
     if report["recording"] != "complete":
@@ -32,7 +33,10 @@ def _lines(report: Report) -> Iterator[str]:
     yield from (f"- {count} rows of {name} were lost" for name, count in report["rows_lost"].items())
     yield from _task(report["task"])
     yield from _motion(report["motion"])
-    yield from _times(report["tasks"])
+    yield from ("", "## Cycles, ms", "")
+    if report["mode"] == "lockstep":
+        yield from ("In lockstep there are no deadlines: a tick lasts as long as its tasks take.", "")
+    yield from _table(TIMES, [_times_row(name, task) for name, task in report["tasks"].items()])
     yield from _response(report["system_response"])
 
 
@@ -50,14 +54,6 @@ def _motion(motion: Report | None) -> Iterator[str]:
         )
 
 
-def _times(tasks: dict[str, Report]) -> Iterator[str]:
-    yield from ("", "## Cycles, ms", "")
-    yield from _table(
-        TIMES,
-        [_times_row(name, task) for name, task in tasks.items()],
-    )
-
-
 def _times_row(name: str, task: Report) -> list[str]:
     counts = [str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")]
     late, execution = task["lateness_ms"], task["execution_ms"]
@@ -69,7 +65,7 @@ def _times_row(name: str, task: Report) -> list[str]:
         *(_ms(execution, key) for key in ("p50", "p99", "max")),
         _ms(task["communication_ms"], "p99"),
         _ms(task["residual_ms"], "min"),
-        "-" if task["alpha_ms"] is None else f"{task['alpha_ms']:.3f}",
+        *("-" if task[key] is None else f"{task[key]:.3f}" for key in ("deviation_ms", "alpha_ms")),
         _ms(task.get("plan_age_ms"), "max"),
     ]
 

@@ -43,7 +43,7 @@ def report_of(recording: Recording) -> Report:
         "worked": ended.get("worked", False),
         "outcome": outcome or None,
         "digest": outcome.get("digest"),
-        "simulated_s": round(outcome.get("ticks", 0) * layout.clock_ns * 1e-9, 6),
+        "simulated_s": round(outcome.get("ticks", _last_tick(recording) + 1) * layout.clock_ns * 1e-9, 6),
         "wall_s": round(ended.get("wall_s", 0.0), 6),
         "clock_skipped": ended.get("clock_skipped", 0),
         "missed": sum(task.get("missed", 0) for task in counted.values()),
@@ -52,7 +52,7 @@ def report_of(recording: Recording) -> Report:
         "system_response": system_response(recording, config, layout),
         "task": _task_outcome(recording, layout),
         "motion": motion(recording, layout),
-        "recording": ended.get("recording", "none"),
+        "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
     }
 
@@ -74,6 +74,10 @@ def _task(
         made, visible_at = recording.signal(plan, "tick"), recording.signal(plan, "visible_at")
         entry["plan_age_ms"] = plan_age_ms(cycles["tick"], made, visible_at, layout.clock_ns * 1e-6)
     return entry
+
+
+def _last_tick(recording: Recording) -> int:
+    return max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
 
 
 def _task_outcome(recording: Recording, layout: Layout) -> Report | None:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from backplane.layout import TaskSpec
-from tools.reporting.statistics import distribution
+from levels.timing import residual_bound_ns, residual_deviation_ns
+from tools.reporting.statistics import Distribution, distribution
 
 
 def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int) -> dict[str, Any]:
@@ -16,31 +17,33 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int) -> dict[str, 
     `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its R their time slice.
     """
     slice_ns = task.every * task.within_cycles * period_ns
-    execution = (cycles["process_ns"] - cycles["read_ns"]) * 1e-6
-    communication = (cycles["read_ns"] - cycles["start_ns"] + cycles["end_ns"] - cycles["process_ns"]) * 1e-6
-    lateness = (cycles["start_ns"] - cycles["release_ns"]) * 1e-6
-    residual = (cycles["release_ns"] + slice_ns - cycles["end_ns"]) * 1e-6
-    gaps = np.diff(cycles["start_ns"]) * 1e-6
+    execution = cycles["process_ns"] - cycles["read_ns"]
+    communication = cycles["read_ns"] - cycles["start_ns"] + cycles["end_ns"] - cycles["process_ns"]
+    gaps = np.diff(cycles["start_ns"])
     return {
         "traced": len(cycles),
         "slice_ms": slice_ns * 1e-6,
-        "lateness_ms": distribution(lateness),
-        "execution_ms": distribution(execution),
-        "communication_ms": distribution(communication),
-        "residual_ms": distribution(residual),
-        "largest_gap_ms": round(float(gaps.max()), 6) if len(gaps) else None,
-        "alpha_ms": _alpha_ms(slice_ns, execution, communication),
+        "lateness_ms": distribution((cycles["start_ns"] - cycles["release_ns"]) * 1e-6),
+        "execution_ms": distribution(execution * 1e-6),
+        "communication_ms": distribution(communication * 1e-6),
+        "residual_ms": distribution((cycles["release_ns"] + slice_ns - cycles["end_ns"]) * 1e-6),
+        "largest_gap_ms": round(float(gaps.max()) * 1e-6, 6) if len(gaps) else None,
+        **_worst(slice_ns, execution.tolist(), communication.tolist()),
     }
 
 
-def _alpha_ms(slice_ns: int, execution: np.ndarray, communication: np.ndarray) -> float | None:
-    """Return alpha of eq. 3.6: the part of R that is left in the worst cycle."""
-    if not len(execution):
-        return None
-    return round(slice_ns * 1e-6 - float(execution.max()) - float(communication.max()), 6)
+def _worst(slice_ns: int, execution_ns: list[int], communication_ns: list[int]) -> dict[str, float | None]:
+    """Return alpha of eq. 3.6, what is left in the worst cycle, and how much the residual varies; both in ms."""
+    if not execution_ns:
+        return {"alpha_ms": None, "deviation_ms": None}
+    alpha_ns = residual_bound_ns(slice_ns, execution_ns, communication_ns)
+    deviation_ns = residual_deviation_ns(execution_ns, communication_ns)
+    return {"alpha_ms": round(alpha_ns * 1e-6, 6), "deviation_ms": round(deviation_ns * 1e-6, 6)}
 
 
-def plan_age_ms(executor: np.ndarray, plan_tick: np.ndarray, plan_visible_at: np.ndarray, tick_ms: float) -> Any:
+def plan_age_ms(
+    executor: np.ndarray, plan_tick: np.ndarray, plan_visible_at: np.ndarray, tick_ms: float
+) -> Distribution | None:
     """Return how old, in simulated time, the plan was that each cycle of an executor could read.
 
     `executor` holds the ticks of its cycles; `plan_tick` and `plan_visible_at` are of the plans, in order.

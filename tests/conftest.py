@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -31,6 +33,15 @@ planner = "two_levels:LowerPlanner"
 coupling = "tight"
 within_cycles = 4
 """
+
+
+_NUMBERS = count()
+
+
+@pytest.fixture
+def rack_name() -> str:
+    """A name for a rack that no other test, of this run or another, uses at the same time."""
+    return f"test-{os.getpid()}-{next(_NUMBERS)}"
 
 
 @pytest.fixture

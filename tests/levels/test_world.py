@@ -1,0 +1,130 @@
+"""The world model: poses, velocities, and a revision that says when something starts or stops moving."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from backplane.message import Message
+from levels.messages import SCENE
+from levels.world import WorldModel
+from tests.levels.arms import config
+from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
+
+Array = NDArray[np.float64]
+PERIOD = 8
+TICK_S = CLOCK_NS * 1e-9
+START = np.array([[0.5, 0.3, 0.475], [0.6, 0.3, 0.475], [0.5, -0.3, 0.5]])
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+Poses = Callable[[float], tuple[Array, Array]]
+
+
+class WorldRig:
+    """Runs the world model on scenes that are a function of time."""
+
+    def __init__(self) -> None:
+        board = BoardSpec("world", PERIOD, WorldModel)
+        self.rack = Lockstep([board], *config("puma560"), outside={"servo.scene": SCENE})
+
+    @property
+    def model(self) -> Message:
+        """What the executor wrote last."""
+        return cast(Message, self.rack.tasks["world"].write.model)
+
+    def run(self, seconds: float, poses: Poses | None) -> list[int]:
+        """Run for `seconds`, with a scene every tick while `poses` is given; return the revisions that were seen."""
+        revisions = [self.model.revision]
+        for _ in range(round(seconds / TICK_S)):
+            if poses is not None:
+                scene = self.rack.message("servo.scene")
+                scene.position, scene.quaternion = poses(self.rack.tick * TICK_S)
+                self.rack.write("servo.scene", scene)
+            self.rack.step()
+            if self.model.revision != revisions[-1]:
+                revisions.append(self.model.revision)
+        return revisions
+
+
+def resting(_: float) -> tuple[Array, Array]:
+    return START, np.tile(UPRIGHT, (3, 1))
+
+
+def sliding(begin_s: float, end_s: float, speed: float) -> Poses:
+    """The first object slides along x between two times."""
+
+    def poses(time_s: float) -> tuple[Array, Array]:
+        moved = START.copy()
+        moved[0, 0] += speed * (min(max(time_s, begin_s), end_s) - begin_s)
+        return moved, np.tile(UPRIGHT, (3, 1))
+
+    return poses
+
+
+def test_there_is_no_model_before_the_first_scene() -> None:
+    rig = WorldRig()
+    assert rig.run(0.2, None) == [0]
+    assert not rig.model.quaternion.any()
+
+
+def test_bodies_at_rest_keep_one_revision_and_have_no_velocity() -> None:
+    rig, rng = WorldRig(), np.random.default_rng(2)
+    rig.run(0.1, resting)
+    first = rig.model.revision
+    assert rig.run(2.0, lambda _: (START + rng.normal(0.0, 2e-5, (3, 3)), np.tile(UPRIGHT, (3, 1)))) == [first]
+    assert not rig.model.velocity.any()
+    assert rig.model.position == pytest.approx(START, abs=2e-4)
+
+
+def test_the_revision_rises_when_a_body_starts_and_when_it_rests_again() -> None:
+    rig = WorldRig()
+    revisions = rig.run(3.0, sliding(1.0, 1.5, 0.25))
+    assert len(revisions) == 4  # none, first scene, start, rest
+    assert revisions == sorted(revisions)
+    assert revisions[2] * TICK_S == pytest.approx(1.0, abs=0.05)
+    assert revisions[3] * TICK_S == pytest.approx(1.7, abs=0.05)
+
+
+def test_the_velocity_of_a_moving_body_is_estimated() -> None:
+    rig = WorldRig()
+    rig.run(1.4, sliding(1.0, 2.0, 0.25))
+    assert rig.model.velocity == pytest.approx(np.array([[0.25, 0, 0], [0, 0, 0], [0, 0, 0]]), abs=1e-9)
+    assert rig.model.position[0, 0] == pytest.approx(0.5 + 0.25 * 0.4, abs=0.26 * PERIOD * TICK_S)
+
+
+def test_a_body_that_creeps_is_seen_to_have_moved() -> None:
+    rig = WorldRig()
+    revisions = rig.run(3.0, sliding(0.5, 10.0, 0.004))
+    assert len(revisions) > 2
+
+
+def test_a_body_that_turns_on_the_spot_moves() -> None:
+    def turning(time_s: float) -> tuple[Array, Array]:
+        quaternions = np.tile(UPRIGHT, (3, 1))
+        half = 0.5 * min(max(time_s - 1.0, 0.0), 0.5)
+        quaternions[1] = [np.cos(half), 0.0, 0.0, np.sin(half)]
+        return START, quaternions
+
+    assert len(WorldRig().run(3.0, turning)) == 4
+
+
+def test_without_new_scenes_poses_stay_and_velocities_are_zero() -> None:
+    rig = WorldRig()
+    rig.run(1.4, sliding(1.0, 2.0, 0.25))
+    rig.run(0.1, None)
+    seen = rig.model.position.copy()
+    rig.run(0.5, None)
+    assert np.array_equal(rig.model.position, seen)
+    assert not rig.model.velocity.any()
+
+
+def test_the_revision_rises_across_a_restart() -> None:
+    rig = WorldRig()
+    rig.run(1.0, resting)
+    before = rig.model.revision
+    rig.rack.restart("world")
+    rig.run(0.2, resting)
+    assert rig.model.revision > before

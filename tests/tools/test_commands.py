@@ -1,0 +1,158 @@
+"""The commands as a user runs them: answers, exit statuses, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from backplane.segment import racks
+
+ROOT = Path(__file__).resolve().parents[2]
+BOUND_S = 30
+
+
+def rack(*arguments: str | Path, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tools.cli", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+
+
+@pytest.fixture
+def running(small: Path, rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A rack in real time without an end, past its first cycles."""
+    command = [sys.executable, "-m", "tools.cli", "run", str(small), "--set", "clock.mode=realtime"]
+    process = subprocess.Popen(
+        [*command, "--set", f"name={rack_name}", "--out", str(tmp_path / "run")],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(rack_name) and "tick 0 " not in line:
+            break
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def wait_until_gone(name: str) -> bool:
+    deadline = time.monotonic() + BOUND_S
+    while name in racks() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return name not in racks()
+
+
+def test_help_is_there_without_loading_what_commands_need() -> None:
+    code = "import sys, tools.cli; print([m for m in ('numpy', 'pydantic', 'pyarrow', 'mujoco') if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
+    assert found.stdout == "[]\n", found.stderr
+    shown = rack("--help").stdout
+    for command in ("run", "check", "list", "status", "stop", "clean", "record", "report"):
+        assert f"  {command} " in shown
+
+
+def test_run_prints_one_json_document_and_nothing_else(small: Path, rack_name: str, tmp_path: Path) -> None:
+    done = rack("run", small, "--seconds", 1, "--set", f"name={rack_name}", "--out", tmp_path / "run", "--json")
+    report = json.loads(done.stdout)
+    assert (done.returncode, done.stderr) == (0, ""), report["outcome"]
+    assert (report["rack"], report["worked"], report["outcome"]["ticks"]) == (rack_name, True, 400)
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
+        "config.toml",
+        "cycles.parquet",
+        "events.jsonl",
+        "report.json",
+        "report.md",
+        "signals.parquet",
+    ]
+    again = rack("report", tmp_path / "run", "--json")
+    assert json.loads(again.stdout) == report
+
+
+def test_a_config_with_mistakes_is_refused_before_anything_starts(small: Path, rack_name: str, tmp_path: Path) -> None:
+    settings = ["--set", f"name={rack_name}", "--set", "clock.wake=no", "--set", "board.lower.above=uper"]
+    done = rack("run", small, *settings, "--out", tmp_path / "run")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 2
+    assert not (tmp_path / "run").exists()
+    assert rack_name not in racks()
+
+
+def test_a_refusal_is_json_too_when_json_was_asked_for(small: Path) -> None:
+    done = rack("check", small, "--set", "clock.wake=no", "--json")
+    assert done.returncode == 2
+    assert "clock.wake" in json.loads(done.stdout)["error"][0]
+
+
+def test_check_shows_every_mailbox_at_its_bus_address(small: Path) -> None:
+    shown = json.loads(rack("check", small, "--json").stdout)
+    addresses = {mailbox["mailbox"]: mailbox["address"] for mailbox in shown["mailboxes"]}
+    assert set(addresses) == {"upper.command", "upper.status", "lower.status", "lower.plan"}
+    assert len(set(addresses.values())) == 4
+    assert max(addresses.values()) < shown["segment_bytes"]
+    assert shown["timing"]["plan_ms"] == {"lower": 10.0}
+    text = rack("check", small).stdout
+    assert all(f"0x{address:06x}" in text for address in addresses.values())
+
+
+def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], rack_name: str) -> None:
+    listed = {entry["name"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
+    assert listed[rack_name] == "running"
+    seen = json.loads(rack("status", rack_name, "--json").stdout)
+    assert {task["task"] for task in seen["tasks"]} == {"upper", "lower", "lower.planner"}
+    assert seen["tick"] > 0
+    assert rack_name in rack("status", rack_name).stdout
+    assert rack("stop", rack_name).returncode == 0
+    running.communicate(timeout=BOUND_S)
+    assert wait_until_gone(rack_name)
+
+
+def test_a_recorder_can_join_a_run(running: subprocess.Popen[str], rack_name: str, tmp_path: Path) -> None:
+    recorder = subprocess.Popen(
+        [sys.executable, "-m", "tools.cli", "record", rack_name, "--out", str(tmp_path / "joined")], cwd=ROOT
+    )
+    deadline = time.monotonic() + BOUND_S
+    while not (tmp_path / "joined" / "signals.parquet").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    rack("stop", rack_name)
+    assert recorder.wait(BOUND_S) == 0
+    report = json.loads(rack("report", tmp_path / "joined", "--json").stdout)
+    assert report["rack"] == rack_name
+    assert report["tasks"]["lower"]["traced"] > 0
+
+
+def test_ctrl_c_ends_a_run_in_order(running: subprocess.Popen[str], rack_name: str, tmp_path: Path) -> None:
+    running.send_signal(signal.SIGINT)
+    printed, _ = running.communicate(timeout=BOUND_S)
+    assert running.returncode == 1
+    assert "stopped" in printed
+    assert wait_until_gone(rack_name)
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert (report["outcome"]["cause"], report["recording"]) == ("stopped", "complete")
+
+
+def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str], rack_name: str) -> None:
+    running.kill()
+    running.wait(BOUND_S)
+    cleaned = json.loads(rack("clean", "--json").stdout)
+    assert rack_name not in cleaned["in_use"]
+    assert rack_name not in racks()
+
+
+def test_a_rack_that_is_not_there_is_named(rack_name: str) -> None:
+    done = rack("stop", rack_name)
+    assert done.returncode == 1
+    assert f"rack '{rack_name}' is not there" in done.stderr
+
+
+def test_a_folder_that_holds_files_is_not_written_over(small: Path, tmp_path: Path) -> None:
+    done = rack("run", small, "--seconds", 1, "--out", tmp_path)
+    assert done.returncode == 2
+    assert "not an empty folder" in done.stderr
