@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -128,7 +128,10 @@ class Message:
         """Take over the bytes of a message of the same type."""
         self.raw[:] = other.raw
 
-    # Field names are the layout's; a type checker cannot know them.
+    if TYPE_CHECKING:
+        # Field names are the layout's; a type checker cannot know them.
+        def __setattr__(self, name: str, value: Any) -> None: ...
+
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"message has no field '{name}'; fields: {', '.join(self.record.dtype.names or ())}")
 

@@ -120,11 +120,12 @@ class Segment:
         except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
             why = "belongs to another user" if isinstance(error, posix_ipc.PermissionsError) else "is not there"
             raise SegmentError(f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}") from None
-        owner = os.fstat(shm.fd).st_uid
-        if os.getuid() not in (owner, 0) or shm.size < HEAD_SIZE:
+        found = os.fstat(shm.fd)
+        if os.getuid() not in (found.st_uid, 0) or found.st_size < HEAD_SIZE:
             os.close(shm.fd)
-            raise SegmentError(f"rack '{rack}': owner {owner}, {shm.size} bytes: not a segment of this user's")
-        return cls(rack, shm.fd, shm.size)
+            why = f"owner {found.st_uid}, {found.st_size} bytes: not a segment of this user's"
+            raise SegmentError(f"rack '{rack}': {why}")
+        return cls(rack, shm.fd, found.st_size)
 
     def _read_head(self) -> None:
         if self.words[Head.MAGIC] != MAGIC or self.words[Head.VERSION] != VERSION:

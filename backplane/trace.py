@@ -23,11 +23,14 @@ RECORD = np.dtype(
         ("read_ns", "i8"),  # commands, statuses, plan read
         ("process_ns", "i8"),  # process done
         ("end_ns", "i8"),  # commands, statuses written
-        ("flags", "i8"),  # Flag
+        ("flags", "i8"),  # Flag in the low 16 bits; above them the releases skipped just before this one
         ("state", "i8"),  # state of the level
     ]
 )
 FIELDS = tuple(RECORD.names or ())
+
+
+SKIPPED_SHIFT = 16
 
 
 class Flag(IntFlag):

@@ -7,7 +7,7 @@ from time import monotonic_ns
 from backplane.clock import SystemClock
 from backplane.segment import Segment
 from backplane.semaphores import clock_semaphore
-from backplane.trace import Flag, TraceWriter
+from backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
 from backplane.wake import NextCycle
 from backplane.words import Block, TaskState
 from boards.ports import InputPorts, OutputPorts
@@ -62,7 +62,7 @@ class Task:
         record[0] = tick
         record[1] = start if lockstep else self.clock.time_of(tick)
         record[2], record[3], record[4], record[5] = start, read, processed, end
-        record[6] = flags | missed * _MISS | (skipped > 0) * _SKIP | self._trouble()
+        record[6] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT | self._trouble()
         record[7] = block[_LEVEL_STATE] = self.status.state if self.status is not None else 0
         self.trace.write()
         block[_CYCLES] += 1

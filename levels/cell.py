@@ -196,13 +196,19 @@ def start_qpos(cell: Cell) -> NDArray[np.float64]:
 
 
 def check_start(cell: Cell, robot: RobotConfig) -> None:
-    """Raise `RobotError` when home is outside the limits, in a contact that no task means, or not finite."""
+    """Raise `RobotError` when home is outside the limits, too heavy to hold, in a touch, or not finite."""
     for name, q, (low, high) in zip(robot.joints, cell.home, cell.limits.position, strict=True):
         if not low <= q <= high:
             raise RobotError(f"robot.home: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid")
     data = cell.start()
     if not np.isfinite(data.qacc).all():
         raise RobotError(f"model '{robot.model}': acceleration at home is not finite; check masses, inertias, gravity")
+    load = np.abs(data.qfrc_bias - data.qfrc_passive)[cell.dof]
+    for name, needed, limit in zip(robot.joints, load, cell.bounds.torque, strict=True):
+        if needed > limit:
+            raise RobotError(
+                f"robot.home: joint '{name}' carries {needed:.4g} N m there; its torque limit is {limit:g}"
+            )
     for pair in unmeant(data, cell.touch):
         first, second = (geom_name(cell.model, geom) for geom in pair)
         raise RobotError(

@@ -209,7 +209,7 @@ SERVO_PLAN = MessageType(
     "servo_plan",
     1,
     (
-        Field("inertia", "f8", "kg m2", "joint-space inertia for the coming cycles, what is held included", ("joints", "joints")),
+        Field("inertia", "f8", "kg m2", "joint-space inertia, what is held included", ("joints", "joints")),
         Field("held", "i2", "1", "object included; -1: none"),
         Field("payload_mass", "f8", "kg", "mass in the gripper"),
         Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
@@ -258,7 +258,7 @@ WORLD_MODEL = MessageType(
     "world_model",
     1,
     (
-        Field("revision", "u4", "1", "rises whenever a body that was at rest moves, and when it rests again; 0: nothing sensed yet"),
+        Field("revision", "u4", "1", "rises when a body starts to move and when it rests again; 0: nothing sensed"),
         Field("position", "f8", "m", "body origins", ("bodies", 3)),
         Field("quaternion", "f8", "1", "body orientations", ("bodies", 4)),
         Field("velocity", "f8", "m/s", "body velocities, estimated", ("bodies", 3)),

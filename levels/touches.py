@@ -31,7 +31,7 @@ def touch_matrix(
     """Return (ngeom, ngeom): True where a contact of two geoms is one that no task means.
 
     A task means an object on a support, an object in the gripper, the parts of one object and the fingers on each
-    other. Every other contact of arm or object is a touch; what the rest of the cell does among itself is not looked at.
+    other. Every other contact of arm or object is a touch; the rest of the cell is not looked at.
     """
     touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     ours = np.union1d(arm, objects)

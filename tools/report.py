@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +13,18 @@ from tools.answer import Json, print_json
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
 
 
-def report(run: RunFolder, as_json: Json = False) -> None:
+Against = Annotated[
+    Path | None, typer.Option(metavar="RUN", help="another run: tell the first tick at which what they wrote differs")
+]
+
+
+def report(run: RunFolder, against: Against = None, as_json: Json = False) -> None:
     """Report on a run, from its recording.
 
-    Makes report.json and report.md anew.
+    Makes report.json and report.md anew. With --against the exit status is 1 when the runs part before any miss.
     """
     from tools.reporting.report import write_report
 
-    data, text = write_report(run)
+    data, text = write_report(run, against)
     print_json(data) if as_json else print(text)
+    sys.exit(0 if against is None or data["against"]["explained"] else 1)

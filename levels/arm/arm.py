@@ -25,17 +25,23 @@ class Arm(Protocol):
     """An arm with torque-driven joints and a force-driven gripper.
 
     `tick` is the tick that its state belongs to. `torque` (joints,), N m, and `grip_force`, N, are what it was given
-    last, behind the limit gate; `clipped` counts the cycles in which the gate cut a command, `touches` the contacts that
-    no task means, and `first_touch` says which was the first. `fault` is empty, or says why the arm has stopped for good.
+    last, behind the limit gate; `clipped` counts the cycles in which the gate cut a command. `fault` is empty, or says
+    why the arm has stopped for good.
     """
 
     tick: int
     torque: Array
     grip_force: float
     clipped: int
-    touches: int
-    first_touch: str
     fault: str
+
+    @property
+    def touches(self) -> int:
+        """Contacts that no task means."""
+
+    @property
+    def first_touch(self) -> str:
+        """The first of them: what touched what, and when; empty: there was none."""
 
     def sense(self) -> Sensed:
         """Return what the sensors say. The arrays are valid until the next call."""

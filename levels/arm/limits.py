@@ -74,7 +74,7 @@ class LimitGate:
         nearest, _, status, _ = daqp.solve(self._unity, -gain / scale, per_torque, upper, lower, self._kinds)
         if status < 0:
             nearest = np.clip(gain, least, most) / scale
-        return np.clip((per_torque @ nearest + offset) * self._torque, -self._torque, self._torque)
+        return np.asarray(np.clip((per_torque @ nearest + offset) * self._torque, -self._torque, self._torque))
 
     def _speed_towards(self, distance: Array, speed: Array) -> Array:
         """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.

@@ -49,7 +49,6 @@ class ElementalMoveExecutor(Executor):
         self._done = 0
         self._handed_down = 0
         self._request = 0
-        self._requests = 0
         self._replans = 0
         self._waiting_since: int | None = None
         self._error = Error.NONE
@@ -66,6 +65,7 @@ class ElementalMoveExecutor(Executor):
         if not self._error:
             self._take_done(status, segments)
             self._watch(status, segments)
+        if not self._error:
             self._mind_the_way(status, segments, tick)
             self._fill(read.command.value, segments, tick)
         if self._error:
@@ -80,7 +80,9 @@ class ElementalMoveExecutor(Executor):
         if read.last_command.is_there and read.last_status.is_there:
             last = read.last_status.value
             write.command.copy_from(read.last_command.value)
-            self._done, self._replans, self._requests = last.done, last.replans, last.replan
+            self._done, self._replans = last.done, last.replans
+            if last.state == State.ERROR:
+                self._fail(Error(last.error), last.reason)
             self._handed_down = max(last.done, segments.newest_move)
             if self._handed_down >= last.planned:
                 write.status.end = last.end
@@ -94,7 +96,7 @@ class ElementalMoveExecutor(Executor):
         if first <= self._handed_down + 1:
             return
         segments.clear()
-        self._request = 0
+        self._close_request()
         if status.resting or not self._handed_down:
             self._done = self._handed_down = first - 1
             self._error, self._reason = Error.NONE, ""
@@ -103,8 +105,8 @@ class ElementalMoveExecutor(Executor):
         """Count segments that are done; a grasp must have found something."""
         while (taken := segments.take_done(status.done)) is not None:
             self._done = int(taken["move"])
-            grasped = taken["kind"] == SegmentKind.GRIPPER and taken["opening"] == self._gripper.closed
-            if grasped and self._is_shut(status):
+            gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
+            if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
                 self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm, without object")
 
     def _watch(self, status: Message, segments: SegmentWindow) -> None:
@@ -125,18 +127,22 @@ class ElementalMoveExecutor(Executor):
             and segments.first["kind"] == SegmentKind.PATH
         )
         if not blocked:
-            self._request = 0
+            self._close_request()
         elif not self._request:
-            self._requests += 1
-            self._request = self._requests
+            # The cycle's number: no request of an earlier life of this board has the same.
+            self._request = tick // self.context.every
         elif (plan := self._plans.anew(self._request)) is not None:
             if plan.error:
                 self._wait(plan, tick)
                 return
             segments.replace_first(plan)
             self._handed_down = int(plan.move)
-            self._request = 0
+            self._close_request()
             self._replans += 1
+
+    def _close_request(self) -> None:
+        if self._request:
+            self._request, self._waiting_since, self._reason = 0, None, ""
 
     def _fill(self, command: Message, segments: SegmentWindow, tick: int) -> None:
         """Hand down the moves behind the last one, as far as their plans are there and the window has room."""
@@ -192,6 +198,7 @@ class ElementalMoveExecutor(Executor):
     def _fail(self, error: Error, reason: str) -> None:
         if not self._error:
             self._error, self._reason = error, reason
+            self._request = 0
 
     def _report(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
         under_way = segments.first if segments.count else None
@@ -200,8 +207,8 @@ class ElementalMoveExecutor(Executor):
         report.error, report.reason = self._error, self._reason
         report.done, report.held, report.replans = self._done, status.held, self._replans
         report.current = int(under_way["move"]) if under_way is not None else 0
-        at = np.flatnonzero(command.moves["id"][: command.count] == report.current) if report.current else ()
-        report.verb = int(command.moves["verb"][at[0]]) if len(at) else Verb.NONE
+        under_way_at = np.flatnonzero(command.moves["id"][: command.count] == report.current)
+        report.verb = int(command.moves["verb"][under_way_at[0]]) if report.current and under_way_at.size else Verb.NONE
         self._report_plans(command, status, report)
         report.replan = self._request
         report.start = status.position

@@ -135,7 +135,7 @@ class CollisionChecker:
         m.geom_margin[:] = np.where(arm, 0.0, self.clearance)
         m.geom_gap[:] = 0.0
         m.pair_margin[:] = self.clearance
-        return m.geom_contype.copy()
+        return np.array(m.geom_contype)
 
     def _required_distances(self) -> Array:
         """Return (geoms, geoms), in m: clearance for arm and cell, 0 for what the cell lets touch itself."""

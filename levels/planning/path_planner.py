@@ -46,9 +46,7 @@ class PathPlanner:
         resolution = STEP_PART * clearance / float(np.sqrt(len(levers)))
         self._search = SampledSearch(low, high, levers, resolution)
 
-    def plan(
-        self, start: Array, goal: Array, free: Free, attempt: int = 0, searches: int = SEARCHES
-    ) -> Path | None:
+    def plan(self, start: Array, goal: Array, free: Free, attempt: int = 0, searches: int = SEARCHES) -> Path | None:
         """Return the quickest path found from `start` to `goal` (joints,), rad, or None.
 
         `attempt` asks for other random numbers: for another try in the same world. With fewer `searches` the path is

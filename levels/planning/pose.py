@@ -22,7 +22,7 @@ class Pose(NamedTuple):
     position: Array
     quaternion: Array
 
-    def __matmul__(self, inner: Pose) -> Pose:  # type: ignore[override]
+    def __matmul__(self, inner: Pose) -> Pose:
         """Return `inner`, a pose in the frame that this pose places, in the frame of this pose."""
         position, quaternion = np.zeros(3), np.zeros(4)
         mujoco.mju_mulPose(position, quaternion, *self, *inner)

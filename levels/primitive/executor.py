@@ -72,7 +72,9 @@ class PrimitiveExecutor(Executor):
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Sample command, status, plan and world model; write the next set point and this level's status."""
-        passed = tick - self._tick if self._tick is not None else self.context.every
+        if self._tick is None:
+            self._tick, self._memory = tick - self.context.every, recall(read)
+        passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
         serials = window(read.command.value)
         self._plans.accept(read.plan, serials)
@@ -80,18 +82,19 @@ class PrimitiveExecutor(Executor):
         if self._tracking.update(read.status):
             self._take_up(read)
         if self._tracking.in_step:
-            self._go_on(read, serials, tick, passed * self.context.tick_s)
+            self._go_on(read, serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._rules.cycles(self._params.silent):
             self._fault = Fault(Error.BELOW, f"no status from below for {self._tracking.silent_cycles} cycles")
         self._write_set_point(write.command, tick)
         self._write_status(read, write.status, serials, tick)
 
     def _take_up(self, read: Ports) -> None:
-        """Go on from where the servo holds the arm; after a start, with what the last messages say."""
-        if self._memory is None:
-            self._memory = recall(read, self._gripper.force if self._gripper is not None else 0.0)
-        self._fault = None
+        """Go on from where the servo holds the arm."""
         servo = read.status.value
+        if self._memory is None:
+            force = self._gripper.force if self._gripper is not None else 0.0
+            self._memory = Memory(opening=servo.opening, force=force)
+        self._fault = None
         self._position[:] = servo.target
         self._guard.carry(self._memory.held, servo.position, read.world.value)
         if isinstance(self._work, PathWork):
@@ -152,10 +155,8 @@ class PrimitiveExecutor(Executor):
     def _begin_gripper(self, segment: Segment, memory: Memory, read: Ports) -> GripperWork:
         if self._gripper is None:
             raise ValueError(f"segment {segment.id}: the arm has no gripper; only paths are valid")
-        closed = self._gripper.closed
-        closing = abs(segment.opening - closed) < abs(memory.opening - closed)
         memory.opening, memory.force = segment.opening, segment.force
-        return GripperWork(segment, closing, self._rules)
+        return GripperWork(segment, self._gripper, self._rules)
 
     def _begin_path(self, segment: Segment, memory: Memory, read: Ports) -> PathWork:
         path = segment.path()
@@ -196,11 +197,12 @@ class PrimitiveExecutor(Executor):
 
     def _write_set_point(self, command: Message, tick: int) -> None:
         every, work, memory = self.context.every, self._work, self._memory
-        command.id = tick // every + 1
+        command.id = tick // every + 1 if memory is not None else 0
         # Out of step, no set point is better than one from where the arm may not be.
         command.due = tick + 2 * every if self._tracking.in_step else 0
         command.position[:] = self._position
-        _, velocity, acceleration = work.motion.set_point if isinstance(work, PathWork) else self._rest
+        moving = work if self._tracking.in_step and isinstance(work, PathWork) else None
+        _, velocity, acceleration = moving.motion.set_point if moving is not None else self._rest
         command.velocity[:], command.acceleration[:] = velocity, acceleration
         if memory is not None:
             command.opening, command.force = memory.opening, memory.force

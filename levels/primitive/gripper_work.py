@@ -8,17 +8,15 @@ from levels.primitive.fault import Fault
 from levels.primitive.path_work import WorkRules
 from levels.primitive.segment import Segment
 from levels.primitive.tracking import HANDOVER_CYCLES, Quiet
+from levels.robot import GripperConfig
 
 
 class GripperWork:
-    """One GRIPPER segment under way; it is done when the gripper has come to rest, wherever that is.
+    """One GRIPPER segment under way; it is done when the gripper has come to rest, wherever that is."""
 
-    `closing` says whether an object is grasped by it, not released.
-    """
-
-    def __init__(self, segment: Segment, closing: bool, rules: WorkRules) -> None:
+    def __init__(self, segment: Segment, gripper: GripperConfig, rules: WorkRules) -> None:
         self.segment = segment
-        self.closing = closing
+        self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
         self.fault: Fault | None = None
         self._permitted_m_s = rules.params.settled_opening
         self._cycles = 0
@@ -27,8 +25,8 @@ class GripperWork:
 
     @property
     def held_after(self) -> int | None:
-        """The object in the gripper afterwards."""
-        return self.segment.object if self.closing else None
+        """The object in the gripper afterwards: the segment's, if it goes nearer to closed than to open."""
+        return self.segment.object if self._closes else None
 
     def done(self, status: Message) -> bool:
         """Say whether the gripper has come to rest."""

@@ -18,11 +18,11 @@ class Memory:
     force: float = 0.0
 
 
-def recall(read: Ports, force: float) -> Memory:
-    """Return what the level's own last messages say; without any, the gripper stays as it is, with `force` in N."""
+def recall(read: Ports) -> Memory | None:
+    """Return what the level's own last messages say; None when it never had anything to remember."""
     status, command = read.last_status, read.last_command
-    if not (status.is_there and command.is_there and command.value.due):
-        return Memory(opening=read.status.value.opening, force=force)
+    if not (status.is_there and command.is_there and command.value.id):
+        return None
     return Memory(
         done=status.value.done,
         interrupted=status.value.current,

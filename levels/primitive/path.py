@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-COINCIDENT_RAD = 1e-9
-"""Waypoints closer than this are one waypoint."""
+COINCIDENT_RAD = 1e-7
+"""Waypoints closer than this are one waypoint, and a shorter blend is none."""
 STRAIGHT = 1e-9
 """Two unit directions closer than this are one direction: the corner between them needs no stop."""
 
@@ -170,6 +170,7 @@ def _distinct(points: Array, radii: Array) -> tuple[Array, Array]:
             kept.append(k)
         else:
             merged[kept[-1]] = min(merged[kept[-1]], radii[k])
+    merged[merged < COINCIDENT_RAD] = 0.0
     merged[kept[0]] = merged[kept[-1]] = 0.0
     return points[kept], merged[kept]
 

@@ -50,8 +50,8 @@ class SpeedLimits(NamedTuple):
 def speed_limits(first: Array, second: Array, third: Array, limits: JointLimits, share: float) -> SpeedLimits:
     """Return limits of s that keep every joint within `limits` where |q'|, |q''|, |q'''| are bounded as given.
 
-    The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds. On a curve, `share`
-    (0 to 1) is the part of the highest speed that is used: the less, the more is left to accelerate with.
+    The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds. `share` (0 to 1) is the
+    part used of the highest speed that the bend of a curve permits: the less, the more is left to accelerate with.
     """
     velocity, acceleration, jerk = limits.velocity, limits.acceleration, limits.jerk
     curved = bool(second.any())

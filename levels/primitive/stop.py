@@ -17,6 +17,8 @@ EFFORTS = ((1.0, 1.0), (0.6, 1.0), (0.6, 0.5), (0.35, 0.6), (0.35, 0.3), (0.2, 0
 INTERVALS = 24
 """Intervals of equal time in which the joint limits are checked."""
 ROUNDING = 1e-6
+REST_RAD_S = 1e-7
+"""Motion slower than this rests."""
 
 
 def make_stop(path: BlendedPath, limits: JointLimits, motion: Motion) -> Trajectory | None:
@@ -25,7 +27,7 @@ def make_stop(path: BlendedPath, limits: JointLimits, motion: Motion) -> Traject
     None: every one of them would break a limit or overrun the path. Motion may then follow its trajectory,
     which itself ends at rest, and ask again a cycle later. Bounded time, whatever the path.
     """
-    if motion.ds <= 0.0:
+    if motion.ds < REST_RAD_S:
         return joined([], motion.s)
     most, jerk = acceleration_room(path.bounds.first[path.piece_at(motion.s)], limits)
     # Beyond a stop the path goes on in another direction: only rest may be there.

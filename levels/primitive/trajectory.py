@@ -12,7 +12,7 @@ import ruckig
 from numpy.typing import NDArray
 
 from levels.messages import SECTIONS_A_LINE
-from levels.primitive.path import COINCIDENT_RAD, BlendedPath
+from levels.primitive.path import COINCIDENT_RAD, BlendedPath, PathBounds
 from levels.primitive.speed import JointLimits, SpeedLimits, boundary_speeds, speed_limits
 
 Array = NDArray[np.float64]
@@ -37,8 +37,8 @@ class Motion(NamedTuple):
 class Trajectory:
     """Motion along a path as sections of constant jerk.
 
-    `sections` (n, 5), n >= 1: start in s, then s, ds, dds and jerk of the path parameter there; the
-    last section ends at `duration`, in s. At rest before and behind.
+    `sections` (n, 5), n >= 1: start in s, then s, ds, dds and jerk of the path parameter there; the last one ends at
+    `duration`, in s, at rest. `begin` and `end` are the path parameter at both ends, in rad.
     """
 
     def __init__(self, sections: Array, duration: float) -> None:
@@ -97,16 +97,16 @@ class _Run:
         first, last = path.piece_at(start), path.piece_at(end - COINCIDENT_RAD)
         inner = path.breaks[first + 1 : last + 1]
         self.marks = [start, *inner.tolist(), end]
-        self.bounds = [bound[first : last + 1] for bound in path.bounds]
-        corners = int(self.bounds[1].any(axis=1).sum())
+        self.bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
+        corners = int(self.bounds.second.any(axis=1).sum())
         self.shares = SHARES if corners else SHARES[:1]
         self.most_sections = SECTIONS_A_LINE * (1 + corners)
 
-    def ways(self) -> list[tuple[list[float], list[Array]]]:
+    def ways(self) -> list[tuple[list[float], PathBounds]]:
         """Return marks and bounds: each piece with limits of its own, or one set for all: for many small corners."""
         alone = (self.marks, self.bounds)
-        together = ([self.marks[0], self.marks[-1]], [bound.max(axis=0, keepdims=True) for bound in self.bounds])
-        return [alone, together] if len(self.marks) > 2 else [alone]
+        together = PathBounds(*(bound.max(axis=0, keepdims=True) for bound in self.bounds))
+        return [alone, ([self.marks[0], self.marks[-1]], together)] if len(self.marks) > 2 else [alone]
 
 
 def _fastest(run: _Run, limits: JointLimits) -> list[Section]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backplane.message import Message, State
-from levels.arm import Sensed, SimulatedArm
+from levels.arm import Arm, Sensed, SimulatedArm
 from levels.cell import build_cell
 from levels.dynamics import Dynamics, Payload
 from levels.level import Executor, Input, LevelContext, Ports
@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 class ServoExecutor(Executor):
     """Follows joint set points with torques, and lets the arm's time pass.
 
-    torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction; M is the planner's. A
-    cycle first simulates the ticks since the last one, so that the arm's time is the clock's when cycles are missed, too.
+    torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction; M is the planner's.
+    A cycle first simulates the ticks since the last one: the arm's time is the clock's also when cycles are missed.
     """
 
     inputs = {
@@ -38,7 +38,7 @@ class ServoExecutor(Executor):
         super().__init__(context)
         params = read_params(ServoParams, context.params)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self.arm = SimulatedArm(cell, context.scene, context.clock_ns)
+        self.arm: Arm = SimulatedArm(cell, context.scene, context.clock_ns)
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._dynamics = Dynamics(cell)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)

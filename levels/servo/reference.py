@@ -7,6 +7,8 @@ come again it joins them smoothly.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,11 +30,19 @@ FURTHEST_S = 2.0
 """How far ahead a set point may be due: one beyond that is a broken command, not a slow level."""
 
 
+class SetPoint(NamedTuple):
+    """Positions, rad, and velocities, rad/s, (joints,) each, to be reached at tick `due`."""
+
+    due: int
+    position: Array
+    velocity: Array
+
+
 class Reference:
     """Interpolates set points. Tick by tick: `at(command, tick)` gives the motion wanted at that tick.
 
-    `holding`: no fresh set point. `refused`: set points that were cut at the bounds, and cycles that saw one which is no
-    motion.
+    `holding`: no fresh set point. `refused`: set points that were cut at the bounds, and cycles that saw one which is
+    no motion.
     """
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
@@ -40,6 +50,7 @@ class Reference:
         joints = len(limits.velocity)
         self._nothing = Decay(np.zeros(joints), np.zeros(joints), limits.velocity, limits.acceleration)
         self._due = 0
+        self._next: SetPoint | None = None
         self.holding = True
         self.refused = 0
         self.start(np.zeros(joints), np.zeros(joints), 0)
@@ -49,7 +60,6 @@ class Reference:
         self._curve: Curve = Ramp(position.copy(), velocity.copy(), self._limits.acceleration)
         self._from = tick
         self._difference, self._differs_from = self._nothing, tick
-        self._end = (position, velocity)
         self.holding = True
 
     def meet(self, position: Array, velocity: Array, tick: int) -> None:
@@ -63,34 +73,46 @@ class Reference:
             self._join(position, velocity, tick)
 
     def at(self, command: Message, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, given the newest `JOINT_SET_POINT`; the acceleration is the next cycle's."""
-        due = command.due
-        if due != self._due and due > tick:
-            self._take(command, due, tick)
+        """Return the motion wanted at `tick`, given the newest `JOINT_SET_POINT`; its acceleration is mid-cycle."""
+        self._turn(tick)
+        due, waiting = command.due, self._next
+        if tick < due != self._due and (waiting is None or due != waiting.due):
+            self._receive(command, due, tick)
+            self._turn(tick)
         if not self.holding and tick >= self._due:
             last = self._motion(self._due)
             self.start(last.position, last.velocity, self._due)
         return self._motion(tick)
 
-    def _take(self, command: Message, due: int, tick: int) -> None:
-        """Turn towards a new set point."""
+    def _receive(self, command: Message, due: int, tick: int) -> None:
+        """Take a copy of a set point. It waits until the one before it is due: not every protocol is as punctual."""
         finite = bool(np.isfinite(command.position).all() and np.isfinite(command.velocity).all())
         if not finite or (due - tick) * self._tick_s > FURTHEST_S:
             self.refused += 1
             return
-        position, velocity = self._clamp(command.position, command.velocity)
+        position = np.clip(command.position, self._bounds.position[:, 0], self._bounds.position[:, 1])
+        velocity = np.clip(command.velocity, -self._bounds.velocity, self._bounds.velocity)
+        self.refused += not (np.array_equal(position, command.position) and np.array_equal(velocity, command.velocity))
+        self._next = SetPoint(due, position, velocity)
+
+    def _turn(self, tick: int) -> None:
+        """Turn to the waiting set point when its time has come."""
+        if self._next is None or (not self.holding and tick < self._due):
+            return
+        (due, position, velocity), self._next = self._next, None
+        if due <= tick:
+            return
         now = self._motion(tick)
-        begin = min(tick, self._due) if not self.holding else tick
+        begin = tick if self.holding else self._due
         curve = self._bridge(begin, position, velocity, due)
         joined = not self.holding and bool((curve.hardest() <= HARDEST * self._limits.acceleration).all())
+        self._due, self.holding = due, False
         if joined:
             self._curve, self._from = curve, begin
-        else:
-            left_s = (due - tick) * self._tick_s
-            self._curve, self._from = Hermite(position - velocity * left_s, velocity, position, velocity, left_s), tick
-        self._due, self.holding = due, False
-        if not joined:
-            self._join(now.position, now.velocity, tick)
+            return
+        left_s = (due - tick) * self._tick_s
+        self._curve, self._from = Hermite(position - velocity * left_s, velocity, position, velocity, left_s), tick
+        self._join(now.position, now.velocity, tick)
 
     def _bridge(self, begin: int, position: Array, velocity: Array, due: int) -> Hermite:
         """Return the curve from the present one at tick `begin` to a set point."""
@@ -118,10 +140,3 @@ class Reference:
             curve.velocity + difference.velocity,
             ahead.acceleration + apart.acceleration,
         )
-
-    def _clamp(self, position: Array, velocity: Array) -> tuple[Array, Array]:
-        """Return a set point within the bounds; count it when it was not."""
-        inside = np.clip(position, self._bounds.position[:, 0], self._bounds.position[:, 1])
-        slow = np.clip(velocity, -self._bounds.velocity, self._bounds.velocity)
-        self.refused += not (np.array_equal(inside, position) and np.array_equal(slow, velocity))
-        return inside, slow

@@ -239,13 +239,13 @@ def test_a_move_that_is_cut_off_by_the_next_goes_on_from_where_it_was() -> None:
 def test_the_scene_shows_moving_obstacles_objects_and_the_tool_where_they_are() -> None:
     robot_and_scene = config("puma560_crossing")
     made, scene = cell("puma560_crossing"), robot_and_scene[1]
-    soon = SceneConfig(**{**scene.model_dump(), "motion": [{"body": "post", "at": 0.1, "to": (0.62, 0.0, 0.7)}]})
+    soon = SceneConfig(**{**scene.model_dump(), "motion": [{"body": "post", "at": 0.1, "to": (0.62, 0.0, 0.9)}]})
     arm = SimulatedArm(made, soon, CLOCK_NS)
     arm.step(240)
     seen = Message(SCENE.dtype(sizes(made)))
     arm.look(seen)
     post = len(scene.objects)
-    assert seen.position[post] == pytest.approx([0.62, 0.85 - 0.25 * (239 * TICK_S - 0.1), 0.7])
+    assert seen.position[post] == pytest.approx([0.62, 0.85 - 0.25 * (239 * TICK_S - 0.1), 0.9])
     assert seen.position[0] == pytest.approx([0.5, 0.3, 0.475], abs=1e-3)
     position, rotation = Dynamics(made).pose(arm.sense().position)
     assert seen.tool_position == pytest.approx(position, abs=1e-12)

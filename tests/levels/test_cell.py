@@ -97,9 +97,9 @@ def test_whatever_drives_a_joint_becomes_a_torque_motor_with_its_limit(
 
 def test_a_tendon_drive_is_replaced_when_the_config_gives_torque_limits(tmp_path: Path) -> None:
     drives = '<motor joint="shoulder"/><position name="winch" tendon="cable" kp="10"/>'
-    made = build(pendulum(tmp_path, drives, torque=(25.0, 10.0)))
+    made = build(pendulum(tmp_path, drives, torque=(45.0, 10.0)))
     assert made.model.nu == 2
-    assert made.bounds.torque == pytest.approx([25.0, 10.0])
+    assert made.bounds.torque == pytest.approx([45.0, 10.0])
 
 
 def test_sensors_and_keyframes_of_replaced_actuators_go_with_them(tmp_path: Path) -> None:
@@ -141,6 +141,7 @@ WRONG_CONFIGS = {
     "length": ({"velocity": (1.0,)}, "robot.velocity: 1 values; one a joint is 2"),
     "home outside": ({"home": (0.0, 2.5)}, "joint 'elbow' at 2.5 rad; -1.995 to 1.995 is valid"),
     "home touches": ({"home": (1.5, 0.5)}, "'floor' touches 'lower'"),
+    "too weak": ({"torque": (1.0, 20.0)}, "joint 'shoulder' carries"),
     "no range": ({"position": ((2.5, 3.0), (-1.0, 1.0))}, "joint 'shoulder' has no room from 2.5 to 2 rad"),
     "gripper": ({"gripper": gripper()}, "'grip' is not in the model"),
 }

@@ -216,27 +216,28 @@ def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
     assert rack.status.done == 0
 
 
-@pytest.mark.parametrize("died_at_s", [0.05, 0.3, 0.9, 1.2])
-def test_executor_that_starts_anew_finishes_what_was_under_way(died_at_s: float) -> None:
+@pytest.mark.parametrize(("died_at_s", "away_s"), [(0.05, 0.25), (0.3, 0.25), (0.3, 0.0), (0.9, 0.04), (1.2, 0.0)])
+def test_executor_that_starts_anew_finishes_what_was_under_way(died_at_s: float, away_s: float) -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     rack.run(died_at_s)
     rack.tasks["primitive"].due = -1
-    rack.run(0.25)
+    rack.run(away_s)
     rack.restart("primitive")
     assert rack.run_until_done(2)
     assert np.abs(rack.servo.position - rack.home).max() < 1e-3
     assert rack.servo.touches == 0
 
 
-def test_executor_that_starts_anew_keeps_its_grip() -> None:
+@pytest.mark.parametrize("died_at_s", [0.1, 1.0])
+def test_executor_that_starts_anew_keeps_its_grip(died_at_s: float) -> None:
     rack = PrimitiveRack()
     rack.command(gripper(1, opening=0.0, held=0, force=17.0))
-    rack.run_until_done(1)
+    rack.run(died_at_s)
     rack.tasks["primitive"].due = -1
-    rack.run(0.25)
+    rack.run(0.02)
     rack.restart("primitive")
-    rack.run(0.5)
+    rack.run(1.0)
     assert (rack.status.done, rack.status.held) == (1, 0)
     assert (rack.set_points[-1]["force"], rack.set_points[-1]["opening"]) == (17.0, 0.0)
 
@@ -270,6 +271,16 @@ def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
     servo.due = rack.tick
     assert rack.run_until_done(2)
     assert rack.status.error == 0
+
+
+def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() -> None:
+    rack = PrimitiveRack("k1607")
+    corner = rack.home + 0.2
+    rack.command(path(1, [rack.home, corner, corner - 0.3], [0.0, 0.2, 0.0]))
+    assert rack.run_until_done(1)
+    assert np.abs(rack.servo.position - corner + 0.3).max() < 1e-3
+    rack.command(gripper(2, opening=0.0))
+    assert rack.run_until_error().reason == "segment 2: the arm has no gripper; only paths are valid"
 
 
 def test_two_equal_runs_write_equal_set_points() -> None:

@@ -279,3 +279,17 @@ def test_a_restart_does_not_drop_what_is_held(grasping: ServoRig) -> None:
     scene = grasping.rack.read("servo.scene")
     assert scene.position[0] == pytest.approx(scene.tool_position, abs=0.01)
     assert grasping.status.touches == 0
+
+
+@pytest.mark.parametrize("early", [0, 3, PERIOD - 1])
+def test_set_points_that_come_early_wait_for_their_turn(early: int) -> None:
+    move, targets = course("puma560"), []
+    for ahead in (0, early):
+        rig = rig_of("puma560")
+        for _ in range(700):
+            if (rig.rack.tick + ahead) % PERIOD == 0:
+                due = rig.rack.tick + ahead + PERIOD
+                rig.set_point(*move.at(due * TICK_S - 0.1), due)
+            rig.run(1)
+        targets.append(np.array(rig.targets))
+    assert np.abs(targets[0] - targets[1]).max() < 1e-12

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -18,29 +19,37 @@ ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 30
 
 
-def rack(*arguments: str | Path, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "tools.cli", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 
-@pytest.fixture
-def running(small: Path, rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+@contextmanager
+def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A rack in real time without an end, past its first cycles."""
     command = [sys.executable, "-m", "tools.cli", "run", str(small), "--set", "clock.mode=realtime"]
     process = subprocess.Popen(
-        [*command, "--set", f"name={rack_name}", "--out", str(tmp_path / "run")],
+        [*command, "--set", f"name={name}", *arguments],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.startswith(rack_name) and "tick 0 " not in line:
-            break
-    yield process
-    process.kill()
-    process.communicate()
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith(name) and "tick 0 " not in line:
+                break
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def running(small: Path, rack_name: str) -> Iterator[subprocess.Popen[str]]:
+    with launched(small, rack_name, "--no-record") as process:
+        yield process
 
 
 def wait_until_gone(name: str) -> bool:
@@ -128,9 +137,10 @@ def test_a_recorder_can_join_a_run(running: subprocess.Popen[str], rack_name: st
     assert report["tasks"]["lower"]["traced"] > 0
 
 
-def test_ctrl_c_ends_a_run_in_order(running: subprocess.Popen[str], rack_name: str, tmp_path: Path) -> None:
-    running.send_signal(signal.SIGINT)
-    printed, _ = running.communicate(timeout=BOUND_S)
+def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path) -> None:
+    with launched(small, rack_name, "--out", str(tmp_path / "run")) as running:
+        running.send_signal(signal.SIGINT)
+        printed, _ = running.communicate(timeout=BOUND_S)
     assert running.returncode == 1
     assert "stopped" in printed
     assert wait_until_gone(rack_name)

@@ -95,9 +95,9 @@ def _accesses(segment: Segment, protocol: Protocol) -> tuple[Callable[[], None],
         message.position[:] = joints
         writer.write(tick)
 
-    def read() -> float:
+    def read() -> None:
         reading = reader.read(tick + 1)
-        return reading.value.position[0]
+        joints[0] = reading.value.position[0]
 
     def both() -> None:
         write()

@@ -7,6 +7,9 @@ from typing import Any
 
 Report = dict[str, Any]
 
+SHOWN = 10
+"""Misses that the text shows; report.json has them all."""
+
 TIMES = [
     *("task", "R", "cycles", "missed", "skipped", "late p50", "p99", "max", "exec p50", "p99", "max"),
     *("comm p99", "residual min", "deviation", "alpha", "plan age max"),
@@ -31,13 +34,42 @@ def _lines(report: Report) -> Iterator[str]:
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
     yield from (f"- {count} rows of {name} were lost" for name, count in report["rows_lost"].items())
+    yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])
     yield from ("", "## Cycles, ms", "")
     if report["mode"] == "lockstep":
         yield from ("In lockstep there are no deadlines: a tick lasts as long as its tasks take.", "")
     yield from _table(TIMES, [_times_row(name, task) for name, task in report["tasks"].items()])
+    yield from _misses(report["misses"])
     yield from _response(report["system_response"])
+
+
+def _against(against: Report | None) -> Iterator[str]:
+    if against is None:
+        return
+    parting = against["first_difference"]
+    if parting is None:
+        yield f"- all messages are those of {against['folder']}"
+        return
+    missed = against["first_miss_tick"]
+    why = f"the first miss is at tick {missed}" if missed is not None else "neither run has a miss"
+    yield f"- parts from {against['folder']} at tick {parting['tick']}, in {parting['mailbox']}; {why}"
+
+
+def _misses(misses: list[Report]) -> Iterator[str]:
+    if not misses:
+        return
+    yield from ("", f"## Misses: {len(misses)}, the first {min(SHOWN, len(misses))}", "")
+    rows = [
+        [str(miss["tick"]), miss["task"], miss["what"], *(_given(miss, key) for key in ("started_ms", "took_ms"))]
+        for miss in misses[:SHOWN]
+    ]
+    yield from _table(["tick", "task", "what", "started late, ms", "took, ms"], rows)
+
+
+def _given(miss: Report, key: str) -> str:
+    return f"{miss[key]:.3f}" if key in miss else "-"
 
 
 def _task(task: Report | None) -> Iterator[str]:

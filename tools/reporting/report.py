@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ from backplane.layout import Layout, TaskSpec
 from backplane.message import State
 from boards.config import RackConfig, loads
 from tools.recording import Recording
+from tools.reporting.difference import first_difference
 from tools.reporting.markdown import markdown
+from tools.reporting.misses import misses
 from tools.reporting.motion import motion
 from tools.reporting.response import system_response
 from tools.reporting.timing import plan_age_ms, task_times
@@ -19,9 +22,15 @@ from tools.snapshot import TASK_STATUS
 Report = dict[str, Any]
 
 
-def write_report(folder: Path) -> tuple[Report, str]:
-    """Make the report of the run in `folder`, write it there, and return it as data and as text."""
-    report = report_of(Recording(folder))
+def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
+    """Make the report of the run in `folder`, write it there, and return it as data and as text.
+
+    With the folder of another run `against`, it tells where the two part.
+    """
+    recording = Recording(folder)
+    report = report_of(recording)
+    if against is not None:
+        report["against"] = _compared(recording, Recording(against), report["misses"])
     text = markdown(report)
     (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     (folder / "report.md").write_text(text)
@@ -48,12 +57,24 @@ def report_of(recording: Recording) -> Report:
         "clock_skipped": ended.get("clock_skipped", 0),
         "missed": sum(task.get("missed", 0) for task in counted.values()),
         "skipped": sum(task.get("skipped", 0) for task in counted.values()),
+        "misses": misses(recording, layout),
         "tasks": {task.name: _task(recording, config, layout, task, counted) for task in layout.tasks},
         "system_response": system_response(recording, config, layout),
         "task": _task_outcome(recording, layout),
         "motion": motion(recording, layout),
         "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
+    }
+
+
+def _compared(recording: Recording, other: Recording, found: list[Report]) -> Report:
+    parting = first_difference(recording, other)
+    missed = min((miss["tick"] for miss in [*found, *misses(other, other.layout)]), default=None)
+    return {
+        "folder": str(other.folder),
+        "first_difference": asdict(parting) if parting is not None else None,
+        "first_miss_tick": missed,
+        "explained": parting is None or (missed is not None and missed <= parting.tick),
     }
 
 

@@ -1,0 +1,60 @@
+"""A small bus for tests: a writer's and a reader's task, and the mailboxes that a test asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec
+from backplane.message import Field, MessageType
+from backplane.segment import Segment
+from boards.config.fields import field_specs
+
+CLOCK_NS = 2_500_000
+NAME = "writer.point"
+SIZES = {"row": 24}
+POINT = MessageType(
+    "point",
+    3,
+    (
+        Field("id", "u4", "1", "serial of the message"),
+        Field("row", "i8", "1", "the serial again in every place: half a message shows", ("row",)),
+        Field("text", "S8", "ASCII", "a word"),
+    ),
+)
+
+
+def mailbox(
+    protocol: Protocol = "time-slice", every: int = 1, delay: int = 1, depth: int = 8, name: str = NAME
+) -> MailboxSpec:
+    """Return the spec of a mailbox of points."""
+    return MailboxSpec(
+        name=name,
+        writer="writer",
+        readers=("reader",),
+        protocol=protocol,
+        every=every,
+        delay=delay,
+        depth=depth,
+        message=POINT.name,
+        version=POINT.version,
+        size=POINT.dtype(SIZES).itemsize,
+        fields=field_specs(POINT, SIZES),
+    )
+
+
+def task(name: str, every: int = 1, slot: int = 2, role: Role = "executor", depth: int = 16) -> TaskSpec:
+    """Return the spec of a task on a board of its own."""
+    return TaskSpec(name, name, role, slot, 0, 0, every, 1, depth)
+
+
+def layout(rack: str, mailboxes: Iterable[MailboxSpec] = (), tasks: Iterable[TaskSpec] = ()) -> Layout:
+    """Return a layout; without `tasks`, those of a writer and a reader."""
+    return Layout(rack, CLOCK_NS, tuple(tasks) or (task("writer"), task("reader", slot=3)), tuple(mailboxes))
+
+
+def message_address(segment: Segment, serial: int, name: str = NAME) -> int:
+    """Return the bus address of the message in that serial's slot."""
+    spec = segment.layout.mailbox(name)
+    slot = (serial % spec.depth) * slot_stride(spec)
+    return segment.map.mailboxes[name] + MAILBOX_HEAD_SIZE + slot + SLOT_HEAD_SIZE

@@ -1,0 +1,36 @@
+"""Buses for tests, removed at their end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from backplane import semaphores
+from backplane.layout import MailboxSpec, TaskSpec
+from backplane.segment import SHM_FOLDER, Segment, unlink
+from tests.backplane.bus import layout
+
+MakeBus = Callable[..., Segment]
+
+
+@pytest.fixture
+def make_bus(rack_name: str) -> Iterator[MakeBus]:
+    """Make the one bus of a test, of these mailboxes and tasks."""
+
+    made: list[Segment] = []
+
+    def make(*parts: MailboxSpec | TaskSpec, config: str = "") -> Segment:
+        boxes = [part for part in parts if isinstance(part, MailboxSpec)]
+        tasks = [part for part in parts if isinstance(part, TaskSpec)]
+        segment = Segment.create(layout(rack_name, boxes, tasks), config)
+        made.append(segment)
+        semaphores.create(segment.layout)
+        return segment
+
+    yield make
+    for segment in made:
+        segment.close()
+    semaphores.unlink_all(rack_name)
+    unlink(rack_name)
+    assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]

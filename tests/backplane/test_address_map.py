@@ -1,0 +1,59 @@
+"""The memory map: windows on pages, nothing over anything else."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from backplane.address_map import BLOCK_SIZE, HEAD_SIZE, LINE, PAGE, AddressMap, mailbox_size, trace_size
+from backplane.layout import Layout, TaskSpec, depth_for
+from backplane.words import Block, Head, System
+from tests.backplane.bus import layout, mailbox, task
+
+PLANNER = TaskSpec("writer.planner", "writer", "planner", 2, 0, 0, 8, 4, 64)
+
+
+@pytest.fixture
+def full() -> Layout:
+    boxes = [mailbox(name=f"writer.{n}", depth=depth) for n, depth in (("a", 4), ("b", 64), ("c", 8))]
+    return layout("full", boxes, [task("writer"), PLANNER, task("reader", slot=3)])
+
+
+def test_windows_follow_each_other_on_pages(full: Layout) -> None:
+    places = AddressMap(full)
+    assert [window.board for window in places.windows] == ["writer", "reader"]
+    assert places.windows[0].address == HEAD_SIZE
+    assert all(window.address % PAGE == window.size % PAGE == 0 for window in places.windows)
+    assert all(first.address + first.size == second.address for first, second in pairwise(places.windows))
+    assert places.size == places.windows[-1].address + places.windows[-1].size
+
+
+def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
+    places = AddressMap(full)
+    areas = [(places.blocks[t.name], BLOCK_SIZE + trace_size(t)) for t in full.tasks]
+    areas += [(places.mailboxes[m.name], mailbox_size(m)) for m in full.mailboxes]
+    areas.sort()
+    assert all(address % LINE == 0 for address, _ in areas)
+    assert all(address + size <= following for (address, size), (following, _) in pairwise(areas))
+
+
+def test_what_a_board_writes_lies_in_its_window(full: Layout) -> None:
+    places = AddressMap(full)
+    window = places.windows[0]
+    for address in (*places.mailboxes.values(), places.blocks["writer"], places.blocks["writer.planner"]):
+        assert window.address <= address < window.address + window.size
+
+
+def test_shared_words_fit_their_places() -> None:
+    last_slot = 21
+    assert max(Head) < min(System)
+    assert (System.SYSFAIL + last_slot + 1) * 8 <= HEAD_SIZE
+    assert (max(Block) + 1) * 8 <= BLOCK_SIZE
+
+
+@pytest.mark.parametrize(
+    ("span_ticks", "every", "slots"), [(0, 1, 4), (1, 1, 4), (2, 1, 8), (800, 1, 1024), (800, 8, 128)]
+)
+def test_depth_keeps_the_span_in_a_power_of_two(span_ticks: int, every: int, slots: int) -> None:
+    assert depth_for(span_ticks, every) == slots

@@ -1,0 +1,130 @@
+"""Message types and messages: sizes, fields, text."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from backplane.errors import MailboxError
+from backplane.message import REASON_BYTES, Field, Message, MessageType, State, command, status
+
+POSE = MessageType("pose", 1, (Field("position", "f8", "m", "", (3,)), Field("valid", "u1", "1", "")))
+TRACK = MessageType(
+    "track",
+    2,
+    (
+        Field("count", "u2", "1", "poses"),
+        Field("poses", POSE, "", "way", ("poses",)),
+        Field("angle", "f8", "rad", "joints", ("joints", 2)),
+        Field("word", "S4", "ASCII", ""),
+    ),
+)
+SIZES = {"poses": 5, "joints": 6}
+
+
+@pytest.fixture
+def track() -> Message:
+    return Message(TRACK.dtype(SIZES))
+
+
+def test_symbolic_sizes_are_filled_in() -> None:
+    dtype = TRACK.dtype(SIZES)
+    assert dtype["angle"].shape == (6, 2)
+    assert dtype["poses"].shape == (5,)
+    assert dtype["poses"].base["position"].shape == (3,)
+
+
+def test_an_unknown_size_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(MailboxError, match=r"'track' field 'poses': size 'poses' is unknown; known sizes: joints"):
+        TRACK.dtype({"joints": 6})
+
+
+def test_every_field_lies_on_its_own_boundary() -> None:
+    dtype = TRACK.dtype(SIZES)
+    assert dtype.fields is not None
+    assert all(offset % field.alignment == 0 for field, offset in dtype.fields.values())
+
+
+@pytest.mark.parametrize("wrong", ["raw", "copy_from", "_hidden"])
+def test_a_field_that_no_message_could_show_is_refused(wrong: str) -> None:
+    with pytest.raises(MailboxError, match=f"message 'bad': field '{wrong}'"):
+        MessageType("bad", 1, (Field(wrong, "f8", "1", ""),))
+
+
+def test_a_field_stands_once() -> None:
+    with pytest.raises(MailboxError, match="field 'x'"):
+        MessageType("bad", 1, (Field("x", "f8", "1", ""), Field("x", "f8", "1", "")))
+
+
+def test_a_misspelt_field_is_refused_in_writing_and_in_reading(track: Message) -> None:
+    with pytest.raises(AttributeError, match="cuont"):
+        track.cuont = 3
+    with pytest.raises(AttributeError, match="no field 'cuont'; fields: count, poses, angle, word"):
+        _ = track.cuont
+
+
+def test_scalars_read_as_plain_numbers(track: Message) -> None:
+    track.count = 7
+    assert type(track.count) is int
+    assert track.count == 7
+
+
+def test_arrays_are_views_of_the_bytes(track: Message) -> None:
+    angle = track.angle
+    track.angle = np.arange(12.0).reshape(6, 2)
+    angle[0, 1] = -1.0
+    assert track.record["angle"][0].tolist() == [0.0, -1.0]
+    assert track.raw[TRACK.dtype(SIZES).fields["angle"][1] :][8:16].cast("d")[0] == -1.0
+
+
+def test_a_group_is_filled_field_by_field(track: Message) -> None:
+    track.poses["position"][2] = (1, 2, 3)
+    track.poses[2]["valid"] = 1
+    assert track.record["poses"]["position"][2].tolist() == [1.0, 2.0, 3.0]
+    assert track.record["poses"]["valid"].tolist() == [0, 0, 1, 0, 0]
+
+
+def test_text_reads_as_text_cut_to_its_field(track: Message) -> None:
+    track.word = "gripper"
+    assert track.word == "grip"
+    track.word = "né"
+    assert track.word == "n?"
+
+
+def test_shorter_text_leaves_nothing_of_the_longer(track: Message) -> None:
+    track.word = "abcd"
+    track.word = "x"
+    assert track.record["word"] == b"x"
+    assert bytes(track.raw).count(b"bcd") == 0
+
+
+def test_a_number_that_does_not_fit_its_field_is_refused(track: Message) -> None:
+    with pytest.raises(OverflowError):
+        track.count = 70_000
+
+
+def test_clear_and_copy_take_every_byte(track: Message) -> None:
+    track.count, track.word = 3, "abc"
+    track.angle[:] = 2.5
+    other = Message(TRACK.dtype(SIZES))
+    other.copy_from(track)
+    assert bytes(other.raw) == bytes(track.raw)
+    track.clear()
+    assert bytes(track.raw) == bytes(len(track.raw))
+
+
+def test_messages_of_a_type_keep_their_own_values() -> None:
+    first, second = (Message(TRACK.dtype(SIZES)) for _ in range(2))
+    first.count = 1
+    assert (first.count, second.count) == (1, 0)
+
+
+def test_commands_begin_with_their_serial_and_statuses_with_the_answer() -> None:
+    move = command("move", 1, Field("goal", "f8", "rad", ""))
+    moving = status("moving", 1, Field("at", "f8", "rad", ""))
+    assert [f.name for f in move.fields] == ["id", "goal"]
+    assert [f.name for f in moving.fields] == ["echo", "state", "error", "reason", "at"]
+    answer = Message(moving.dtype({}))
+    answer.state, answer.reason = State.ERROR, "x" * 500
+    assert State(answer.state) is State.ERROR
+    assert len(answer.reason) == REASON_BYTES

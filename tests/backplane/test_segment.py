@@ -1,0 +1,216 @@
+"""The segment: who may attach, what it carries, and that nothing half made has a name."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import stat
+import time
+from collections.abc import Callable
+
+import pytest
+
+from backplane.errors import SegmentError
+from backplane.layout import Layout
+from backplane.segment import VERSION, Segment, racks, shm_path, unlink
+from backplane.words import Block, Head, System
+from tests.backplane.bus import layout, mailbox
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, descriptors, exit_status, fork, forked, kill
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+STRANGER, ANOTHER = 65_533, 65_532
+"""Users that own nothing here."""
+as_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+
+
+def refusal(attach: Callable[[], object]) -> str:
+    with pytest.raises(SegmentError) as error:
+        attach()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_segment_is_its_users_alone_and_all_of_it_is_allocated(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    found = shm_path(segment.rack).stat()
+    assert stat.S_IMODE(found.st_mode) == 0o600
+    assert found.st_size == len(segment.bytes)
+    assert found.st_blocks * 512 >= found.st_size
+
+
+def test_whoever_attaches_finds_layout_and_config(make_bus: MakeBus) -> None:
+    made = make_bus(mailbox(), mailbox("lock", name="writer.other"), config='name = "näme"\n')
+    found = Segment.attach(made.rack)
+    assert found.layout == made.layout
+    assert found.config == made.config
+    assert found.map.mailboxes == made.map.mailboxes
+    assert (found.launcher, found.launcher_is_alive) == (os.getpid(), True)
+
+
+def test_attached_memory_is_the_same_memory(make_bus: MakeBus) -> None:
+    made = make_bus()
+    found = Segment.attach(made.rack)
+    made.words[System.TICK] = 2**62 + 1
+    found.block("reader")[Block.DONE] = -7
+    assert found.words[System.TICK] == 2**62 + 1
+    assert made.block("reader")[Block.DONE] == -7
+
+
+def test_tasks_begin_without_a_release_and_boards_hold_sysfail(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    assert [segment.block(t)[w] for t in ("writer", "reader") for w in (Block.RELEASED, Block.DONE)] == [-1] * 4
+    assert [segment.words[System.SYSFAIL + slot] for slot in (1, 2, 3, 4)] == [0, 1, 1, 0]
+
+
+def test_a_name_in_use_is_refused_and_the_first_segment_stays(make_bus: MakeBus) -> None:
+    first = make_bus()
+    first.words[System.TICK] = 5
+    assert f"rack '{first.rack}' has a segment already" in refusal(lambda: Segment.create(first.layout, ""))
+    assert Segment.attach(first.rack).words[System.TICK] == 5
+
+
+def test_attaching_to_nothing_names_what_there_is(make_bus: MakeBus) -> None:
+    there = make_bus().rack
+    told = refusal(lambda: Segment.attach("nobody-s"))
+    assert "rack 'nobody-s' is not there" in told
+    assert there in told
+
+
+@pytest.mark.parametrize("name", ["a/b", "x" * 300])
+def test_a_name_that_none_can_have_is_not_there(name: str) -> None:
+    assert "is not there" in refusal(lambda: Segment.attach(name))
+
+
+def test_another_layout_version_is_refused(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    segment.words[Head.VERSION] = VERSION + 1
+    told = refusal(lambda: Segment.attach(segment.rack))
+    assert f"layout version {VERSION + 1}; this program attaches to {VERSION}" in told
+
+
+def test_a_segment_of_another_kind_is_refused(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    segment.words[Head.MAGIC] += 1
+    refusal(lambda: Segment.attach(segment.rack))
+
+
+def test_a_size_other_than_the_heads_is_refused(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    size = len(segment.bytes)
+    os.truncate(shm_path(segment.rack), size + 4096)
+    told = refusal(lambda: Segment.attach(segment.rack))
+    assert f"{size + 4096} bytes; its head says {size}" in told
+
+
+def test_a_segment_without_room_for_a_head_is_refused(rack_name: str) -> None:
+    shm_path(rack_name).touch()
+    try:
+        assert "0 bytes" in refusal(lambda: Segment.attach(rack_name))
+    finally:
+        unlink(rack_name)
+
+
+@as_root
+def test_another_users_segment_is_refused(make_bus: MakeBus) -> None:
+    segment = make_bus()
+
+    def attach(why: str) -> bool:
+        os.setuid(STRANGER)
+        return why in refusal(lambda: Segment.attach(segment.rack))
+
+    assert exit_status(fork(lambda: attach("belongs to another user"))) == 0
+    # Open to everybody and made by somebody: what it holds is not to be trusted.
+    shm_path(segment.rack).chmod(0o666)
+    os.chown(shm_path(segment.rack), ANOTHER, ANOTHER)
+    assert exit_status(fork(lambda: attach(f"owner {ANOTHER}"))) == 0
+
+
+def test_refused_attaches_leave_no_file_open(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    segment.words[Head.VERSION] = VERSION + 1
+    before = descriptors()
+    for _ in range(5):
+        refusal(lambda: Segment.attach(segment.rack))
+    assert descriptors() == before
+
+
+def test_a_closed_segment_leaves_no_file_open_and_stays_readable(make_bus: MakeBus) -> None:
+    made, before = make_bus(), descriptors()
+    found = Segment.attach(made.rack)
+    found.close()
+    found.close()
+    assert found.words[Head.SIZE] == len(made.bytes)
+    del found
+    assert descriptors() == before
+
+
+def too_large(rack: str) -> Layout:
+    return layout(rack, [mailbox(depth=1 << 40)])
+
+
+def test_shared_memory_that_does_not_suffice_is_told_at_creation(rack_name: str) -> None:
+    told = refusal(lambda: Segment.create(too_large(rack_name), ""))
+    assert f"rack '{rack_name}'" in told
+    assert "bytes of shared memory" in told
+    assert rack_name not in racks()
+
+
+def test_a_limit_on_file_size_is_told_at_creation(rack_name: str) -> None:
+    def create() -> bool:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        return "File too large" in refusal(lambda: Segment.create(layout(rack_name, [mailbox()]), ""))
+
+    assert exit_status(fork(create)) == 0
+    assert rack_name not in racks()
+
+
+def test_failed_creations_leave_no_file_open(rack_name: str) -> None:
+    before = descriptors()
+    for _ in range(5):
+        refusal(lambda: Segment.create(too_large(rack_name), ""))
+    assert descriptors() == before
+
+
+def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str) -> None:
+    spec, rng, complete = layout(rack_name, [mailbox(depth=4096)]), random.Random(1), 0
+    for _ in range(40):
+        creator = fork(lambda: Segment.create(spec, "x = 1"))
+        time.sleep(rng.uniform(0.0, 0.006))
+        kill(creator)
+        if rack_name in racks():
+            found = Segment.attach(rack_name)
+            assert (found.layout, found.config, found.launcher_is_alive) == (spec, "x = 1", False)
+            found.close()
+            unlink(rack_name)
+            complete += 1
+    assert complete
+
+
+def test_a_launcher_is_told_from_a_later_process_of_its_number(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    segment.words[Head.LAUNCHER_START] += 1
+    assert not segment.launcher_is_alive
+
+
+def test_a_segment_knows_when_its_name_means_another(make_bus: MakeBus) -> None:
+    first = make_bus()
+    assert first.has_its_name
+    unlink(first.rack)
+    assert not first.has_its_name
+    second = make_bus()
+    assert (first.has_its_name, second.has_its_name) == (False, True)
+
+
+def test_unlinking_what_is_gone_is_no_error(rack_name: str) -> None:
+    unlink(rack_name)
+    assert rack_name not in racks()
+
+
+def test_a_segment_outlives_its_name_for_those_who_have_it(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    with forked(lambda: time.sleep(60)):
+        unlink(segment.rack)
+        segment.words[System.TICK] = 3
+        assert segment.words[System.TICK] == 3

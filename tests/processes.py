@@ -1,0 +1,93 @@
+"""Processes for tests: forked workers, and waits that end."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+BOUND_S = 20.0
+"""Bound of every wait: reached only when something is broken."""
+FORKS = "ignore:.*multi-threaded, use of fork:DeprecationWarning"
+"""Filter for tests that fork: a worker here touches shared memory alone, none of the parent's threads' locks."""
+
+
+def fork(work: Callable[[], object]) -> int:
+    """Run `work` in a child process; its exit status is 0 when `work` returned true or nothing."""
+    pid = os.fork()
+    if pid:
+        return pid
+    status = 1
+    try:
+        status = 0 if work() in (None, True) else 2
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(status)
+
+
+@contextmanager
+def forked(work: Callable[[], object]) -> Iterator[int]:
+    """Run `work` in a child process that is killed at the end, should it still run."""
+    pid = fork(work)
+    try:
+        yield pid
+    finally:
+        kill(pid)
+
+
+def kill(pid: int) -> None:
+    """Kill a child of this process and reap it."""
+    with suppress(ProcessLookupError, ChildProcessError):
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+
+
+def exit_status(pid: int, bound_s: float = BOUND_S) -> int:
+    """Wait for a child's end and return its exit status, negative for a signal."""
+    pidfd = os.pidfd_open(pid)
+    try:
+        wait_until(lambda: os.waitid(os.P_PIDFD, pidfd, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None, bound_s)
+    finally:
+        os.close(pidfd)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def wait_until(condition: Callable[[], object], bound_s: float = BOUND_S) -> None:
+    """Wait until `condition` holds. Raises `TimeoutError` when it does not come to."""
+    deadline = time.monotonic() + bound_s
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"not within {bound_s:g} s")
+        time.sleep(0.001)
+
+
+def runs(pid: int) -> bool:
+    """Say whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def parent_of(pid: int) -> int:
+    """Return the parent of a running process."""
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the children of a process; none when it is gone."""
+    with suppress(FileNotFoundError, ProcessLookupError):
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return []
+
+
+def descriptors() -> int:
+    """Return how many files this process has open and in use."""
+    gc.collect()
+    return len(list(Path("/proc/self/fd").iterdir()))

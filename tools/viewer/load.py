@@ -1,0 +1,34 @@
+"""The times of one task against its deadline, as curves."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from backplane.layout import TaskSpec
+from tools.viewer.blocks import Block
+from tools.viewer.palette import LIMIT, of_joint
+from tools.viewer.stream import Stream
+
+LOAD, TIMES = "load", "times"
+
+
+class Load:
+    """Writes trace records: lateness, execution and deadline in ms, and the part of the time slice that is used up."""
+
+    def __init__(self, stream: Stream, task: TaskSpec, period_ns: int) -> None:
+        self._stream, self._task = stream, task.name
+        self._slice_ns = task.every * task.within_cycles * period_ns
+        curves = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
+        stream.static((TIMES, task.name), rr.SeriesLines(names=curves, colors=[of_joint(1), of_joint(0), LIMIT]))
+        stream.static((LOAD, task.name), rr.SeriesLines(names=[f"{task.name}, % of its slice"]))
+
+    def write(self, block: Block) -> None:
+        """Write every cycle; 100 % is the deadline."""
+        rows = block.rows
+        lateness = rows["start_ns"] - rows["release_ns"]
+        execution = rows["process_ns"] - rows["read_ns"]
+        curves = np.column_stack((lateness, execution, np.full(len(rows), self._slice_ns))) * 1e-6
+        self._stream.scalars((TIMES, self._task), block.times, curves)
+        used = (rows["end_ns"] - rows["release_ns"]) * (100.0 / self._slice_ns)
+        self._stream.scalars((LOAD, self._task), block.times, used)
