@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-EventKind = Literal["launch", "ready", "start", "printed", "died", "hang", "stop", "end"]
+EventKind = Literal["launch", "ready", "start", "printed", "died", "hang", "stop", "end", "recorder"]
 
 
 @dataclass(frozen=True)

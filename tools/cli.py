@@ -12,6 +12,7 @@ from tools.check import check
 from tools.clean import clean
 from tools.list import list_racks
 from tools.record import record
+from tools.replay import replay
 from tools.report import report
 from tools.run import run
 from tools.status import status
@@ -32,6 +33,7 @@ app.command()(status)
 app.command()(stop)
 app.command()(clean)
 app.command()(record)
+app.command()(replay)
 app.command()(report)
 app.command()(bench)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,24 +11,35 @@ import typer
 from tools.answer import Json, RackName, print_json
 
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
+View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 
 
-def record(rack: RackName, out: Out = None, as_json: Json = False) -> None:
+def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = False) -> None:
     """Record a running rack, from now on.
 
-    Trace and signals, until its run is over or Ctrl-C.
+    Trace, signals and run.rrd, until its run is over or Ctrl-C.
     """
     from contextlib import suppress
 
     from backplane.segment import Segment
     from tools.folders import folder_of
     from tools.recorder.recorder import Recorder
+    from tools.recorder.side_sink import SideSink
+    from tools.viewer.sink import ViewSink
+    from tools.viewer.window import Window, free_port, url
 
     segment = Segment.attach(rack)
     folder = folder_of(out, rack)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.toml").write_text(segment.config)
+    told: list[str] = []
+    port = free_port() if view else None
+    beside = SideSink(lambda: ViewSink(segment, folder, port), told.append)
     # Ctrl-C ends the recording, not the run; the files are finished on the way out.
-    with Recorder(segment, folder) as recorder, suppress(KeyboardInterrupt):
+    with Recorder(segment, folder, beside) as recorder, suppress(KeyboardInterrupt):
+        window = None if port is None else Window(url(port))
         recorder.follow()
-    print_json({"rack": rack, "folder": str(folder)}) if as_json else print(f"recorded into {folder}")
+    told += window.told() if window is not None else []
+    for text in told:
+        print(text, file=sys.stderr)
+    print_json({"rack": rack, "folder": str(folder), "told": told}) if as_json else print(f"recorded into {folder}")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import ConfigName, Json, Settings, print_json
+from tools.answer import ConfigName, Failure, Json, Settings, print_json
 
 Lockstep = Annotated[bool, typer.Option("--lockstep", help="a tick begins when every task due has finished: exact")]
 Seconds = Annotated[
@@ -18,6 +18,7 @@ Speed = Annotated[
     float | None, typer.Option(metavar="X", help="run this many times faster than real time, or slower: 0.5")
 ]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
+View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
 
 
@@ -29,6 +30,7 @@ def run(
     settings: Settings = [],  # noqa: B006  typer copies it
     out: Out = None,
     no_record: NoRecord = False,
+    view: View = False,
     as_json: Json = False,
 ) -> None:
     """Run a rack until its task ends, and report on it.
@@ -40,13 +42,15 @@ def run(
     from tools.folders import folder_of
     from tools.running import run_rack
 
+    if view and no_record:
+        raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
     found = load(config, overrides)
     folder = None if no_record else folder_of(out, found.name)
     with display_for(silent=as_json) as display:
-        result = run_rack(found, seconds, folder, display)
+        result = run_rack(found, seconds, folder, display, view)
     if folder is None:
         report, text = result.document(), result.text()
     else:
@@ -54,4 +58,7 @@ def run(
 
         report, text = write_report(folder)
     print_json(report) if as_json else print(text)
+    if not result.worked:
+        # Last, and by itself: whoever looks only at the end, or only at stderr, sees why.
+        print(result.failure(), file=sys.stderr)
     sys.exit(0 if result.worked else 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 from backplane.segment import Segment
 from backplane.words import Block, System
 from boards.config.schema import RackConfig
+from boards.events import Event
 from boards.outcome import Outcome
 from boards.rack import Rack
 from tools.answer import Failure
@@ -21,6 +22,7 @@ from tools.display import Display
 from tools.event_log import EventLog
 from tools.recorder.process import RecorderProcess
 from tools.snapshot import Viewer
+from tools.viewer.window import Window, free_port, url
 
 COUNTED = (
     *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),
@@ -44,6 +46,11 @@ class RunResult:
         """Whether the run did what it was for."""
         return self.outcome.worked
 
+    def failure(self) -> str:
+        """Return why the run did not do what it was for, in one line."""
+        end = self.outcome
+        return f"{self.rack}: {end.cause}: {'; '.join(end.faults) or end.reason or f'after {end.ticks} ticks'}"
+
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
         return {**asdict(self), "worked": self.worked}
@@ -56,37 +63,47 @@ class RunResult:
         return "\n".join([*lines, f"digest {end.digest}"])
 
 
-def run_rack(config: RackConfig, seconds: float | None, folder: Path | None, display: Display) -> RunResult:
+def run_rack(
+    config: RackConfig, seconds: float | None, folder: Path | None, display: Display, view: bool = False
+) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`, if there is one.
+
+    With `view` the recorder serves a viewer, whose window opens and may close at any time.
 
     Raises what `Rack` raises, and `Failure` when the recorder cannot attach; a rack that did not get as far as
     that leaves no folder.
     """
     log = EventLog(display)
+    sources: list[Callable[[], list[str]]] = []
     with _recorder(folder) as recorder:
         with Rack(config, log.add) as rack:
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())
                 log.open(folder / "events.jsonl")
-                if not recorder.attach(config.name, folder):
+                port = free_port() if view else None
+                if not recorder.attach(config.name, folder, port):
                     raise Failure(recorder.finish())
+                window = None if port is None else Window(url(port))
+                sources = [recorder.told, *([window.told] if window is not None else [])]
             started = time.monotonic()
-            outcome = _watch(rack, seconds, display)
+            outcome = _watch(rack, seconds, display, lambda: _hear(sources, rack.segment, log))
             wall_s, segment = time.monotonic() - started, rack.segment
         recording = recorder.finish() if recorder is not None else "none"
+        _hear(sources, segment, log)
     skipped = segment.words[System.CLOCK_SKIPPED]
     result = RunResult(config.name, outcome, wall_s, skipped, _counters(segment), recording)
     log.end(result.document())
     return result
 
 
-def _watch(rack: Rack, seconds: float | None, display: Display) -> Outcome:
+def _watch(rack: Rack, seconds: float | None, display: Display, hear: Callable[[], None]) -> Outcome:
     with _stopped_by_signals(rack):
         rack.start(seconds)
         viewer = Viewer(rack.segment)
         while rack.watch(display.period_s):
             display.show(viewer.look())
+            hear()
         display.show(viewer.look())
     if rack.outcome is None:
         raise Failure("the run ended without an outcome")
@@ -108,6 +125,12 @@ def _stopped_by_signals(rack: Rack) -> Iterator[None]:
     finally:
         for number, handler in kept.items():
             signal.signal(number, handler)
+
+
+def _hear(sources: list[Callable[[], list[str]]], segment: Segment, log: EventLog) -> None:
+    """Make events of what the recorder and its viewer have to say."""
+    for text in [text for told in sources for text in told()]:
+        log.add(Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text))
 
 
 @contextmanager

@@ -42,7 +42,7 @@ class ElementalMoveExecutor(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self.params = read_params(ElementalMoveParams, context.params)
+        self._params = read_params(ElementalMoveParams, context.params)
         self._gripper = context.robot.gripper
         self._plans = PlansAtHand()
         self._started = False
@@ -181,7 +181,7 @@ class ElementalMoveExecutor(Executor):
             self._waiting_since = tick
         self._reason = refusal.reason
         waited_s = (tick - self._waiting_since) * self.context.tick_s
-        if refusal.error != Error.NO_PATH or waited_s > self.params.patience:
+        if refusal.error != Error.NO_PATH or waited_s > self._params.patience:
             self._fail(Error(refusal.error), refusal.reason)
 
     def _time_below(self, by_s: float) -> float:
@@ -189,11 +189,11 @@ class ElementalMoveExecutor(Executor):
         if by_s <= 0.0:
             return 0.0
         # A status from below waits up to a cycle to be read, and what is written then shows a cycle later.
-        return by_s - 2.0 * self.context.period_s - self.params.answer
+        return by_s - 2.0 * self.context.period_s - self._params.answer
 
     def _is_shut(self, status: Message) -> bool:
         gripper = self._gripper
-        return gripper is not None and abs(status.opening - gripper.closed) < self.params.grasp_gap
+        return gripper is not None and abs(status.opening - gripper.closed) < self._params.grasp_gap
 
     def _fail(self, error: Error, reason: str) -> None:
         if not self._error:

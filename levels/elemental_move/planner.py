@@ -59,7 +59,7 @@ class ElementalMovePlanner(Planner):
         # mink and OMPL take a second and much memory to import: the process of a planner pays, no other.
         from levels.planning.motion import MotionPlanner
 
-        self.params = read_params(ElementalMoveParams, context.params)
+        self._params = read_params(ElementalMoveParams, context.params)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._published: list[Published] = []
@@ -170,7 +170,7 @@ class ElementalMovePlanner(Planner):
         return refusal.error == Error.NO_PATH and (revision != refusal.revision or tick >= refusal.again_at)
 
     def _note_refusal(self, job: Job, refused: Refused, revision: int, visible_at: int) -> None:
-        again_at = visible_at + round(self.params.retry / self.context.tick_s)
+        again_at = visible_at + round(self._params.retry / self.context.tick_s)
         self._refusal = Refusal(job.move.id, job.request, refused.code, revision, again_at)
         self._tries += 1
         if not job.request:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import mink
 import numpy as np
@@ -120,12 +121,12 @@ class InverseKinematics:
         whole[self._cell.qpos] = q
         self._configuration.update(whole)
 
-    def _bound_joints(self, model: object) -> None:
+    def _bound_joints(self, model: Any) -> None:
         """Give `model` the arm's position limits, a margin inside."""
         limits = self._cell.limits.position
         self._inner_low, self._inner_high = limits[:, 0] + LIMIT_MARGIN_RAD, limits[:, 1] - LIMIT_MARGIN_RAD
         joints = self._cell.model.dof_jntid[self._cell.dof]
         limited = np.isfinite(limits).all(axis=1)
-        model.jnt_limited[joints] = limited  # type: ignore[attr-defined]
-        model.jnt_range[joints[limited], 0] = self._inner_low[limited]  # type: ignore[attr-defined]
-        model.jnt_range[joints[limited], 1] = self._inner_high[limited]  # type: ignore[attr-defined]
+        model.jnt_limited[joints] = limited
+        model.jnt_range[joints[limited], 0] = self._inner_low[limited]
+        model.jnt_range[joints[limited], 1] = self._inner_high[limited]

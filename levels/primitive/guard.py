@@ -45,7 +45,6 @@ class Guard:
         self._clearance = CLEARANCE_PART * scene.clearance
         self._rows, self._objects = len(scene.bodies), len(scene.objects)
         self._by_themselves = (np.arange(self._rows) >= self._objects)[:, None].astype(float)
-        self._lookahead_s = lookahead_s
         self._delay_s = delay_s
         self._spacing_s = lookahead_s / NEAR_CHECKS
         self._phase = 0

@@ -24,7 +24,7 @@ Option = TypeVar("Option")
 TURNS = 8
 """Turns about the tool's z axis that are tried where only its direction is given."""
 WAYS = 16
-"""Ways to do a transfer that are tried to their end."""
+"""Ways to do an action that are tried to their end."""
 HALVINGS = 7
 """Halvings in the search for what is reachable on the way to a place that is not."""
 
@@ -71,11 +71,11 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
         tools = [pose(action.position, pointing(action.direction or DOWN, turn)) for turn in turns]
     motion = rehearsal.motion
     rehearsal.situation.lay_out(motion.checker, None)
-    spots = [Spot(tool, q) for tool in tools for q in motion.ik.solutions(tool, rehearsal.q, motion.checker.free)]
-    if not spots:
+    ends = [(tool, q) for tool in tools for q in motion.ik.solutions(tool, rehearsal.q, motion.checker.free)]
+    if not ends:
         raise _nothing_at(motion, tools, rehearsal.q)
-    spots.sort(key=lambda spot: motion.ik.time_between(rehearsal.q, spot.above))
-    return _first(spots, lambda spot: rehearsal.then(k, Verb.MOVE, spot.tool, joints=spot.above))
+    ends.sort(key=lambda end: motion.ik.time_between(rehearsal.q, end[1]))
+    return _first(ends[:WAYS], lambda end: rehearsal.then(k, Verb.MOVE, end[0], joints=end[1]))
 
 
 def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:

@@ -14,8 +14,7 @@ from levels.messages import Error
 from levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 from levels.planning.situation import Situation
 from levels.task.program import Transfer
-from levels.touches import below as below_body
-from levels.touches import geom_name, geoms_of
+from levels.touches import below, geom_name, geoms_of
 
 Array = NDArray[np.float64]
 
@@ -27,6 +26,8 @@ HEIGHT_STEP_M = 0.01
 SET_DOWN_M = 0.0005
 """Gap between an object and its support when the gripper opens."""
 FARTHEST_M = 10.0
+SKIN_M = 1e-6
+"""A ray that has met the arm goes on this far behind the surface."""
 STANDING_M = 0.02
 """A goal whose height is farther than this from standing on a support is a mistake of the program."""
 
@@ -60,21 +61,30 @@ def standing(cell: Cell, situation: Situation, name: str, row: int, goal: Pose) 
     Raises `Refused` for a goal over no support, or far above or below one.
     """
     model, data = cell.model, _laid_out(cell, situation.with_body(row, goal))
-    geom = np.full(1, -1, dtype=np.int32)
-    body = int(cell.bodies[row])
-    mujoco.mj_ray(model, data, goal.position, np.array(DOWN), None, 1, body, geom)
     x, y, z = goal.position
-    if geom[0] not in cell.supports:
+    support = _geom_below(cell, data, row, goal.position)
+    if support not in cell.supports:
         supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.supports) or "none"
-        below = f"over '{geom_name(model, int(geom[0]))}'" if geom[0] >= 0 else "over nothing"
-        raise Refused(Error.UNREACHABLE, f"at [{x:.3f}, {y:.3f}] '{name}' would be {below}; supports: {supports}")
-    parts = geoms_of(model, below_body(model, cell.bodies[[row]]))
-    gap = min(mujoco.mj_geomDistance(model, data, int(part), int(geom[0]), FARTHEST_M, None) for part in parts)
+        place = f"over '{geom_name(model, support)}'" if support >= 0 else "over nothing"
+        raise Refused(Error.UNREACHABLE, f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}")
+    parts = geoms_of(model, below(model, cell.bodies[[row]]))
+    gap = min(mujoco.mj_geomDistance(model, data, int(part), support, FARTHEST_M, None) for part in parts)
     if abs(gap) > STANDING_M:
         side = "above" if gap > 0 else "deep in"
-        place = f"{abs(gap) * 1e3:.0f} mm {side} '{geom_name(model, int(geom[0]))}'"
+        place = f"{abs(gap) * 1e3:.0f} mm {side} '{geom_name(model, support)}'"
         raise Refused(Error.UNREACHABLE, f"at z = {z:.3f} '{name}' would be {place}; valid z: {z - gap:.3f}")
     return goal.raised(SET_DOWN_M - gap)
+
+
+def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
+    """Return the geom straight below `point` that is neither object `row` nor the arm; -1: there is none."""
+    found, body = np.full(1, -1, dtype=np.int32), int(cell.bodies[row])
+    begin = point.copy()
+    while True:
+        distance = mujoco.mj_ray(cell.model, data, begin, np.array(DOWN), None, 1, body, found)
+        if found[0] not in cell.arm_geoms:
+            return int(found[0])
+        begin[2] -= distance + SKIN_M
 
 
 def _laid_out(cell: Cell, situation: Situation) -> mujoco.MjData:
@@ -91,7 +101,7 @@ def _laid_out(cell: Cell, situation: Situation) -> mujoco.MjData:
 def _top(cell: Cell, situation: Situation, row: int) -> float:
     """Return the height of the highest point of object `row`, from its bounding boxes, in m."""
     model, data = cell.model, _laid_out(cell, situation)
-    parts = geoms_of(model, below_body(model, cell.bodies[[row]]))
+    parts = geoms_of(model, below(model, cell.bodies[[row]]))
     # A box's extent along z: its half sizes, seen along the third row of its rotation.
     vertical = data.geom_xmat[parts].reshape(-1, 3, 3)[:, 2, :]
     centre, half = model.geom_aabb[parts, :3], model.geom_aabb[parts, 3:]

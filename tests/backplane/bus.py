@@ -43,9 +43,11 @@ def mailbox(
     )
 
 
-def task(name: str, every: int = 1, slot: int = 2, role: Role = "executor", depth: int = 16) -> TaskSpec:
+def task(
+    name: str, every: int = 1, slot: int = 2, role: Role = "executor", within_cycles: int = 1, depth: int = 16
+) -> TaskSpec:
     """Return the spec of a task on a board of its own."""
-    return TaskSpec(name, name, role, slot, 0, 0, every, 1, depth)
+    return TaskSpec(name, name, role, slot, 0, 0, every, within_cycles, depth)
 
 
 def layout(rack: str, mailboxes: Iterable[MailboxSpec] = (), tasks: Iterable[TaskSpec] = ()) -> Layout:

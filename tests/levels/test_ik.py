@@ -34,7 +34,8 @@ def test_every_pose_that_some_configuration_has_is_reached_within_the_limits(nam
             reached = ik.tool_at(q)
             assert reached.position == pytest.approx(target.position, abs=1e-4)
             assert reached.angle_to(target) < 1e-4
-            assert np.all(q >= limits[:, 0]) and np.all(q <= limits[:, 1])
+            assert np.all(q >= limits[:, 0])
+            assert np.all(q <= limits[:, 1])
 
 
 def test_solutions_are_distinct_and_the_quickest_to_get_to_comes_first() -> None:
@@ -51,7 +52,8 @@ def test_solutions_leave_out_what_is_not_free() -> None:
     ik, home, target = SOLVERS["puma560"], CELLS["puma560"].home, pose((0.5, -0.2, 0.7), DOWN)
     first = ik.reachable(target, home)[0]
     kept = ik.solutions(target, home, lambda q: not np.allclose(q, first))
-    assert kept and not any(np.allclose(q, first) for q in kept)
+    assert kept
+    assert not any(np.allclose(q, first) for q in kept)
 
 
 def test_pose_out_of_reach_has_no_solution() -> None:
@@ -71,7 +73,8 @@ def test_nearby_stays_on_its_branch_or_finds_nothing() -> None:
     branches = ik.reachable(pose((0.5, -0.2, 0.7), DOWN), home)
     for q in branches:
         near = ik.nearby(pose((0.5, -0.2, 0.72), DOWN), q)
-        assert near is not None and np.max(np.abs(near - q)) < 0.5
+        assert near is not None
+        assert np.max(np.abs(near - q)) < 0.5
     assert ik.nearby(pose((-0.5, 0.2, 0.7), DOWN), branches[0]) is None
 
 

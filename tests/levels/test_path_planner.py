@@ -82,7 +82,8 @@ def test_equal_questions_get_equal_paths_whatever_was_planned_before(
     fresh.plan(sides[1], sides[0], checker.free)
     again = fresh.plan(*sides, checker.free)
     assert again is not None
-    assert np.array_equal(again.waypoints, around.waypoints) and np.array_equal(again.blend, around.blend)
+    assert np.array_equal(again.waypoints, around.waypoints)
+    assert np.array_equal(again.blend, around.blend)
 
 
 def test_another_attempt_takes_other_random_numbers(

@@ -1,27 +1,54 @@
-"""The recorder's process, `python -m tools.recorder`: stdin names rack and folder, and ends when the run is over."""
+"""The recorder's process, `python -m tools.recorder`: stdin names rack and folder, and ends when the run is over.
+
+On stdout it says "recording" once it has attached; every other line is something that the user should know.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from backplane.segment import Segment
 from tools.recorder.recorder import Recorder
+from tools.recorder.side_sink import SideSink, Sink
+
+NICENESS = 10
+"""On a core that it shares, the recorder comes behind boards without real-time priority too."""
 
 
 def main() -> None:
     """Attach to the rack that one line of JSON names, say so on stdout, record until stdin ends."""
-    # Ctrl-C reaches the whole foreground group; the launcher decides when the recording is complete.
+    # Ctrl-C and the like reach the whole foreground group; the launcher decides when the recording is complete.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.nice(NICENESS)
+    with suppress(ImportError):
+        import tools.viewer.sink  # noqa: F401  takes a second: spent while the rack is being launched
     line = sys.stdin.readline()
     if not line:
         return
-    rack, folder = json.loads(line)
-    with Recorder(Segment.attach(rack), Path(folder)) as recorder:
-        print("recording", flush=True)
+    rack, folder, port = json.loads(line)
+    segment = Segment.attach(rack)
+    view = SideSink(lambda: _view(segment, Path(folder), port), _tell)
+    with Recorder(segment, Path(folder), view) as recorder:
+        _tell("recording")
         recorder.follow(until=sys.stdin.fileno())
+
+
+def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
+    from tools.viewer.sink import ViewSink
+
+    return ViewSink(segment, folder, port)
+
+
+def _tell(text: str) -> None:
+    # Nobody may listen any more; the files are finished all the same.
+    with suppress(OSError):
+        print(text, flush=True)
 
 
 if __name__ == "__main__":

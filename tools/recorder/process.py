@@ -7,6 +7,7 @@ import os
 import select
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -26,27 +27,61 @@ class RecorderProcess:
             env={**os.environ, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])},
         )
         self._printed = b""
+        self._unread = b""
+        self._lines: list[str] = []
+        self._end_is_told = False
 
-    def attach(self, rack: str, folder: Path) -> bool:
-        """Have it record that rack into that folder; False when it cannot."""
-        stdin, stdout = self._process.stdin, self._process.stdout
-        if stdin is None or stdout is None:
+    @property
+    def pid(self) -> int:
+        """Process id of the recorder."""
+        return self._process.pid
+
+    def attach(self, rack: str, folder: Path, port: int | None = None) -> bool:
+        """Have it record that rack into that folder, and serve a viewer on that port; False when it cannot."""
+        stdin = self._process.stdin
+        if stdin is None:
             return False
         try:
-            stdin.write(json.dumps([rack, str(folder)]).encode() + b"\n")
+            stdin.write(json.dumps([rack, str(folder), port]).encode() + b"\n")
             stdin.flush()
         except BrokenPipeError:
             return False
-        return bool(select.select([stdout], [], [], ATTACH_S)[0]) and stdout.readline().strip() == b"recording"
+        deadline = time.monotonic() + ATTACH_S
+        while "recording" not in self._lines:
+            if not self._read(deadline - time.monotonic()):
+                return False
+        self._lines.remove("recording")
+        return True
+
+    def told(self) -> list[str]:
+        """Return what the user should know of the recorder since the last call; its early end, too."""
+        while self._process.returncode is None and self._read(0.0):
+            continue
+        lines, self._lines = self._lines, []
+        if self._process.returncode is None and self._process.poll() is not None and not self._end_is_told:
+            self._end_is_told = True
+            lines.append(f"the recorder ended with status {self._process.returncode}; the rack runs on, unrecorded")
+        return lines
 
     def finish(self) -> str:
         """Let it take over what is left and finish its files; return "complete", or why the recording is not."""
-        if self._process.returncode is None:
+        if not self._printed and self._process.stdin is not None and not self._process.stdin.closed:
             try:
-                self._printed = self._process.communicate(timeout=FINISH_S)[1]
+                rest, self._printed = self._process.communicate(timeout=FINISH_S)
+                self._lines += (self._unread + rest).decode(errors="replace").splitlines()
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.communicate()
         status = self._process.returncode
         last = self._printed.decode(errors="replace").strip().splitlines()[-1:]
         return "complete" if status == 0 else ": ".join([f"the recorder ended with status {status}", *last])
+
+    def _read(self, timeout_s: float) -> bool:
+        """Take what it has printed; False when there is nothing within the time, or its output has ended."""
+        stdout = self._process.stdout
+        if stdout is None or not select.select([stdout], [], [], max(0.0, timeout_s))[0]:
+            return False
+        block = os.read(stdout.fileno(), 1 << 16)
+        *lines, self._unread = (self._unread + block).split(b"\n")
+        self._lines += [line.decode(errors="replace") for line in lines]
+        return bool(block)

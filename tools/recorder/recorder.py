@@ -14,6 +14,7 @@ from backplane.segment import Segment
 from backplane.trace import trace_ring
 from backplane.words import Run, System
 from tools.recorder.cycles import CyclesFile
+from tools.recorder.side_sink import Sink
 from tools.recorder.signals import SignalsFile
 
 REALTIME_S = 0.05
@@ -24,11 +25,12 @@ LOCKSTEP_S = 0.005
 class Recorder:
     """Records one rack into `folder`. Use it as a context: leaving it finishes the files.
 
-    The first recorder of a rack in lockstep is its follower: the clock waits for it.
+    The first recorder of a rack in lockstep is its follower: the clock waits for it. `beside` takes the same rows.
     """
 
-    def __init__(self, segment: Segment, folder: Path) -> None:
+    def __init__(self, segment: Segment, folder: Path, beside: Sink | None = None) -> None:
         layout = segment.layout
+        self._beside = beside
         self._segment, self._words = segment, segment.words
         self._traces = {task.name: trace_ring(segment, task.name) for task in layout.tasks}
         self._mailboxes = {mailbox.name: mailbox_ring(segment, mailbox.name) for mailbox in layout.mailboxes}
@@ -53,10 +55,16 @@ class Recorder:
             rows, lost = ring.drain()
             self._cycles.add(task, rows)
             self._lost[task] += lost
+            if self._beside is not None:
+                self._beside.add_cycles(task, rows)
         for mailbox, ring in self._mailboxes.items():
             rows, lost = ring.drain()
             self._signals.add(mailbox, rows)
             self._lost[mailbox] += lost
+            if self._beside is not None:
+                self._beside.add_signals(mailbox, rows)
+        if self._beside is not None:
+            self._beside.advance(tick, self._lost)
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = tick
 
@@ -76,3 +84,5 @@ class Recorder:
             self._words[System.FOLLOWER_PID] = 0
         self._cycles.close({task: self._lost[task] for task in self._traces})
         self._signals.close({mailbox: self._lost[mailbox] for mailbox in self._mailboxes})
+        if self._beside is not None:
+            self._beside.close(self._words[System.TICK] + 1, self._lost)

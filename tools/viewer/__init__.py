@@ -1,4 +1,5 @@
 """The view of a run: everything a rack wrote, as a recording for the rerun viewer.
 
-It imports rerun, whose threads no board may share: only the recorder's process, and tools that read, import this package.
+It imports rerun, whose threads no board may share: only the recorder's process,
+and tools that read a recording, import it.
 """

@@ -24,7 +24,8 @@ class Fields:
         self._lanes = {field.name: (SIGNALS, mailbox.name, field.name) for field in self._fields}
         for field in self._fields:
             unit = "" if field.unit in ("", "1") else f", {field.unit}"
-            curves = [f"{field.name}[{at}]{unit}" for at in range(prod(field.shape))] if field.shape else [f"{field.name}{unit}"]
+            places = [f"[{at}]" for at in range(prod(field.shape))] if field.shape else [""]
+            curves = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
             stream.static(self._lanes[field.name], rr.SeriesLines(names=curves))
 
     def write(self, block: Block) -> None:

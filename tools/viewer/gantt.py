@@ -15,6 +15,11 @@ BOARDS = "boards"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
 
 
+def lane_of(task: TaskSpec) -> tuple[str, ...]:
+    """Return the lane of a task; lanes stand in the order of slots."""
+    return (BOARDS, f"{task.slot}-{task.board}", task.role)
+
+
 class Gantt:
     """Writes trace records as spans: read, process or plan, write, wait. What was missed is red.
 
@@ -24,11 +29,11 @@ class Gantt:
 
     def __init__(self, stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> None:
         self._stream, self._speed = stream, speed
-        self._lane = (BOARDS, task.board, task.role)
+        self._lane = lane_of(task)
         last_ns = task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS)
         self._last_ns = last_ns if lockstep else np.iinfo(np.int64).max
         self._work = "process" if task.role == "executor" else "plan"
-        style_lane(stream, self._lane, PHASES)
+        style_lane(stream, self._lane, PHASES, quiet=["wait"])
 
     def write(self, block: Block) -> None:
         """Write four spans a cycle."""

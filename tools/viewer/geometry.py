@@ -42,7 +42,7 @@ def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -
     for body in set(range(1, model.nbody)) - set(moving_bodies(model).tolist()):
         pose = rr.Transform3D(
             translation=data.xpos[body],
-            quaternion=xyzw(data.xquat[body]),
+            quaternion=rr.Quaternion(xyzw=xyzw(data.xquat[body])),
             parent_frame=WORLD,
             child_frame=frame_of(model, body),
         )

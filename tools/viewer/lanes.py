@@ -11,10 +11,14 @@ from tools.viewer.palette import Colour
 from tools.viewer.stream import Stream
 
 
-def style_lane(stream: Stream, entity: Sequence[str], colours: Mapping[str, Colour]) -> None:
-    """Give the states of a lane their colours; others take what the viewer picks."""
+def style_lane(stream: Stream, entity: Sequence[str], colours: Mapping[str, Colour], quiet: Sequence[str] = ()) -> None:
+    """Give the states of a lane their colours, and all but the `quiet` ones their names.
+
+    A state that is not named here takes what the viewer picks.
+    """
     names = list(colours)
-    stream.static(entity, rr.StateConfiguration(values=names, labels=names, colors=list(colours.values())))
+    labels = [" " if name in quiet else name for name in names]
+    stream.static(entity, rr.StateConfiguration(values=names, labels=labels, colors=list(colours.values())))
 
 
 def write_spans(stream: Stream, entity: Sequence[str], times: list[rr.TimeColumn], states: Sequence[str]) -> None:
@@ -27,7 +31,10 @@ def write_span(stream: Stream, tick: int, stamp_ns: int, entity: Sequence[str], 
     stream.at(tick, stamp_ns, entity, rr.StateChange(state=state))
 
 
-def lanes_view(name: str, contents: Sequence[str]) -> rrb.View:
-    """Return a view of lanes, on the time axis that all views share."""
+def lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:
+    """Return a view of lanes: all of the run, or what lies within `around_s` of the time that is looked at."""
     axis = rrb.TimeAxis(link="LinkToGlobal")
+    if around_s is not None:
+        begin, end = (rrb.TimeRangeBoundary.cursor_relative(seconds=at) for at in (-around_s, around_s))
+        axis = rrb.TimeAxis(link="Independent", view_range=rrb.TimeRange(start=begin, end=end))
     return rrb.StateTimelineView(origin="/", contents=list(contents), name=name, time_view=axis)

@@ -21,7 +21,7 @@ class Load:
         self._slice_ns = task.every * task.within_cycles * period_ns
         curves = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
         stream.static((TIMES, task.name), rr.SeriesLines(names=curves, colors=[of_joint(1), of_joint(0), LIMIT]))
-        stream.static((LOAD, task.name), rr.SeriesLines(names=[f"{task.name}, % of its slice"]))
+        stream.static((LOAD, task.name), rr.SeriesLines(names=[f"{task.name}, %"]))
 
     def write(self, block: Block) -> None:
         """Write every cycle; 100 % is the deadline."""

@@ -28,6 +28,16 @@ STATES: dict[str, Colour] = {
     "missed": (240, 140, 30, 255),
     "lost": (120, 20, 20, 255),
 }
+EVENTS: dict[str, Colour] = {
+    "launch": (110, 110, 120, 255),
+    "ready": (110, 110, 120, 255),
+    "start": (70, 140, 230, 255),
+    "stop": (240, 140, 30, 255),
+    "end": (70, 180, 90, 255),
+    "died": (220, 50, 50, 255),
+    "hang": (220, 50, 50, 255),
+}
+"""Of a kind that is not here the viewer picks a colour."""
 PHASES: dict[str, Colour] = {
     "wait": (60, 62, 70, 255),
     "read": (90, 170, 220, 255),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -13,7 +14,7 @@ Floats = NDArray[np.float64]
 Shape = Callable[[mujoco.MjModel, int], rr.AsComponents]
 
 Geom = mujoco.mjtGeom
-SOLID = "solid"
+SOLID: Final = "solid"
 
 
 def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
@@ -26,7 +27,7 @@ def colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
     """Return red, green, blue, alpha of a geom, 0 to 255: its material's, where it has one."""
     material = model.geom_matid[geom]
     rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-    return np.round(rgba * 255).astype(np.uint8)
+    return np.asarray(np.round(rgba * 255), dtype=np.uint8)
 
 
 def xyzw(quaternions: Floats) -> Floats:
@@ -134,7 +135,7 @@ def placed(model: mujoco.MjModel, geom: int, points: Floats) -> Floats:
     return np.asarray(model.geom_pos[geom] + points @ rotation.reshape(3, 3).T)
 
 
-SHAPES: dict[Geom, Shape] = {
+SHAPES: dict[mujoco.mjtGeom, Shape] = {
     Geom.mjGEOM_PLANE: _plane,
     Geom.mjGEOM_HFIELD: _height_field,
     Geom.mjGEOM_SPHERE: _sphere,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,7 +27,7 @@ class Stream:
 
     def __init__(self, name: str, file: Path, times: Timelines, blueprint: rrb.Blueprint, port: int | None) -> None:
         self.times = times
-        self._recording = rr.RecordingStream(APPLICATION, recording_id=name)
+        self._recording = rr.RecordingStream(APPLICATION, recording_id=f"{name}-{time.time_ns()}")
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
         sinks: list[rr.FileSink | rr.GrpcServerSink] = [rr.FileSink(str(file))]

@@ -43,9 +43,7 @@ class Timelines:
 
     def moment(self, tick: int, stamp_ns: int) -> Moment:
         """Return one moment on the timelines."""
-        return Moment(
-            np.timedelta64(tick * self.clock_ns, "ns"), np.datetime64(stamp_ns + self._offset_ns, "ns")
-        )
+        return Moment(np.timedelta64(tick * self.clock_ns, "ns"), np.datetime64(stamp_ns + self._offset_ns, "ns"))
 
     def learn(self, ticks: Ints, stamps_ns: Ints) -> None:
         """Take down when ticks happened; both are sorted."""
@@ -57,7 +55,7 @@ class Timelines:
         """Return about when ticks happened, CLOCK_MONOTONIC, ns."""
         # From the newest on, so that nothing is lost to the 53 bits of a float.
         last = self._stamps[-1]
-        return last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64)
+        return np.asarray(last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64))
 
     def monotonic(self, time_ns: int) -> int:
         """Return a CLOCK_REALTIME stamp as CLOCK_MONOTONIC."""

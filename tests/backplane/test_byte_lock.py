@@ -1,0 +1,54 @@
+"""The kernel's lock on a byte: exclusive, at once or not at all, gone with its process."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from backplane.byte_lock import ByteLock
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, descriptors, forked, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+ADDRESS = 24
+
+
+def test_two_holders_in_one_process_exclude_each_other(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    first, second = ByteLock(segment, ADDRESS), ByteLock(segment, ADDRESS)
+    assert first.take()
+    assert not second.take()
+    first.give_back()
+    assert second.take()
+
+
+def test_neighbouring_bytes_are_locks_of_their_own(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    locks = [ByteLock(segment, ADDRESS + i) for i in range(3)]
+    assert all(lock.take() for lock in locks)
+
+
+def test_a_closed_lock_is_free_and_leaves_no_file_open(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    before = descriptors()
+    first = ByteLock(segment, ADDRESS)
+    first.take()
+    first.close()
+    assert descriptors() == before
+    assert ByteLock(segment, ADDRESS).take()
+
+
+def test_a_lock_ends_with_its_process(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    mine = ByteLock(segment, ADDRESS)
+
+    def hold() -> None:
+        ByteLock(segment, ADDRESS).take()
+        segment.words[ADDRESS] = 1
+        time.sleep(60)
+
+    with forked(hold):
+        wait_until(lambda: segment.words[ADDRESS])
+        assert not mine.take()
+    assert mine.take()

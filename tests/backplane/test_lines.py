@@ -1,0 +1,40 @@
+"""The utility lines: SYSFAIL by slot, and the lines that one word holds."""
+
+from __future__ import annotations
+
+import pytest
+
+from backplane.lines import UtilityLines
+from backplane.segment import Segment
+from backplane.words import System
+from tests.backplane.bus import task
+from tests.backplane.conftest import MakeBus
+
+
+@pytest.fixture
+def bus(make_bus: MakeBus) -> Segment:
+    return make_bus(task("low", slot=21), task("high", slot=2), task("high.planner", slot=2))
+
+
+def test_a_board_holds_sysfail_until_its_self_test_has_passed(bus: Segment) -> None:
+    lines = UtilityLines(bus)
+    assert lines.sysfail == [2, 21]
+    lines.release_sysfail(2)
+    assert UtilityLines(Segment.attach(bus.rack)).sysfail == [21]
+    lines.release_sysfail(21)
+    assert lines.sysfail == []
+
+
+def test_a_board_that_fails_holds_sysfail_again(bus: Segment) -> None:
+    lines = UtilityLines(bus)
+    for slot in (2, 21):
+        lines.release_sysfail(slot)
+    lines.assert_sysfail(21)
+    assert lines.sysfail == [21]
+
+
+@pytest.mark.parametrize("line", ["acfail", "sysreset", "emergency_stop"])
+def test_each_line_has_its_own_word(bus: Segment, line: str) -> None:
+    lines, names = UtilityLines(bus), ("acfail", "sysreset", "emergency_stop")
+    bus.words[System[line.upper()]] = 1
+    assert [name for name in names if getattr(lines, name)] == [line]

@@ -1,0 +1,105 @@
+"""Rings read in blocks: nothing lost in time, and an exact count of what was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from backplane.mailbox import Writer
+from backplane.protocols import open_writer
+from backplane.ring import Ring, mailbox_ring
+from backplane.segment import Segment
+from tests.backplane.bus import NAME, mailbox
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, fork, kill, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+DEPTH = 16
+
+
+@pytest.fixture
+def bus(make_bus: MakeBus) -> Segment:
+    return make_bus(mailbox(depth=DEPTH))
+
+
+def write(writer: Writer, count: int) -> None:
+    for _ in range(count):
+        serial = writer.serial + 1
+        writer.message.id = serial
+        writer.message.row[:] = serial
+        writer.write(10 * serial)
+
+
+def serials(ring: Ring) -> tuple[list[int], int]:
+    """Return the serials of the rows drained, and how many were lost."""
+    rows, lost = ring.drain()
+    assert (rows["message"]["id"] == rows["serial"]).all()
+    return rows["serial"].tolist(), lost
+
+
+def test_rows_come_in_order_and_once(bus: Segment) -> None:
+    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    assert serials(ring) == ([], 0)
+    for first in range(1, 100, 11):
+        write(writer, 11)
+        assert ring.waiting == 11
+        assert serials(ring) == (list(range(first, first + 11)), 0)
+        assert ring.waiting == 0
+    assert serials(ring) == ([], 0)
+
+
+def test_a_row_carries_its_messages_head(bus: Segment) -> None:
+    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    writer.write(7, basis=3)
+    row = ring.drain().rows[0]
+    assert [row[word] for word in ("serial", "tick", "visible_at", "basis", "epoch")] == [1, 7, 8, 3, 1]
+
+
+@pytest.mark.parametrize("written", [DEPTH - 1, DEPTH, DEPTH + 1, 3 * DEPTH + 5])
+def test_lost_rows_are_counted_exactly(bus: Segment, written: int) -> None:
+    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    write(writer, 3)
+    ring.drain()
+    write(writer, written)
+    found, lost = serials(ring)
+    # One slot is the writer's: what lies in it may be half a message.
+    assert found == list(range(3 + written - len(found) + 1, 3 + written + 1))
+    assert len(found) == min(written, DEPTH - 1)
+    assert lost == written - len(found)
+
+
+def test_rows_taken_are_copies(bus: Segment) -> None:
+    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    write(writer, 1)
+    rows = ring.drain().rows
+    write(writer, 3 * DEPTH)
+    assert rows["serial"].tolist() == [1]
+
+
+def test_a_second_reader_loses_nothing_by_the_first(bus: Segment) -> None:
+    writer, first, second = open_writer(bus, NAME), mailbox_ring(bus, NAME), mailbox_ring(bus, NAME)
+    write(writer, 5)
+    assert serials(first) == serials(second) == ([1, 2, 3, 4, 5], 0)
+
+
+def hammer(segment: Segment) -> None:
+    writer = open_writer(segment, NAME)
+    while True:
+        write(writer, 1)
+
+
+def test_every_row_is_whole_or_counted_beside_a_hammering_writer(bus: Segment) -> None:
+    ring, taken, lost = mailbox_ring(bus, NAME), 0, 0
+    writer = fork(lambda: hammer(bus))
+    try:
+        while taken < 20_000:
+            wait_until(lambda: ring.waiting)
+            rows, missing = ring.drain()
+            whole = rows["message"]["row"] == rows["serial"][:, np.newaxis]
+            assert whole.all()
+            assert (np.diff(rows["serial"]) == 1).all()
+            taken, lost = taken + len(rows), lost + missing
+    finally:
+        kill(writer)
+    rows, missing = ring.drain()
+    assert taken + len(rows) + lost + missing == mailbox_ring(bus, NAME).waiting

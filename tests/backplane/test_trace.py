@@ -1,0 +1,50 @@
+"""Trace rings: one record a cycle, as its task wrote it."""
+
+from __future__ import annotations
+
+from backplane.trace import FIELDS, TraceWriter, trace_ring
+from tests.backplane.bus import task
+from tests.backplane.conftest import MakeBus
+
+DEPTH = 16
+
+
+def trace(writer: TraceWriter, ticks: range) -> None:
+    for tick in ticks:
+        for at in range(len(FIELDS)):
+            writer.record[at] = 100 * tick + at
+        writer.write()
+
+
+def test_records_are_read_as_they_were_written(make_bus: MakeBus) -> None:
+    segment = make_bus(task("writer", depth=DEPTH))
+    writer, ring = TraceWriter(segment, "writer"), trace_ring(segment, "writer")
+    trace(writer, range(1, 6))
+    rows, lost = ring.drain()
+    assert lost == 0
+    assert [row.tolist() for row in rows] == [tuple(100 * t + at for at in range(len(FIELDS))) for t in range(1, 6)]
+
+
+def test_a_task_that_nobody_reads_goes_on_and_its_reader_knows_what_it_lost(make_bus: MakeBus) -> None:
+    segment = make_bus(task("writer", depth=DEPTH))
+    writer, ring = TraceWriter(segment, "writer"), trace_ring(segment, "writer")
+    trace(writer, range(100))
+    rows, lost = ring.drain()
+    assert (rows["tick"] // 100).tolist() == list(range(100 - len(rows), 100))
+    assert len(rows) + lost == 100
+
+
+def test_a_restarted_task_goes_on_in_its_ring(make_bus: MakeBus) -> None:
+    segment = make_bus(task("writer", depth=DEPTH))
+    ring = trace_ring(segment, "writer")
+    trace(TraceWriter(segment, "writer"), range(3))
+    trace(TraceWriter(segment, "writer"), range(3, 5))
+    assert (ring.drain().rows["tick"] // 100).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_tasks_have_rings_of_their_own(make_bus: MakeBus) -> None:
+    segment = make_bus(task("writer"), task("reader", slot=3))
+    trace(TraceWriter(segment, "writer"), range(2))
+    trace(TraceWriter(segment, "reader"), range(5, 6))
+    rings = [trace_ring(segment, name).drain().rows["tick"].tolist() for name in ("writer", "reader")]
+    assert rings == [[0, 100], [500]]

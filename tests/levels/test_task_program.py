@@ -1,0 +1,92 @@
+"""The `[task]` table: what it may say, and the one line for each mistake."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+import pytest
+
+from levels.errors import ProgramError
+from levels.task.program import Goto, Home, TaskConfig, Transfer, read_program
+from tests.levels.arms import ROBOTS, config
+
+PUMA, SCENE = config("puma560")
+TASKS = ROBOTS.parent / "tasks"
+
+
+def read(*actions: dict[str, Any]) -> TaskConfig:
+    return read_program({"action": list(actions)}, PUMA, SCENE)
+
+
+def mistake(*actions: dict[str, Any]) -> str:
+    with pytest.raises(ProgramError) as caught:
+        read(*actions)
+    return str(caught.value)
+
+
+def test_actions_of_every_kind_are_read() -> None:
+    transfer, pose, joints, home = read(
+        {"do": "transfer", "object": "peg", "to": [0.5, 0.3, 0.5], "yaw": 1.0, "by": 30},
+        {"do": "goto", "position": [0.5, 0.2, 0.7], "direction": [0, 0, -1]},
+        {"do": "goto", "joints": [0, 0, 0, 0, 0, 0]},
+        {"do": "home"},
+    ).action
+    assert isinstance(transfer, Transfer)
+    assert transfer.by == 30.0
+    assert isinstance(pose, Goto)
+    assert pose.position == (0.5, 0.2, 0.7)
+    assert isinstance(joints, Goto)
+    assert joints.joints == (0.0,) * 6
+    assert isinstance(home, Home)
+
+
+@pytest.mark.parametrize(
+    ("task", "robot"),
+    [("around-the-wall", "puma560"), ("around-the-wall", "puma560_crossing"), ("k1607-tour", "k1607")],
+)
+def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> None:
+    table = tomllib.loads((TASKS / f"{task}.toml").read_text())["task"]
+    assert read_program(table, *config(robot)).action
+
+
+@pytest.mark.parametrize(
+    ("action", "line"),
+    [
+        ({"do": "fly"}, "task.action.0.do = 'fly': valid: transfer, goto, home"),
+        ({"object": "peg"}, "task.action.0.do: valid: transfer, goto, home"),
+        (
+            {"do": "transfer", "object": "cup", "to": [0.5, 0.3, 0.5]},
+            "task.action.0.object = 'cup': not in the scene; objects: block1, block2, peg",
+        ),
+        ({"do": "transfer", "object": "peg"}, "task.action.0.to: field required"),
+        ({"do": "home", "by": 0}, "task.action.0.by = 0: input should be greater than 0"),
+        ({"do": "home", "speed": 2}, "task.action.0.speed = 2: extra inputs are not permitted"),
+        ({"do": "goto"}, "task.action.0: a goto has either position or joints"),
+        ({"do": "goto", "joints": [0, 0]}, "task.action.0.joints: 2 values; valid: 6, one a joint"),
+        (
+            {"do": "goto", "position": [0, 0, 1], "direction": [0, 0, 0]},
+            "task.action.0: direction is all zero; its length must not be zero",
+        ),
+        (
+            {"do": "goto", "position": [0, 0, float("nan")]},
+            "task.action.0.position.2 = nan: input should be a finite number",
+        ),
+    ],
+)
+def test_each_mistake_is_one_line_with_place_value_and_what_is_valid(action: dict[str, Any], line: str) -> None:
+    assert mistake(action) == line
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    assert len(mistake({"do": "fly"}, {"do": "home", "by": -1}, {"do": "goto"}).splitlines()) == 3
+
+
+def test_transfer_needs_a_gripper() -> None:
+    robot, scene = config("k1607")
+    with pytest.raises(ProgramError, match="the robot has no gripper; valid: goto, home"):
+        read_program({"action": [{"do": "transfer", "object": "peg", "to": [0, 0, 0]}]}, robot, scene)
+
+
+def test_table_without_actions_is_an_empty_program() -> None:
+    assert read_program({}, PUMA, SCENE).action == ()

@@ -1,0 +1,73 @@
+"""A rack of the project in one process, straight from its config."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Any
+
+from backplane.message import Message, State
+from boards.config import RackConfig, load
+from levels.scene import MotionConfig
+from tests.levels.arms import config as arm_config
+from tests.levels.lockstep import BoardSpec, Lockstep
+
+
+class WholeRack(Lockstep):
+    """All boards of config `name`; with `arm`, on another arm and cell, with `actions` another program."""
+
+    def __init__(
+        self,
+        name: str = "nasrem",
+        arm: str | None = None,
+        actions: Sequence[Mapping[str, Any]] | None = None,
+        motion: Sequence[MotionConfig] = (),
+        params: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        config = load(name)
+        robot, scene = arm_config(arm) if arm is not None else (config.robot, config.scene)
+        assert robot is not None
+        task = config.task if actions is None else {"action": list(actions)}
+        boards = [board(config, name, (params or {}).get(name, {})) for name in config.board]
+        super().__init__(boards, robot, scene.model_copy(update={"motion": tuple(motion)}), task, config.seed)
+
+    @property
+    def task(self) -> Message:
+        """The task level's status."""
+        return self.read("task.status")
+
+    @property
+    def move(self) -> Message:
+        """The elemental move level's status."""
+        return self.read("elemental_move.status")
+
+    @property
+    def primitive(self) -> Message:
+        """The primitive level's status."""
+        return self.read("primitive.status")
+
+    def run_to_end(self, most_s: float) -> Message:
+        """Run until the task is done or has failed, at most `most_s` simulated seconds; return its status."""
+        self.run(most_s, lambda rack: rack.read("task.status").state in (State.DONE, State.ERROR))
+        return self.task
+
+
+def board(config: RackConfig, name: str, params: Mapping[str, Any]) -> BoardSpec:
+    """Return what a test's rack needs of a board's config."""
+    table = config.board[name]
+    return BoardSpec(
+        name=name,
+        every=config.every(name),
+        executor=named(table.executor),
+        planner=named(table.planner) if table.planner is not None else None,
+        within_cycles=table.within_cycles,
+        above=table.above or "",
+        below=table.below or "",
+        params={**table.params, **params},
+    )
+
+
+def named(place: str) -> Any:
+    """Return the class at "package.module:Class"."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)

@@ -1,0 +1,95 @@
+"""The hierarchy of boards as a graph, coloured by what each is at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+
+import numpy as np
+import rerun as rr
+
+from backplane.layout import Layout
+from backplane.message import State
+from backplane.trace import Flag
+from tools.viewer.blocks import Block
+from tools.viewer.palette import STATES
+from tools.viewer.stream import Stream
+
+HIERARCHY = "hierarchy"
+ROW, COLUMN = 45.0, 110.0
+"""From node to node, in the graph's units: about the width of a letter is 7."""
+
+
+class Hierarchy:
+    """Writes the tasks as nodes, levels above each other, whenever the state of one changes.
+
+    Edges go down with commands and from planners with plans; a board outside the hierarchy stands beside it.
+    """
+
+    def __init__(self, stream: Stream, layout: Layout, levels: tuple[str, ...]) -> None:
+        self._stream = stream
+        self._tasks = [task.name for task in layout.tasks]
+        self._states = dict.fromkeys(self._tasks, "idle")
+        self._positions = positions(layout, levels)
+        self._changes: list[tuple[int, int, str, str]] = []
+        downward = list(pairwise(levels))
+        plans = [(task.name, task.board) for task in layout.tasks if task.role == "planner"]
+        stream.static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
+        self._log(0, int(stream.times.stamps_of(np.zeros(1, dtype=np.int64))[0]))
+
+    def write(self, task: str, block: Block) -> None:
+        """Take down where a task's state changes."""
+        names = _names(block.rows)
+        before = np.concatenate(([self._states[task]], names[:-1]))
+        for row in np.flatnonzero(names != before):
+            self._changes.append((int(block.ticks[row]), int(block.stamps_ns[row]), task, str(names[row])))
+        self._states[task] = str(names[-1])
+
+    def lose(self, tick: int, stamp_ns: int, board: str) -> None:
+        """Take down that a board ended or hangs."""
+        if board in self._states:
+            self._changes.append((tick, stamp_ns, board, "lost"))
+            self._states[board] = "lost"
+
+    def advance(self) -> None:
+        """Write what has been taken down, in the order of time."""
+        if not self._changes:
+            return
+        shown = dict(self._shown)
+        for tick, stamp_ns, task, state in sorted(self._changes):
+            shown[task] = state
+            self._log(tick, stamp_ns, shown)
+        self._changes.clear()
+
+    def _log(self, tick: int, stamp_ns: int, states: Mapping[str, str] | None = None) -> None:
+        self._shown = dict(states or self._states)
+        nodes = rr.GraphNodes(
+            self._tasks,
+            positions=[self._positions[task] for task in self._tasks],
+            colors=[STATES[self._shown[task]] for task in self._tasks],
+            labels=[_label(task) for task in self._tasks],
+        )
+        self._stream.at(tick, stamp_ns, (HIERARCHY,), nodes)
+
+
+def _label(task: str) -> str:
+    """Return what stands in a task's node: a planner stands beside its board's."""
+    return task.partition(".")[2] or task
+
+
+def _names(rows: np.ndarray) -> np.ndarray:
+    """Return what to show of each trace record: the level's state, or that the cycle was missed."""
+    names = np.array([state.name.lower() for state in State] + ["missed"])
+    shown = np.where((rows["flags"] & Flag.MISSED) > 0, len(names) - 1, rows["state"])
+    return np.asarray(names[shown])
+
+
+def positions(layout: Layout, levels: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Return where the tasks stand: levels in the middle, their planners to the right, other boards to the left."""
+    others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in levels]
+    rows = {board: row for row, board in enumerate(levels)} | {board: row for row, board in enumerate(others)}
+    columns = dict.fromkeys(levels, 0) | dict.fromkeys(others, -1)
+    return {
+        task.name: ((columns[task.board] + (task.role == "planner")) * COLUMN, rows[task.board] * ROW)
+        for task in layout.tasks
+    }
