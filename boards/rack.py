@@ -56,11 +56,7 @@ class Rack:
         return cls(load(str(name_or_path), overrides))
 
     def __enter__(self) -> Self:
-        try:
-            self.launch()
-        except BaseException:
-            self.close()
-            raise
+        self.launch()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -69,8 +65,16 @@ class Rack:
     def launch(self) -> None:
         """Power on every board but the clock, and wait until all have passed their self-tests.
 
-        Raises `ConfigError`, `SegmentError` when the name is in use, `LaunchError` when a board fails.
+        Raises `ConfigError`, `SegmentError` when the name is in use, `LaunchError` when a board fails; nothing is
+        left then.
         """
+        try:
+            self._power_on()
+        except BaseException:
+            self.close()
+            raise
+
+    def _power_on(self) -> None:
         self._crate = crate = CrateLine()
         # The crate imports while the config is being wired: on two cores that is half a second saved.
         crate.send(Preload(modules(self.config), tuple(sys.path)))
@@ -152,7 +156,7 @@ class Rack:
                 self._pids[name] = pid
             case Ended(name, _, status):
                 self._pids.pop(name, None)
-                if status != 0 and self.outcome is None:
+                if self.outcome is None and (status != 0 or self.segment.words[System.STATE] != Run.STOPPED):
                     self._lose("died", name, f"board '{name}' ended: {_status(status)}")
             case None:
                 self._lose("died", "crate", "the crate ended, and every board with it")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from levels import cell_index
 from levels.errors import RobotError
+from levels.gripper import set_opening
 from levels.limits import Bounds, Limits, joint_bounds, planned_limits
 from levels.mjcf import compile_spec, load_spec
 from levels.motors import fit_gripper, fit_motors, listed
@@ -178,20 +179,10 @@ def index(
 
 def start_qpos(cell: Cell) -> NDArray[np.float64]:
     """Return qpos of the start: arm at home, gripper and the fingers geared to it open, the rest as in the model."""
-    m = cell.model
-    qpos = np.array(m.qpos0)
+    qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = cell.home
-    if cell.gripper_qpos is None:
-        return qpos
-    qpos[cell.gripper_qpos] = cell.gripper_open
-    for k in np.flatnonzero((m.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (m.eq_obj2id >= 0)):
-        first, second = m.jnt_qposadr[m.eq_obj1id[k]], m.jnt_qposadr[m.eq_obj2id[k]]
-        if second == cell.gripper_qpos:
-            travel = qpos[second] - m.qpos0[second]
-            qpos[first] = m.qpos0[first] + np.polynomial.polynomial.polyval(travel, m.eq_data[k, :5])
-        elif first == cell.gripper_qpos and m.eq_data[k, 1]:
-            travel = qpos[first] - m.qpos0[first]
-            qpos[second] = m.qpos0[second] + (travel - m.eq_data[k, 0]) / m.eq_data[k, 1]
+    if cell.gripper_qpos is not None and cell.gripper_open is not None:
+        set_opening(cell.model, qpos, cell.gripper_qpos, cell.gripper_open)
     return qpos
 
 

@@ -71,7 +71,7 @@ ELEMENTAL_MOVE = MessageType(
         Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
         Field("position", "f8", "m", "tool position at the end", (3,)),
         Field("quaternion", "f8", "1", "tool orientation at the end", (4,)),
-        Field("joints", "f8", "rad", "joint positions at the end, for MOVE_JOINTS; with `posture`, near the end", ("joints",)),
+        Field("joints", "f8", "rad", "where MOVE_JOINTS ends; with `posture`, near the end", ("joints",)),
         Field("posture", "u1", "1", "1: of the configurations at the pose, the one nearest to `joints` is wanted"),
         Field("by", "f8", "s", "simulated time by which it must be done; 0: no such time"),
     ),
@@ -115,7 +115,7 @@ MOVE_STATUS = status(
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
     Field("planned", "u4", "1", "newest elemental move whose path is at hand; 0: none yet"),
     Field("end", "f8", "rad", "joint positions at the end of that path", ("joints",)),
-    Field("replan", "u4", "1", "serial of the open request to plan the current move anew from `start`; 0: none is open"),
+    Field("replan", "u4", "1", "open request to plan the current move anew from `start`; 0: none is open"),
     Field("start", "f8", "rad", "joint positions where that motion holds", ("joints",)),
     Field("replans", "u4", "1", "plans made anew because something was in the way"),
 )

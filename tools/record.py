@@ -37,9 +37,9 @@ def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = 
     beside = SideSink(lambda: ViewSink(segment, folder, port), told.append)
     # Ctrl-C ends the recording, not the run; the files are finished on the way out.
     with Recorder(segment, folder, beside) as recorder, suppress(KeyboardInterrupt):
-        window = None if port is None else Window(url(port))
+        if port is not None:
+            Window(url(port))
         recorder.follow()
-    told += window.told() if window is not None else []
     for text in told:
         print(text, file=sys.stderr)
     print_json({"rack": rack, "folder": str(folder), "told": told}) if as_json else print(f"recorded into {folder}")

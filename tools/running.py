@@ -84,8 +84,7 @@ def run_rack(
                 port = free_port() if view else None
                 if not recorder.attach(config.name, folder, port):
                     raise Failure(recorder.finish())
-                window = None if port is None else Window(url(port))
-                sources = [recorder.told, *([window.told] if window is not None else [])]
+                sources = [recorder.told, *([] if port is None else [_window(port)])]
             started = time.monotonic()
             outcome = _watch(rack, seconds, display, lambda: _hear(sources, rack.segment, log))
             wall_s, segment = time.monotonic() - started, rack.segment
@@ -125,6 +124,15 @@ def _stopped_by_signals(rack: Rack) -> Iterator[None]:
     finally:
         for number, handler in kept.items():
             signal.signal(number, handler)
+
+
+def _window(port: int) -> Callable[[], list[str]]:
+    """Open the viewer on what the recorder serves; return what tells of it. Without a viewer the rack runs all the same."""
+    try:
+        return Window(url(port)).told
+    except Failure as failure:
+        told = [f"no viewer: {failure}"]
+        return lambda: [told.pop()] if told else []
 
 
 def _hear(sources: list[Callable[[], list[str]]], segment: Segment, log: EventLog) -> None:

@@ -118,7 +118,7 @@ def _ways(rehearsal: Rehearsal, row: int, standing_goals: list[Pose], lift: floa
                 puts.append((tool, same))
             ways += [Way(take, put) for put in same]
     if not ways:
-        raise _nothing_at(motion, [goal @ (takes[0].tool.inverse() @ seen).inverse() for goal in standing_goals], here)
+        raise _nothing_at(motion, [place for tool, _ in puts for place in (tool, tool.raised(lift))], here)
     pace = motion.ik.time_between
     return sorted(ways, key=lambda way: pace(here, way.take.above) + pace(way.take.above, way.put.above))
 
@@ -131,7 +131,7 @@ def _takes(rehearsal: Rehearsal, row: int, lift: float) -> list[Spot]:
         takes = [spot for tool in tools for spot in _spots(motion, situation, row, tool, here, lift)]
         if takes:
             return takes
-        refusal = refusal or _nothing_at(motion, tools, here)
+        refusal = refusal or _nothing_at(motion, [place for t in tools for place in (t, t.raised(lift))], here)
         if refusal.code == Error.UNREACHABLE:
             break
     assert refusal is not None, "there is at least one height"
@@ -160,15 +160,16 @@ def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehe
 
 def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refused:
     """Return the refusal for poses of which the arm reaches none, or none freely."""
+    beyond: Pose | None = None
     for tool in tools:
-        for q in motion.ik.reachable(tool, here):
-            if why := motion.checker.why(q):
-                return Refused(Error.NO_PATH, why)
-    begin, end = motion.ik.tool_at(here), tools[0]
+        reachable = motion.ik.reachable(tool, here)
+        if why := next(filter(None, map(motion.checker.why, reachable)), ""):
+            return Refused(Error.NO_PATH, why)
+        beyond = beyond or (tool if not reachable else None)
+    begin, end = motion.ik.tool_at(here), beyond or tools[0]
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         reached = bool(motion.ik.reachable(Pose(begin.towards(end, middle).position, end.quaternion), here))
         low, high = (middle, high) if reached else (low, middle)
-    reach = at(begin.towards(end, low))
-    return Refused(Error.UNREACHABLE, f"out of reach; on the way there {reach} is in reach")
+    return Refused(Error.UNREACHABLE, f"out of reach: {at(end)}; in reach: {at(begin.towards(end, low))}")

@@ -87,7 +87,7 @@ def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
     assert "'post'" in status.reason
 
 
-@pytest.mark.parametrize("names", [("elemental_move",), ("elemental_move.planner",), ("elemental_move", "task")])
+@pytest.mark.parametrize("names", [("elemental_move",), ("elemental_move.planner", "task")])
 def test_task_goes_on_when_boards_are_restarted_again_and_again(names: tuple[str, ...]) -> None:
     rack = WholeRack(actions=[TRANSFER])
     for _ in range(12):

@@ -90,10 +90,10 @@ def test_object_is_turned_as_wanted(start: Rehearsal) -> None:
         ({**TRANSFER, "to": [1.2, 0.0, 0.475]}, Error.UNREACHABLE, "would be over 'floor'; supports: 'table'"),
         ({**TRANSFER, "to": [0.5, -0.2, 0.9]}, Error.UNREACHABLE, "425 mm above 'table'"),
         ({**TRANSFER, "to": [0.5, -0.2, 0.44]}, Error.UNREACHABLE, "35 mm deep in 'table'; valid z: 0.475"),
-        ({**TRANSFER, "to": [0.9, 0.5, 0.475]}, Error.UNREACHABLE, "out of reach; on the way there ["),
+        ({**TRANSFER, "to": [0.9, 0.5, 0.475]}, Error.UNREACHABLE, "out of reach: ["),
         ({**TRANSFER, "to": [0.65, 0.3, 0.475]}, Error.NO_PATH, "'block1' and 'block2'"),
         ({"do": "goto", "position": [0.5, 0.0, 0.6]}, Error.NO_PATH, "'wall'"),
-        ({"do": "goto", "position": [1.5, 0.0, 0.6]}, Error.UNREACHABLE, "out of reach; on the way there ["),
+        ({"do": "goto", "position": [1.5, 0.0, 0.6]}, Error.UNREACHABLE, "out of reach: ["),
         (
             {"do": "goto", "joints": [9, 0, 0, 0, 0, 0]},
             Error.UNREACHABLE,
@@ -111,7 +111,7 @@ def test_what_cannot_be_done_is_refused_with_what_can(
 
 def test_place_named_as_reachable_is_reachable(start: Rehearsal) -> None:
     text = str(refusal(start, {"do": "goto", "position": [1.5, 0.0, 0.6]}))
-    place = [float(x) for x in text.partition("way there [")[2].partition("]")[0].split(",")]
+    place = [float(x) for x in text.partition("in reach: [")[2].partition("]")[0].split(",")]
     assert rehearsed(start, {"do": "goto", "position": place}).moves
 
 

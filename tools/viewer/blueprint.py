@@ -27,7 +27,7 @@ from tools.viewer.poses import FRAMES
 from tools.viewer.stream import path
 from tools.viewer.timelines import SIM_TIME
 
-CYCLES_S = 0.06
+CYCLES_S = 0.022
 """What the Gantt lanes show before and behind the time that is looked at: some cycles of fast and of slower boards."""
 
 

@@ -30,8 +30,7 @@ class Gantt:
     def __init__(self, stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> None:
         self._stream, self._speed = stream, speed
         self._lane = lane_of(task)
-        last_ns = task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS)
-        self._last_ns = last_ns if lockstep else np.iinfo(np.int64).max
+        self._last_ns = task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS) if lockstep else None
         self._work = "process" if task.role == "executor" else "plan"
         style_lane(stream, self._lane, PHASES, quiet=["wait"])
 
@@ -40,8 +39,9 @@ class Gantt:
         rows = block.rows
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
         within = ((moments - rows["release_ns"][:, None]) * self._speed).astype(np.int64)
-        # Cut spans keep an order: no two of a lane begin at once.
-        within = np.minimum(within, self._last_ns + np.arange(len(MOMENTS)))
+        if self._last_ns is not None:
+            # Cut spans keep an order: no two of a lane begin at once.
+            within = np.minimum(within, self._last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
         states = np.array([["read", self._work, "write", "wait"]] * len(rows))
         states[(rows["flags"] & Flag.MISSED) > 0, :3] = "missed"

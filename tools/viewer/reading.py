@@ -27,4 +27,8 @@ def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
     ticks = np.concatenate([batch.column(TICK).to_numpy() for batch in batches])
     rows = [row for batch in batches for row in batch.column(component).to_pylist()]
     order = np.argsort(ticks, kind="stable")
-    return Rows(ticks[order], np.array(rows)[order])
+    try:
+        values = np.array(rows)
+    except ValueError:  # rows of different lengths
+        values = np.array(rows, dtype=object)
+    return Rows(ticks[order], values[order])

@@ -27,6 +27,8 @@ class Stream:
 
     def __init__(self, name: str, file: Path, times: Timelines, blueprint: rrb.Blueprint, port: int | None) -> None:
         self.times = times
+        # Else a mistake is a warning on stderr and a hole in the recording.
+        rr.set_strict_mode(True)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=f"{name}-{time.time_ns()}")
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)

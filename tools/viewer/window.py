@@ -1,11 +1,14 @@
-"""The viewer's window: a process of its own, which may close at any time."""
+"""The viewer's window: a process of its own, which may close at any time and outlives the command that opened it."""
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from tools.answer import Failure
@@ -16,14 +19,24 @@ HOST = "127.0.0.1"
 class Window:
     """A viewer that shows a recording's file, or what a recorder serves.
 
-    Raises `Failure` when none is installed.
+    Raises `Failure` when none is installed, or when there is no screen and `headless` does not ask for none.
     """
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, headless: bool = False) -> None:
+        if not (headless or has_screen()):
+            raise Failure(
+                f"there is no screen here, DISPLAY and WAYLAND_DISPLAY are not set; elsewhere: rerun {source}"
+            )
+        # A file, no pipe: nobody reads what the viewer says while it is open.
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window
         self._process = subprocess.Popen(
-            [executable(), source], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            [executable(), source, *(["--headless"] if headless else [])],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            # Ctrl-C in the terminal ends the run, not the look at it.
+            start_new_session=True,
         )
-
         self._is_told = False
 
     def told(self) -> list[str]:
@@ -35,9 +48,24 @@ class Window:
 
     def wait(self) -> str:
         """Wait until the window is closed; return what went wrong, if anything did."""
-        said = self._process.communicate()[1].decode(errors="replace").strip().splitlines()
-        status = self._process.returncode
-        return ": ".join([f"the viewer ended with status {status}", *said[-1:]]) if status else ""
+        if (status := self._process.wait()) == 0:
+            return ""
+        self._said.seek(0)
+        said = self._said.read().decode(errors="replace").strip().splitlines()
+        return ": ".join([f"the viewer ended with status {status}", *said[-1:]])
+
+    def close(self) -> None:
+        """Close it."""
+        self._is_told = True
+        if self._process.poll() is None:
+            # The command is a script around the viewer: both are of its process group.
+            os.killpg(self._process.pid, signal.SIGTERM)
+            self._process.wait()
+
+
+def has_screen() -> bool:
+    """Return whether there is a screen to open a window on."""
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def executable() -> str:
@@ -45,7 +73,7 @@ def executable() -> str:
     own = Path(sys.executable).with_name("rerun")
     found = str(own) if own.is_file() else shutil.which("rerun")
     if found is None:
-        raise Failure("the viewer 'rerun' is not installed; 'make run' installs it", 1)
+        raise Failure("the viewer 'rerun' is not installed; 'make run' installs it")
     return found
 
 

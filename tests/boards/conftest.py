@@ -1,0 +1,69 @@
+"""Racks of waves for tests, and the proof that nothing of them is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from backplane.segment import SHM_FOLDER
+from boards.config import load
+from boards.config.schema import RackConfig
+from tests.processes import named, wait_until
+
+CLOCK = f"""
+name = "waves"
+python_path = ["{Path(__file__).parent}"]
+
+[clock]
+period_ms = 2.5
+mode = "lockstep"
+"""
+PLAIN = f"""{CLOCK}
+[board.wave]
+slot = 2
+core = 1
+rate_hz = 400
+executor = "wave_levels:Wave"
+
+[board.watch]
+slot = 3
+rate_hz = 50
+below = "wave"
+executor = "wave_levels:Watch"
+ends_run = true
+"""
+PLANNED = PLAIN.replace(
+    '"wave_levels:Wave"',
+    """"wave_levels:PlannedWave"
+planner = "wave_levels:GainPlanner"
+coupling = "tight"
+within_cycles = 4""",
+)
+LOOSE = ("board.wave.coupling=loose", "board.wave.planner_slot=9")
+"""Settings that give the planner of the wave a board of its own."""
+
+MakeConfig = Callable[..., RackConfig]
+
+
+@pytest.fixture
+def wave_file(tmp_path: Path) -> Path:
+    """The rack of waves with a planner, as a file."""
+    path = tmp_path / "waves.toml"
+    path.write_text(PLANNED)
+    return path
+
+
+@pytest.fixture
+def config(rack_name: str, tmp_path: Path) -> Iterator[MakeConfig]:
+    """Configs of this test's own rack, with settings; afterwards nothing of it is left."""
+
+    def make(*settings: str, text: str = PLANNED) -> RackConfig:
+        path = tmp_path / "waves.toml"
+        path.write_text(text)
+        return load(path, [f"name={rack_name}", *settings])
+
+    yield make
+    wait_until(lambda: not named(f"{rack_name}:"))
+    assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]

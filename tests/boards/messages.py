@@ -1,0 +1,49 @@
+"""Everything that two runs wrote, side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from backplane.ring import mailbox_ring
+from backplane.segment import Segment
+from backplane.trace import Flag, trace_ring
+
+WHAT = ("serial", "tick", "visible_at", "basis", "chain")
+
+
+@dataclass(frozen=True)
+class Written:
+    """The messages of a run by mailbox, and its cycles by task; a run shorter than the rings loses none."""
+
+    messages: dict[str, np.ndarray]
+    cycles: dict[str, np.ndarray]
+
+    @classmethod
+    def on(cls, segment: Segment) -> Written:
+        """Take what is on a segment."""
+        messages, cycles = {}, {}
+        for mailbox in segment.layout.mailboxes:
+            messages[mailbox.name], lost = mailbox_ring(segment, mailbox.name).drain()
+            assert not lost
+        for task in segment.layout.tasks:
+            cycles[task.name], lost = trace_ring(segment, task.name).drain()
+            assert not lost
+        return cls(messages, cycles)
+
+    def first_miss(self, otherwise: int) -> int:
+        """Return the first tick at which a task missed or skipped a release; `otherwise` when none did."""
+        found = [otherwise]
+        for rows in self.cycles.values():
+            late = np.flatnonzero(rows["flags"] & (Flag.MISSED | Flag.SKIPPED))
+            # What was skipped lies behind the cycle before.
+            found += [int(rows["tick"][at - 1]) + 1 if at else 0 for at in late[:1]]
+        return min(found)
+
+    def until(self, tick: int) -> dict[str, list[tuple[int, ...]]]:
+        """Return what was released before `tick`, by mailbox: serials, ticks and running hashes."""
+        return {
+            name: [tuple(int(row[word]) for word in WHAT) for row in rows[rows["tick"] < tick]]
+            for name, rows in self.messages.items()
+        }

@@ -1,0 +1,78 @@
+"""Launchers as programs of their own, and everything that descends from them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from tests.processes import BOUND_S, runs, wait_until
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+
+
+class Program:
+    """A launcher that runs in a session of its own."""
+
+    def __init__(self, config: Path, *settings: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, str(HERE / "launcher.py"), str(config), *settings],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+
+    def wait_for_launch(self) -> None:
+        """Wait until the rack runs."""
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "launched\n"
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to the launcher alone."""
+        self._process.send_signal(number)
+
+    def ended(self) -> int:
+        """Wait for the launcher's end and return its exit status."""
+        return self._process.wait(BOUND_S)
+
+    @property
+    def descendants(self) -> list[int]:
+        """The processes that the launcher has left running."""
+        found = []
+        for path in Path("/proc").glob("[0-9]*/stat"):
+            with suppress(FileNotFoundError, ProcessLookupError):
+                pid, session = int(path.parent.name), int(path.read_text().rpartition(")")[2].split()[3])
+                if session == self.pid != pid and runs(pid):
+                    found.append(pid)
+        return found
+
+    def wait_for_descendants(self) -> None:
+        """Wait until none of them runs any more."""
+        wait_until(lambda: not self.descendants)
+
+    def close(self) -> None:
+        """Kill what is left of it."""
+        for pid in [self.pid, *self.descendants]:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self._process.wait(BOUND_S)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+
+@contextmanager
+def launcher(config: Path, *settings: str) -> Iterator[Program]:
+    """Start a launcher; at the end nothing of it runs."""
+    program = Program(config, *settings)
+    try:
+        yield program
+    finally:
+        program.close()

@@ -1,0 +1,124 @@
+"""Signs of life: who has finished nothing for longer than its bound hangs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from backplane.segment import Segment, unlink
+from backplane.words import Block, Run, System
+from boards import heartbeat
+from boards.heartbeat import Heartbeat
+from tests.backplane.bus import layout, task
+
+PERIOD_NS = 2_500_000
+FAST, SLOW = "fast", "slow"
+
+
+class Clock:
+    """Time that a test sets."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        """Return the time, in s."""
+        return self.now_s
+
+
+@pytest.fixture
+def bus(rack_name: str) -> Iterator[Segment]:
+    slow = task(SLOW, every=400, slot=3, within_cycles=2)
+    segment = Segment.create(layout(rack_name, (), [task(FAST), slow]), "")
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    segment.words[System.STATE] = Run.RUNNING
+    yield segment
+    unlink(rack_name)
+    segment.close()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(heartbeat, "time", clock)
+    return clock
+
+
+def run_on(segment: Segment, clock: Clock, seconds: float, *hanging: str) -> None:
+    """Let time pass: all tasks but those are released and finish."""
+    clock.now_s += seconds
+    tick = segment.words[System.TICK] = segment.words[System.TICK] + round(seconds * 1e9 / PERIOD_NS)
+    for name in (FAST, SLOW):
+        block = segment.block(name)
+        block[Block.RELEASED] = tick
+        if name not in hanging:
+            block[Block.DONE] = tick
+
+
+def test_who_goes_on_does_not_hang(bus: Segment, clock: Clock) -> None:
+    beat = Heartbeat(bus)
+    for _ in range(100):
+        run_on(bus, clock, 0.5)
+        assert beat.hanging() == []
+
+
+def test_a_task_that_finishes_nothing_hangs_once(bus: Segment, clock: Clock) -> None:
+    beat, told = Heartbeat(bus), []
+    for _ in range(10):
+        run_on(bus, clock, 0.25, FAST)
+        told += beat.hanging()
+    assert told == [FAST]
+
+
+def test_a_slow_task_has_its_cycles_and_those_of_its_plan(bus: Segment, clock: Clock) -> None:
+    beat = Heartbeat(bus)
+    # Four beats and two cycles for a plan, of a second each.
+    for _ in range(6):
+        run_on(bus, clock, 1.0, SLOW)
+        assert beat.hanging() == []
+    run_on(bus, clock, 1.0, SLOW)
+    assert beat.hanging() == [SLOW]
+
+
+def test_who_has_nothing_to_do_does_not_hang(bus: Segment, clock: Clock) -> None:
+    beat = Heartbeat(bus)
+    for name in (FAST, SLOW):
+        bus.block(name)[Block.RELEASED] = bus.block(name)[Block.DONE] = 8
+    for _ in range(20):
+        clock.now_s += 1.0
+        bus.words[System.TICK] += 1
+        assert beat.hanging() == []
+
+
+def test_a_clock_that_gives_out_no_tick_hangs(bus: Segment, clock: Clock) -> None:
+    beat = Heartbeat(bus)
+    run_on(bus, clock, 0.5)
+    assert beat.hanging() == []
+    clock.now_s += 1.5
+    assert beat.hanging() == [heartbeat.CLOCK]
+    assert beat.hanging() == []
+
+
+@pytest.mark.parametrize("state", [Run.STARTING, Run.STOPPED])
+def test_nobody_hangs_before_and_after_the_run(bus: Segment, clock: Clock, state: Run) -> None:
+    beat = Heartbeat(bus)
+    bus.words[System.STATE] = state
+    clock.now_s += 1000.0
+    assert beat.hanging() == []
+
+
+def test_bounds_stretch_with_the_wall_clock(bus: Segment, clock: Clock) -> None:
+    bus.words[System.PERIOD_NS] = 1000 * PERIOD_NS
+    beat = Heartbeat(bus)
+    clock.now_s += 9.0
+    assert beat.hanging() == []
+    clock.now_s += 2.0
+    assert heartbeat.CLOCK in beat.hanging()
+
+
+def test_in_lockstep_a_plan_takes_as_long_as_it_takes(bus: Segment, clock: Clock) -> None:
+    bus.words[System.LOCKSTEP] = 1
+    beat = Heartbeat(bus)
+    clock.now_s += 30.0
+    assert beat.hanging() == []

@@ -1,0 +1,101 @@
+"""Launches that fail: the reason, and nothing left."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from backplane.lines import UtilityLines
+from backplane.segment import racks
+from backplane.words import Block, TaskState
+from boards.errors import ConfigError, LaunchError
+from boards.events import Event
+from boards.rack import Rack
+from tests.boards.conftest import PLAIN, MakeConfig
+from tests.processes import children_of, descriptors, wait_until
+
+
+def refusal(rack: Rack) -> str:
+    with pytest.raises(LaunchError) as error:
+        rack.launch()
+    return str(error.value)
+
+
+def test_a_failed_self_test_is_the_launch_error(config: MakeConfig) -> None:
+    rack = Rack(config("board.wave.params.trouble=refuse", text=PLAIN))
+    assert refusal(rack) == "board 'wave': the wave is too high: 3 m; permitted: 2 m"
+    assert UtilityLines(rack.segment).sysfail == [2] or UtilityLines(rack.segment).sysfail == [2, 3]
+    assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
+
+
+def test_a_planner_that_fails_its_self_test_holds_its_boards_sysfail(config: MakeConfig) -> None:
+    rack = Rack(config("board.wave.planner=wave_levels:BadPlanner"))
+    assert refusal(rack) == "board 'wave.planner': no gain is known: 0 of 3"
+    assert 2 in UtilityLines(rack.segment).sysfail
+
+
+def test_a_level_that_cannot_be_made_is_told_with_its_error(config: MakeConfig) -> None:
+    rack = Rack(config("board.wave.params.final=NONE"))
+    told = refusal(rack)
+    assert "board 'wave' failed" in told
+    assert "KeyError: 'NONE'" in told
+    assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
+
+
+def test_a_board_that_leaves_without_a_word_is_no_ready_board(config: MakeConfig) -> None:
+    assert refusal(Rack(config("board.wave.params.trouble='leave early'"))) == "board 'wave' ended: exit status 0"
+
+
+def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("boards.rack.LAUNCH_S", 1.0)
+    settings = ("board.watch.executor=wave_levels:Endless",)
+    assert refusal(Rack(config(*settings))) == "boards watch: not ready within 1 s"
+
+
+def test_a_crate_killed_during_the_launch_is_told(config: MakeConfig) -> None:
+    def kill_crate(event: Event) -> None:
+        if event.kind == "launch":
+            crates = [pid for pid in children_of(os.getpid()) if b"boards.crate" in command_of(pid)]
+            for pid in crates:
+                os.kill(pid, signal.SIGKILL)
+
+    rack = Rack(config(), kill_crate)
+    assert "crate" in refusal(rack)
+    assert rack.config.name not in racks()
+
+
+def command_of(pid: int) -> bytes:
+    from pathlib import Path
+
+    return Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
+@pytest.mark.parametrize("trouble", ["refuse", "leave early"])
+def test_failed_launches_leave_nothing_open_and_nobody_running(config: MakeConfig, trouble: str) -> None:
+    children, before = children_of(os.getpid()), descriptors()
+    for _ in range(2):
+        refusal(Rack(config(f"board.wave.params.trouble='{trouble}'")))
+    wait_until(lambda: children_of(os.getpid()) == children)
+    assert descriptors() == before
+
+
+def test_a_config_that_cannot_be_wired_starts_nobody(config: MakeConfig, rack_name: str) -> None:
+    good = config()
+    board = good.board["watch"].model_copy(update={"executor": "wave_levels:Nobody"})
+    bad = good.model_copy(update={"board": {**good.board, "watch": board}})
+    children = children_of(os.getpid())
+    with pytest.raises(ConfigError, match="Nobody"):
+        Rack(bad).launch()
+    assert children_of(os.getpid()) == children
+    assert rack_name not in racks()
+
+
+def test_a_rack_may_be_closed_before_its_launch_and_twice_after(config: MakeConfig) -> None:
+    rack = Rack(config())
+    rack.close()
+    rack.launch()
+    rack.close()
+    rack.close()
+    assert rack.config.name not in racks()

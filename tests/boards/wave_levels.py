@@ -1,0 +1,144 @@
+"""Levels for tests of boards: a wave that a planner scales, somebody who watches it, and trouble on request.
+
+`trouble` in a level's parameters names what goes wrong and `at` the tick; `ticks` is how long it takes.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from backplane.message import Field, Message, MessageType, State, status
+from levels.errors import LevelError
+from levels.level import Executor, Input, LevelContext, Planner, Ports
+
+WAVE = status("wave", 1, Field("value", "f8", "1", "height of the wave"))
+GAIN = MessageType("gain", 1, (Field("gain", "f8", "1", "factor"), Field("made_at", "i8", "tick", "release")))
+
+
+class Trouble:
+    """What a level does wrong, and when."""
+
+    def __init__(self, context: LevelContext) -> None:
+        params: Mapping[str, Any] = context.params
+        self._kind = params.get("trouble", "none")
+        self._at = params.get("at", 0)
+        self._took_ns = params.get("ticks", 0) * context.clock_ns
+
+    def self_test(self) -> None:
+        """Fail the self-test."""
+        if self._kind == "refuse":
+            raise LevelError("the wave is too high: 3 m; permitted: 2 m")
+        if self._kind == "leave early":
+            os._exit(0)
+
+    def at(self, tick: int) -> None:
+        """Do what is due at a tick."""
+        if self._kind == "print" and tick == self._at:
+            print("a wave", tick)  # noqa: T201  what boards print is heard
+        elif self._kind == "raise" and tick == self._at:
+            raise ValueError(f"no wave at tick {tick}")
+        elif self._kind == "late" and tick == self._at:
+            end = time.monotonic_ns() + self._took_ns
+            while time.monotonic_ns() < end:
+                pass
+
+
+class Wave(Executor):
+    """Writes a value that grows with time; done at the tick that `done_at` says."""
+
+    outputs = {"status": WAVE}
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self.trouble = Trouble(context)
+        self._done_at = context.params.get("done_at", 1 << 60)
+        self._final = State[context.params.get("final", "DONE")]
+
+    def self_test(self) -> None:
+        """Fail if that is asked for."""
+        self.trouble.self_test()
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Write the wave's height."""
+        self.trouble.at(tick)
+        write.status.state = self._final if tick >= self._done_at else State.EXECUTING
+        write.status.reason = "the tide" if self._final is State.ERROR and tick >= self._done_at else ""
+        write.status.value = 0.5 * tick * self.gain(read)
+
+    def gain(self, read: Ports) -> float:
+        """Return the factor on the wave."""
+        return 1.0
+
+
+class PlannedWave(Wave):
+    """A wave scaled by its planner's newest gain."""
+
+    inputs = {"plan": Input(GAIN, "own.plan")}
+
+    def gain(self, read: Ports) -> float:
+        """Return the planned factor; 1 before the first plan."""
+        return float(read.plan.value.gain) if read.plan.is_there else 1.0
+
+
+class Steady(PlannedWave):
+    """A planned wave that leaves trouble to its planner."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Write the wave's height."""
+        write.status.state = State.EXECUTING
+        write.status.value = 0.5 * tick * self.gain(read)
+
+
+class GainPlanner(Planner):
+    """Plans the gain from the wave as it was seen, every `plan_every` ticks."""
+
+    inputs = {"status": Input(WAVE, "own.status")}
+    output = GAIN
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self.trouble = Trouble(context)
+        self._every = context.params.get("plan_every", 1)
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Want a plan every so many ticks."""
+        return tick % self._every == 0
+
+    def plan(self, read: Ports, write: Message, tick: int) -> None:
+        """Plan a gain that follows the wave."""
+        self.trouble.at(tick)
+        write.gain = 1.0 + 1.0 / (1.0 + abs(read.status.value.value))
+        write.made_at = tick
+
+
+class BadPlanner(GainPlanner):
+    """A planner that fails its self-test."""
+
+    def self_test(self) -> None:
+        """Fail."""
+        raise LevelError("no gain is known: 0 of 3")
+
+
+class Watch(Executor):
+    """Shows what it sees of the wave."""
+
+    inputs = {"status": Input(WAVE, "below.status")}
+    outputs = {"status": WAVE}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Copy the wave's status."""
+        write.status.state = read.status.value.state
+        write.status.reason = read.status.value.reason
+        write.status.value = read.status.value.value
+
+
+class Endless(Watch):
+    """A level whose self-test does not end."""
+
+    def self_test(self) -> None:
+        """Wait for ever."""
+        while True:
+            time.sleep(1)

@@ -1,0 +1,3 @@
+"""A module that prints while it is imported."""
+
+print("first\nsecond")  # noqa: T201
