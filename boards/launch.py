@@ -66,6 +66,18 @@ class Launch:
             return State.IDLE.name.lower(), ""
         return State(status.value.state).name.lower(), status.value.reason
 
+    def latched(self, segment: Segment) -> list[str]:
+        """Return a line for every level but the one that ends the run whose last status holds an error."""
+        found = []
+        for box in segment.layout.mailboxes:
+            board, _, port = box.name.partition(".")
+            if port != "status" or box.name == self.ends_run or "error" not in (field.name for field in box.fields):
+                continue
+            status = open_observer(segment, box.name).peek()
+            if status.is_there and status.value.error:
+                found.append(f"level '{board}': {status.value.reason}")
+        return found
+
     def cause_of(self, state: str) -> Cause:
         """Return why a run ended that nothing stopped from outside."""
         ends: dict[str, Cause] = {State.DONE.name.lower(): "task done", State.ERROR.name.lower(): "task refused"}

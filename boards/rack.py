@@ -179,6 +179,8 @@ class Rack:
         state, reason = self._plan.final_state(self.segment)
         # A stop may also be requested from outside, by a word in the segment.
         cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._plan.cause_of(state))
+        if cause in ("task done", "time over"):
+            self._faults += self._plan.latched(self.segment)
         self._let_go()
         self.outcome = Outcome(cause, stop, state, reason, digest(self.segment, stop), tuple(self._faults))
         self._tell("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")

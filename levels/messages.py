@@ -145,7 +145,7 @@ SEGMENT = MessageType(
         Field("object", "i2", "1", "object held, or to be grasped; -1: none"),
         Field("touch", "u1", "1", "1: the object may touch supports and fingers (approach, depart)"),
         Field("count", "u2", "1", "waypoints that follow"),
-        Field("waypoints", "f8", "rad", "path in joint space, first point where the motion starts", (WAYPOINTS, "joints")),
+        Field("waypoints", "f8", "rad", "path in joint space, from where the motion starts", (WAYPOINTS, "joints")),
         Field("blend", "f8", "rad", "length over which corner k is rounded", (WAYPOINTS,)),
         Field("by", "f8", "s", "simulated time by which it must be done; 0: no such time"),
         Field("opening", "f8", "m", "gripper joint position to go to, for GRIPPER"),
@@ -189,7 +189,9 @@ TRAJECTORY = MessageType(
         Field("duration", "f8", "s", "from rest to rest"),
         Field("earliest", "f8", "s", "simulated time at which the segment could be done at the earliest"),
         Field("count", "u2", "1", "sections that follow"),
-        Field("sections", "f8", "s, 1, 1/s, 1/s2, 1/s3", "start, s, ds, dds, constant jerk of the path parameter", (SECTIONS, 5)),
+        Field(
+            "sections", "f8", "s, 1, 1/s, 1/s2, 1/s3", "start, s, ds, dds, jerk of the path parameter", (SECTIONS, 5)
+        ),
     ),
 )
 

@@ -127,7 +127,7 @@ def _stopped_by_signals(rack: Rack) -> Iterator[None]:
 
 
 def _window(port: int) -> Callable[[], list[str]]:
-    """Open the viewer on what the recorder serves; return what tells of it. Without a viewer the rack runs all the same."""
+    """Open the viewer on what the recorder serves; return what tells of it. Without one the rack runs all the same."""
     try:
         return Window(url(port)).told
     except Failure as failure:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from backplane import semaphores
+from backplane.byte_lock import ByteLock
 from backplane.errors import SegmentError
 from backplane.layout import Layout
 from backplane.segment import SHM_FOLDER, VERSION, Segment, racks, shm_path, unlink
@@ -115,17 +116,28 @@ def test_clean_tells_what_it_removed_and_what_is_in_use(spec: Layout, rack_name:
         live.close()
 
 
-def test_a_rack_removed_meanwhile_is_not_removed_again(spec: Layout) -> None:
+def test_a_rack_removed_and_launched_meanwhile_is_not_removed(spec: Layout, monkeypatch: pytest.MonkeyPatch) -> None:
     leave_dead(spec)
-    slow = Segment.open(spec.rack)
+    found = Segment.open(spec.rack)
     assert remove_dead(spec.rack)
     again = Segment.create(spec, "")
-    assert not slow.launcher_is_alive
-    # The slow one has found a dead rack; under its name there is a live one by now.
-    assert not slow.has_its_name
+    # Who has looked before all that finds a dead rack still.
+    monkeypatch.setattr(Segment, "open", lambda rack: found)
+    assert not remove_dead(spec.rack)
     assert again.has_its_name
-    for segment in (slow, again):
-        segment.close()
+    again.close()
+
+
+def test_who_finds_another_removing_leaves_it_to_him(spec: Layout) -> None:
+    leave_dead(spec)
+    found = Segment.open(spec.rack)
+    other = ByteLock(found, 8 * Head.MAGIC)
+    assert other.take()
+    assert not remove_dead(spec.rack)
+    assert found.has_its_name
+    other.close()
+    assert remove_dead(spec.rack)
+    found.close()
 
 
 def contend(spec: Layout, start: Segment, word: int) -> bool:

@@ -111,6 +111,7 @@ def test_nobody_hangs_before_and_after_the_run(bus: Segment, clock: Clock, state
 def test_bounds_stretch_with_the_wall_clock(bus: Segment, clock: Clock) -> None:
     bus.words[System.PERIOD_NS] = 1000 * PERIOD_NS
     beat = Heartbeat(bus)
+    assert beat.hanging() == []
     clock.now_s += 9.0
     assert beat.hanging() == []
     clock.now_s += 2.0

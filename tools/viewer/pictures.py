@@ -37,13 +37,17 @@ class Screen:
     def __init__(self, client: ViewerClient) -> None:
         self._client = client
 
-    def look(self, at_s: float) -> Look:
-        """Return the view at a simulated time, s, once it stands still."""
+    def look(self, at_s: float, view: str | None = None) -> Look:
+        """Return what is to be seen at a simulated time, s, once it stands still: all, or the view of that name.
+
+        Raises `KeyError` when there is no such view.
+        """
+        shown = None if view is None else {v.name: v.view_id for v in self._client.get_state().views}[view]
         self._client.set_time(SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused")
         drawn, deadline = b"", time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             time.sleep(PAUSE_S)
-            before, drawn = drawn, bytes(self._client.take_screenshot())
+            before, drawn = drawn, bytes(self._client.take_screenshot(shown))
             if drawn == before:
                 break
         return Look(drawn, tuple(self._complaints()))
@@ -70,9 +74,10 @@ def main() -> int:
     parser.add_argument("recording", type=Path, help="a run.rrd")
     parser.add_argument("out", type=Path, help="PNG file to write")
     parser.add_argument("--at", type=float, required=True, metavar="S", help="simulated time to look at, s")
+    parser.add_argument("--view", metavar="NAME", help="one view alone, as its title says")
     given = parser.parse_args()
     with opened(given.recording) as screen:
-        look = screen.look(given.at)
+        look = screen.look(given.at, given.view)
     given.out.write_bytes(look.picture)
     for complaint in look.complaints:
         print(complaint, file=sys.stderr)
