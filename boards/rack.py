@@ -193,7 +193,7 @@ class Rack:
         try:
             if hasattr(self, "segment"):
                 self._let_go()
-            if self._faults:
+            if self._cause == "board lost":
                 crate.power_off()
             # A crate that has no boards yet may still be importing for them.
             crate.close(LEAVE_S if self._pids else 0)

@@ -1,10 +1,11 @@
-"""Processes for tests: forked workers, and waits that end."""
+"""Processes and threads for tests, and waits that end."""
 
 from __future__ import annotations
 
 import gc
 import os
 import signal
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -65,6 +66,16 @@ def wait_until(condition: Callable[[], object], bound_s: float = BOUND_S) -> Non
         if time.monotonic() > deadline:
             raise TimeoutError(f"not within {bound_s:g} s")
         time.sleep(0.001)
+
+
+@contextmanager
+def in_thread(run: Callable[[], object]) -> Iterator[None]:
+    """Run something beside the test; at the end it must come to its own end."""
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    yield
+    thread.join(BOUND_S)
+    assert not thread.is_alive()
 
 
 def runs(pid: int) -> bool:

@@ -15,6 +15,15 @@ import pytest
 README = Path(__file__).parent.parent / "README.md"
 BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 
+SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
+COMMANDS = [
+    line.partition("#")[0].split()[1:]
+    for block in SHELL.findall(README.read_text())
+    for line in block.splitlines()
+    # What needs a run, or a running rack, of another line has tests of its own in tests/tools.
+    if line.startswith("rack ") and not re.search(r"<|\.toml|RUN|rack (status|stop|record|replay)|--view", line)
+]
+
 
 @pytest.fixture
 def example(tmp_path: Path) -> Path:
@@ -32,6 +41,16 @@ def rack(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(README.parent)}
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_command_of_the_readme_works(words: list[str], tmp_path: Path) -> None:
+    ended = rack(tmp_path, *words)
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_readme_shows_the_commands() -> None:
+    assert {"run", "check", "list", "clean", "bench"} <= {words[0] for words in COMMANDS}
 
 
 def test_the_example_level_runs_as_the_readme_has_it(example: Path) -> None:

@@ -15,7 +15,7 @@ View = Annotated[bool, typer.Option("--view", help="open the viewer on the runni
 
 
 def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = False) -> None:
-    """Record a running rack, from now on.
+    """Record a running rack, from what its rings still hold on.
 
     Trace, signals and run.rrd, until its run is over or Ctrl-C.
     """

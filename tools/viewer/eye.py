@@ -10,8 +10,8 @@ from levels.cell import Cell
 
 DIRECTION = np.array([0.75, -0.95, 0.55])
 """From what is looked at to the eye: from the front right, a little above."""
-DISTANCE = 1.45
-"""In radii of what is looked at: it fills the view."""
+DISTANCE = 1.75
+"""In radii of what is looked at: it fills the view, a raised arm included."""
 ENDLESS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 
 

@@ -8,40 +8,49 @@ import rerun as rr
 from backplane.layout import TaskSpec
 from backplane.trace import Flag
 from tools.viewer.activity import LEVELS, LOG
-from tools.viewer.blocks import Block, Changes
+from tools.viewer.blocks import Block
 from tools.viewer.lanes import style_lane, write_spans
 from tools.viewer.palette import PHASES
 from tools.viewer.stream import Stream
 
 MISSED = "missed"
+SPAN_S = 0.25
+"""A missed cycle marks its quarter of a second: itself it would be too narrow to be seen."""
 
 
 class Misses:
-    """Writes trace records: a span as long as cycles are missed one after the other, and one log line a block."""
+    """Writes trace records: a span wherever cycles were missed, and one log line a block.
+
+    A task that never misses has no lane.
+    """
 
     def __init__(self, stream: Stream, task: TaskSpec) -> None:
         self._stream, self._task = stream, task.name
         self._lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
-        self._changes = Changes()
-        self._any = False
+        self._span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
+        self._is_styled = False
 
     def write(self, block: Block) -> None:
-        """Write what was missed; a task that never misses has no lane."""
-        missed = (block.rows["flags"] & Flag.MISSED) > 0
-        changed = self._changes.rows(missed)
-        if not self._any and not missed.any():
+        """Write what was missed."""
+        missed = np.flatnonzero(block.rows["flags"] & Flag.MISSED)
+        if not len(missed):
             return
-        if not self._any:
+        if not self._is_styled:
             style_lane(self._stream, self._lane, {MISSED: PHASES[MISSED]})
-        self._any = True
-        if len(changed):
-            times = self._stream.times.columns(block.ticks[changed], block.stamps_ns[changed])
-            write_spans(self._stream, self._lane, times, [MISSED if at else "" for at in missed[changed]])
-        if missed.any():
-            self._log(block, np.flatnonzero(missed))
+            self._is_styled = True
+        self._mark(np.unique(block.ticks[missed] // self._span))
+        self._log(block.ticks[missed], int(block.stamps_ns[missed[0]]))
 
-    def _log(self, block: Block, missed: np.ndarray) -> None:
-        ticks = block.ticks[missed]
+    def _mark(self, spans: np.ndarray) -> None:
+        ends = np.setdiff1d(spans + 1, spans)
+        moments = np.concatenate((spans, ends))
+        order = np.argsort(moments)
+        ticks = moments[order] * self._span
+        states = np.array([MISSED] * len(spans) + [""] * len(ends))[order]
+        times = self._stream.times
+        write_spans(self._stream, self._lane, times.columns(ticks, times.stamps_of(ticks)), states.tolist())
+
+    def _log(self, ticks: np.ndarray, stamp_ns: int) -> None:
         which = f"tick {ticks[0]}" if len(ticks) == 1 else f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
         line = rr.TextLog(f"missed: {self._task}: {which}", level="WARN")
-        self._stream.at(int(ticks[0]), int(block.stamps_ns[missed[0]]), (LOG, "misses"), line)
+        self._stream.at(int(ticks[0]), stamp_ns, (LOG, "misses"), line)

@@ -24,9 +24,7 @@ class Window:
 
     def __init__(self, source: str, headless: bool = False) -> None:
         if not (headless or has_screen()):
-            raise Failure(
-                f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; where there is one: rerun {source}"
-            )
+            raise Failure(f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; where there is one: rerun {source}")
         # A file, no pipe: nobody reads what the viewer says while it is open.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window
         self._process = subprocess.Popen(

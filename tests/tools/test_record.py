@@ -1,0 +1,55 @@
+"""`rack record` on a rack that runs, and `--view` and `rack replay` where there is nothing to show or no screen."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from boards.config import load
+from boards.rack import Rack
+from tools.answer import Failure
+from tools.recording import Recording
+from tools.replay import replay
+from tools.viewer.reading import read
+from tools.viewer.window import Window
+
+ROOT = Path(__file__).resolve().parents[2]
+WATCHDOG_S = 50.0
+
+
+def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: str, tmp_path: Path) -> None:
+    config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
+    with Rack(config) as rack:
+        rack.start()
+        command = [sys.executable, "-m", "tools.cli", "record", rack_name, "--out", str(tmp_path / "run"), "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
+            deadline = time.monotonic() + WATCHDOG_S
+            while not (tmp_path / "run" / "run.rrd").is_file() and time.monotonic() < deadline:
+                rack.watch(0.1)
+            rack.stop("recorded")
+            while rack.watch(0.5):
+                continue
+            answer = json.loads(recorder.communicate(timeout=WATCHDOG_S)[0])
+    assert recorder.returncode == 0
+    assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "told": []}
+    assert rack.outcome is not None
+    ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
+    assert ticks[-1] == rack.outcome.ticks - 1
+    assert read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist() == ticks.tolist()
+
+
+def test_a_window_without_a_screen_says_what_to_do_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(Failure, match=r"no screen: .*: rerun run\.rrd"):
+        Window("run.rrd")
+
+
+def test_a_folder_without_a_recording_is_no_run_to_replay(tmp_path: Path) -> None:
+    with pytest.raises(Failure, match=r"it has no run\.rrd"):
+        replay(tmp_path)
