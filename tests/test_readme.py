@@ -33,14 +33,13 @@ def example(tmp_path: Path) -> Path:
 
 
 def rack(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", *words]
-    return subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=55, check=False, env=environment()
-    )
+    return python(folder, "-m", "tools.cli", *words)
 
 
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(README.parent)}
+def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(README.parent)}
+    command = [sys.executable, *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=55, check=False, env=environment)
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
@@ -67,14 +66,21 @@ def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
     script = re.search(r"```python\n(from boards.rack.*?)```", README.read_text(), re.DOTALL)
     assert script
     (tmp_path / "script.py").write_text(script[1].replace("seconds=10", "seconds=1"))
-    ended = subprocess.run(
-        [sys.executable, "script.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=55,
-        check=False,
-        env=environment(),
-    )
+    ended = python(tmp_path, "script.py")
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.startswith("time over 400 ")
+
+
+def test_a_run_reads_back_as_the_readme_has_it(tmp_path: Path) -> None:
+    ended = rack(tmp_path, "run", "nasrem", "--lockstep", "--seconds", "1", "--out", "run", "--json")
+    assert ended.returncode == 0, ended.stderr
+    block = re.search(r"```python\n(from pathlib.*?)```", README.read_text(), re.DOTALL)
+    assert block
+    # pandas is the reader's choice, not a dependency.
+    lines = [line for line in block[1].splitlines() if "pd" not in line]
+    script = "\n".join(lines).replace("runs/nasrem-20250101-120000", "run")
+    script += "\nprint(ticks.shape, measured.shape, error.values.shape[1], len(lateness) > 0)"
+    (tmp_path / "read.py").write_text(script)
+    read = python(tmp_path, "read.py")
+    assert read.returncode == 0, read.stderr
+    assert read.stdout == "(400,) (400, 6) 6 True\n"

@@ -17,9 +17,7 @@ def misses(recording: Recording, layout: Layout) -> list[dict[str, Any]]:
     A skipped release leaves no record of its own: the next one tells how many there were.
     """
     found = [
-        miss
-        for task in layout.tasks
-        for miss in _misses_of(task, recording.cycles.get(task.name, recording.no_cycles))
+        miss for task in layout.tasks for miss in _misses_of(task, recording.cycles.get(task.name, recording.no_cycles))
     ]
     return sorted(found, key=lambda miss: (miss["tick"], miss["task"]))
 
@@ -37,4 +35,3 @@ def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
             entry = {"task": task.name, "tick": int(cycle["tick"]), "what": "late"}
             found.append({**entry, "started_ms": round(late_ms, 6), "took_ms": round(took_ms, 6)})
     return found
-
