@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from backplane.layout import TaskSpec
 from backplane.lines import UtilityLines
 from backplane.message import State
-from backplane.protocols import open_reader
+from backplane.protocols import open_observer
 from backplane.segment import Segment
 from backplane.trace import trace_ring
 from backplane.words import Block, Run, System, TaskState
@@ -75,12 +75,12 @@ class Viewer:
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
         written = {m.name: m.message for m in segment.layout.mailboxes}
         self._statuses = {
-            task.name: open_reader(segment, f"{task.name}.status")
+            task.name: open_observer(segment, f"{task.name}.status")
             for task in segment.layout.tasks
             if f"{task.name}.status" in written
         }
         whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
-        self._whole = open_reader(segment, whole) if whole else None
+        self._whole = open_observer(segment, whole) if whole else None
 
     def look(self) -> Snapshot:
         """Return the rack as it is now."""

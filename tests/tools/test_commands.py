@@ -79,6 +79,7 @@ def test_run_prints_one_json_document_and_nothing_else(small: Path, rack_name: s
         "events.jsonl",
         "report.json",
         "report.md",
+        "run.rrd",
         "signals.parquet",
     ]
     again = rack("report", tmp_path / "run", "--json")

@@ -14,7 +14,7 @@ import numpy as np
 from rerun.experimental import ViewerClient
 
 from tools.viewer.timelines import SIM_TIME
-from tools.viewer.window import free_port
+from tools.viewer.window import executable, free_port
 
 PATIENCE_S = 30.0
 PAUSE_S = 0.4
@@ -63,7 +63,10 @@ class Screen:
 @contextmanager
 def opened(recording: Path) -> Iterator[Screen]:
     """Open a recording in a headless viewer. Raises `RuntimeError` where the machine lacks the graphics libraries."""
-    with ViewerClient.spawn(headless=True, port=free_port(), hide_welcome_screen=True) as client:
+    spawned = ViewerClient.spawn(
+        headless=True, port=free_port(), hide_welcome_screen=True, executable_path=executable()
+    )
+    with spawned as client:
         client.open(str(recording.resolve()))
         yield Screen(client)
 
