@@ -28,7 +28,8 @@ class Window:
         # A file, no pipe: nobody reads what the viewer says while it is open.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window
         self._process = subprocess.Popen(
-            [executable(), source, *(["--headless"] if headless else [])],
+            # Without an address of its own the viewer would listen to every machine around.
+            [executable(), "--bind", HOST, source, *(["--headless"] if headless else [])],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._said,
