@@ -12,6 +12,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+OWN_NAME = f"readme-{os.getpid()}"
 README = Path(__file__).parent.parent / "README.md"
 BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 
@@ -33,7 +34,9 @@ def example(tmp_path: Path) -> Path:
 
 
 def rack(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return python(folder, "-m", "tools.cli", *words)
+    # A rack of the same name may be at work on this machine.
+    own = ["--set", f"name={OWN_NAME}"] if words[0] == "run" else []
+    return python(folder, "-m", "tools.cli", *words, *own)
 
 
 def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -65,7 +68,8 @@ def test_the_example_level_runs_as_the_readme_has_it(example: Path) -> None:
 def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
     script = re.search(r"```python\n(from boards.rack.*?)```", README.read_text(), re.DOTALL)
     assert script
-    (tmp_path / "script.py").write_text(script[1].replace("seconds=10", "seconds=1"))
+    named = script[1].replace('["clock', f'["name={OWN_NAME}", "clock').replace("seconds=10", "seconds=1")
+    (tmp_path / "script.py").write_text(named)
     ended = python(tmp_path, "script.py")
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.startswith("time over 400 ")
