@@ -7,6 +7,7 @@ due by then has finished: exact, repeatable, as fast as the machine allows.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import posix_ipc
@@ -22,7 +23,7 @@ Ended = Callable[[int], int | None]
 """Called at every tick; returns the tick at which the run stops, once that is known."""
 
 
-class ClockDriver:
+class ClockDriver(ABC):
     """What both modes share: the tick, the releases, the end of the run."""
 
     def __init__(self, segment: Segment, ended: Ended) -> None:
@@ -38,9 +39,9 @@ class ClockDriver:
             if task.is_due(tick, last):
                 task.release(tick)
 
+    @abstractmethod
     def run(self) -> None:
         """Give out ticks until the run is over or the launcher is gone."""
-        raise NotImplementedError
 
     def is_over(self, tick: int) -> bool:
         """Say whether the run ends before `tick`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from time import monotonic_ns
 
 from backplane.clock import SystemClock
@@ -20,7 +21,7 @@ _DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _CORRUPT, _BUS_ERRORS = (
 _MISS, _SKIP, _BUS_ERROR, _DAMAGED = (int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT))
 
 
-class Task:
+class Task(ABC):
     """One task on its board, behind a level's executor or planner."""
 
     def __init__(self, segment: Segment, wiring: TaskWiring) -> None:
@@ -42,9 +43,9 @@ class Task:
             self.cycle(tick)
         self.count_bus()
 
+    @abstractmethod
     def cycle(self, tick: int) -> None:
         """Do what is released at `tick`."""
-        raise NotImplementedError
 
     def tell_clock(self) -> None:
         """In lockstep, have the clock look at this task again."""

@@ -6,6 +6,7 @@ stay outside, in the board that runs it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from backplane.message import Message, MessageType
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 
-__all__ = ["Executor", "Input", "LevelContext", "Planner", "Ports", "Reading", "Verdict"]
+__all__ = ["Executor", "Input", "LevelContext", "Pace", "Planner", "Ports", "Reading", "Verdict"]
 
 
 class Input(NamedTuple):
@@ -37,9 +38,19 @@ class Ports(SimpleNamespace):
         raise AttributeError(f"no port '{name}'; ports: {', '.join(sorted(self.__dict__))}")
 
 
+class Pace(NamedTuple):
+    """How often a level cycles, in ticks, and how many of its cycles one of its plans may take."""
+
+    every: int
+    within_cycles: int
+
+
 @dataclass(frozen=True)
 class LevelContext:
-    """What a level knows of its rack, from the config. Times are ticks of the system clock."""
+    """What a level knows of its rack, from the config. Times are ticks of the system clock.
+
+    `below` is the pace of the level below; None for a level that has none.
+    """
 
     board: str
     every: int
@@ -50,7 +61,7 @@ class LevelContext:
     scene: SceneConfig
     task: Mapping[str, Any]
     sizes: Mapping[str, int]
-    periods: Mapping[str, int]
+    below: Pace | None
     params: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -64,7 +75,7 @@ class LevelContext:
         return self.clock_ns * 1e-9
 
 
-class Executor:
+class Executor(ABC):
     """The foreground of a level: runs every cycle, at high priority, in bounded time.
 
     Subclasses name their ports and write `process`. Output messages keep their values from cycle to
@@ -80,15 +91,15 @@ class Executor:
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start; the board then holds SYSFAIL."""
 
+    @abstractmethod
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Release what the level holds; called once, after the last cycle."""
 
 
-class Planner:
+class Planner(ABC):
     """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
 
     A planner has one output, `plan`, its mailbox `<board>.plan`.
@@ -107,9 +118,9 @@ class Planner:
         """Say, in well under a cycle, whether a plan is wanted now. Default: a command is new."""
         return bool(read.command.is_new)
 
+    @abstractmethod
     def plan(self, read: Ports, write: Message, tick: int) -> None:
         """Make one plan into `write`. It takes effect `within_cycles` cycles after `tick`."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Release what the planner holds; called once, after the last plan."""

@@ -22,6 +22,12 @@ class Upper(Executor):
         write.command.goal = read.status.value.count + 1
 
 
+class Unfinished(Executor):
+    """A level whose author has not written its method."""
+
+    outputs = {"status": COUNT_STATUS}
+
+
 class Lower(Executor):
     """Counts towards the goal, by its own plan."""
 

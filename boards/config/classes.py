@@ -29,4 +29,8 @@ def find_class(reference: str, base: type[T]) -> type[T]:
         kinds = [n for n, c in inspect.getmembers(module, inspect.isclass) if issubclass(c, base) and c is not base]
         what = "has no class" if found is None else f"has no {base.__name__} named"
         raise LookupError(f"module '{module_name}' {what} '{name}'; it has: {', '.join(kinds) or 'none'}")
+    if inspect.isabstract(found):
+        raise LookupError(
+            f"class '{name}' lacks the method '{', '.join(sorted(getattr(found, '__abstractmethods__', ())))}'"
+        )
     return found

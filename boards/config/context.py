@@ -7,7 +7,7 @@ from typing import cast
 from boards.config.cell import cell_sizes
 from boards.config.schema import RackConfig
 from boards.errors import ConfigError, Mistake
-from levels.level import LevelContext
+from levels.level import LevelContext, Pace
 from levels.robot import RobotConfig
 
 
@@ -17,6 +17,7 @@ def context(config: RackConfig, board: str) -> LevelContext:
     sizes = cell_sizes(config, mistakes)
     if mistakes:
         raise ConfigError(mistakes)
+    below = config.board[board].below
     return LevelContext(
         board=board,
         every=config.every(board),
@@ -28,6 +29,6 @@ def context(config: RackConfig, board: str) -> LevelContext:
         scene=config.scene,
         task=config.task,
         sizes=sizes,
-        periods={name: config.every(name) for name in config.board},
+        below=Pace(config.every(below), config.board[below].within_cycles) if below is not None else None,
         params=config.board[board].params,
     )

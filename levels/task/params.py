@@ -10,8 +10,6 @@ from levels.robot import Positive, Table
 class TaskParams(Table):
     """What the levels below need at most, for the promise of a time. In s of simulated time."""
 
-    cycle_below: Positive = Field(0.25, description="cycle of the level below, s")
-    planning_below: Positive = Field(1.0, description="time that it takes to plan one move, s")
     beginning: Positive = Field(0.1, description="from a segment's arrival in the primitive level to motion, s")
     settling: Positive = Field(0.2, description="from the end of a motion to the report that it is done, s")
     gripping: Positive = Field(0.6, description="time that the gripper takes to open or close and to settle, s")

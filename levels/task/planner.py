@@ -14,7 +14,7 @@ from levels.level import Input, LevelContext, Planner, Ports
 from levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
 from levels.params import read_params
 from levels.planning.situation import Situation
-from levels.task.finish import Rehearsed, finish_times
+from levels.task.finish import Rehearsed, cycles_of, finish_times
 from levels.task.params import TaskParams
 from levels.task.program import read_program
 
@@ -42,6 +42,7 @@ class TaskPlanner(Planner):
 
         self._program = read_program(context.task, context.robot, context.scene)
         self._needs = read_params(TaskParams, context.params)
+        self._cycles = cycles_of(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._planned = False
@@ -79,7 +80,7 @@ class TaskPlanner(Planner):
             raise Refused(Error.LIMIT, f"the program has {len(moves)} elemental moves; at most {MOVES} are valid")
         # Planned within its cycles, the plan is read at once and handed down, to be visible a cycle later.
         visible_s = (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
-        finish_s = finish_times(moves, visible_s, self.context.period_s, self._needs)
+        finish_s = finish_times(moves, visible_s, self._cycles, self._needs)
         self._promise(moves, finish_s, write)
         for k, (move, _) in enumerate(moves):
             move.write_to(write.moves[k])

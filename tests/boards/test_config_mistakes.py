@@ -42,7 +42,11 @@ MISTAKES = {
 }
 WIRING_MISTAKES = {
     "no module": ("board.upper.executor='no_levels:Upper'", "cannot import 'no_levels': ModuleNotFoundError"),
-    "no class": ("board.upper.executor='two_levels:Uper'", "has no class 'Uper'; it has: Lower, PlanWriter, Upper"),
+    "no method": ("board.upper.executor='two_levels:Unfinished'", "class 'Unfinished' lacks the method 'process'"),
+    "no class": (
+        "board.upper.executor='two_levels:Uper'",
+        "has no class 'Uper'; it has: Lower, PlanWriter, Unfinished, Upper",
+    ),
     "no executor": ("board.upper.executor='two_levels:LowerPlanner'", "has no Executor named 'LowerPlanner'"),
     "nobody writes": ("board.upper.reads={ status = 'lower.state' }", "nobody writes it; mailboxes: upper.command"),
     "type": (

@@ -91,5 +91,6 @@ def test_cores_that_the_machine_lacks_are_shared_out_and_told(small: Path, monke
 def test_context_tells_a_level_its_rack_in_ticks(small: Path) -> None:
     told = context(load(small, ["board.lower.params.gain=2", "seed=5"]), "lower")
     assert (told.board, told.every, told.within_cycles, told.clock_ns, told.seed) == ("lower", 1, 4, 2_500_000, 5)
-    assert dict(told.periods) == {"upper": 8, "lower": 1}
+    assert told.below is None
+    assert context(load(small), "upper").below == (1, 4)
     assert told.params == {"gain": 2}

@@ -14,7 +14,7 @@ from typing import Any
 from backplane.mailbox import Reading, Verdict
 from backplane.message import Message, MessageType
 from levels.cell import build_cell, sizes
-from levels.level import Executor, Input, LevelContext, Planner, Ports
+from levels.level import Executor, Input, LevelContext, Pace, Planner, Ports
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 
@@ -111,7 +111,7 @@ class Lockstep:
         self.tick = 0
         self.sizes = sizes(build_cell(robot, scene, CLOCK_NS))
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
-        periods = {board.name: board.every for board in boards}
+        paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
             kinds = dict(board.executor.outputs) | ({"plan": board.planner.output} if board.planner else {})
             self.boxes |= {f"{board.name}.{port}": Box(kind, self.sizes) for port, kind in kinds.items()}
@@ -126,7 +126,7 @@ class Lockstep:
                 scene=scene,
                 task=task or {},
                 sizes=self.sizes,
-                periods=periods,
+                below=paces.get(b.below),
                 params=b.params,
             )
             for b in boards

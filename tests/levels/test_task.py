@@ -16,7 +16,7 @@ from levels.planning.motion import MotionPlanner
 from levels.planning.situation import Situation
 from levels.task import TaskExecutor, read_program
 from levels.task.actions import rehearse
-from levels.task.finish import Rehearsed, finish_times
+from levels.task.finish import Cycles, Rehearsed, finish_times
 from levels.task.params import TaskParams
 from levels.task.rehearsal import Rehearsal
 from tests.levels.arms import cell, config
@@ -25,6 +25,7 @@ from tests.levels.whole_rack import WholeRack
 
 ROBOT, SCENE = config("puma560")
 BLOCK1, BLOCK2 = 0, 1
+CYCLES = Cycles(own_s=1.0, below_s=0.25, planning_s=1.0)
 TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 REACH = {"do": "goto", "position": [0.45, 0.10, 0.95]}
 HOME = {"do": "home"}
@@ -123,7 +124,7 @@ def test_rehearsal_can_be_gone_back_to(start: Rehearsal) -> None:
 
 def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> None:
     moves = rehearsed(start, TRANSFER, HOME).moves
-    times = finish_times(moves, 4.0, 1.0, TaskParams())
+    times = finish_times(moves, 4.0, CYCLES, TaskParams())
     assert times[0] > 4.0 + moves[0].duration_s
     for (before, after), (_, duration_s) in zip(itertools.pairwise(times), moves[1:], strict=True):
         assert after >= before + duration_s
@@ -132,7 +133,7 @@ def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> N
 def test_move_with_a_time_ends_no_sooner_and_holds_up_what_follows(start: Rehearsal) -> None:
     first, second = rehearsed(start, REACH, HOME).moves
     late = Rehearsed(first.move._replace(by_s=50.0), first.duration_s)
-    times = finish_times([late, second], 4.0, 1.0, TaskParams())
+    times = finish_times([late, second], 4.0, CYCLES, TaskParams())
     assert times[0] == pytest.approx(51.0)
     assert times[1] > 50.0 + second.duration_s
 
