@@ -1,7 +1,7 @@
 """The memory map: where on the bus every board's window, task block and mailbox lies.
 
 Addresses are byte offsets in the segment. A board's window starts on a page and holds its tasks'
-control blocks and trace rings, then the mailboxes it writes. The map follows from the layout alone.
+control blocks, trace and alarm rings, then the mailboxes it writes. The map follows from the layout alone.
 """
 
 from __future__ import annotations
@@ -18,8 +18,17 @@ HEAD_SIZE = PAGE
 BLOCK_WORDS = 24
 BLOCK_SIZE = BLOCK_WORDS * 8
 TRACE_RECORD_SIZE = 64
+ALARM_RECORD_SIZE = 64
+ALARM_DEPTH = 256
+"""Records in an alarm ring: whoever watches looks many times a second, and an alarm rings once an episode."""
+FAULT_ENTRY_SIZE = 256
+FAULT_ENTRIES = 64
+CLOCK = "clock"
+"""The system controller, in slot 1: its window holds the fault table."""
 MAILBOX_HEAD_SIZE = LINE
 SLOT_HEAD_SIZE = 64
+ALARM_SIZE = LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
+"""Bytes of one alarm ring: a line for its head, then the records."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +47,19 @@ class AddressMap:
         self.windows: list[Window] = []
         self.blocks: dict[str, int] = {}
         self.traces: dict[str, int] = {}
+        self.alarms: dict[str, int] = {}
         self.mailboxes: dict[str, int] = {}
-        address = HEAD_SIZE
+        self.faults = HEAD_SIZE
+        address = self._place_clock(HEAD_SIZE)
         for board in dict.fromkeys(task.board for task in layout.tasks):
             address = self._place_board(board, layout, address)
         self.size = address
+
+    def _place_clock(self, start: int) -> int:
+        self.alarms[CLOCK] = start + FAULT_ENTRIES * FAULT_ENTRY_SIZE
+        end = _up(self.alarms[CLOCK] + ALARM_SIZE, PAGE)
+        self.windows.append(Window(CLOCK, start, end - start))
+        return end
 
     def _place_board(self, board: str, layout: Layout, start: int) -> int:
         address = start
@@ -50,7 +67,8 @@ class AddressMap:
         for task in tasks:
             self.blocks[task.name] = address
             self.traces[task.name] = address + BLOCK_SIZE
-            address = _up(address + BLOCK_SIZE + trace_size(task), LINE)
+            self.alarms[task.name] = _up(address + BLOCK_SIZE + trace_size(task), LINE)
+            address = self.alarms[task.name] + ALARM_SIZE
         names = {task.name for task in tasks}
         for mailbox in layout.mailboxes:
             if mailbox.writer in names:

@@ -5,6 +5,7 @@
 - `SegmentError`: a rack name that is in use, a segment of another layout or owner, a full /dev/shm.
 - `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
 - `ClockError`: a rate off the grid, a period that is no period.
+- `FaultTableError`: more faults than one run can have.
 """
 
 from __future__ import annotations
@@ -24,3 +25,7 @@ class MailboxError(BackplaneError):
 
 class ClockError(BackplaneError):
     """A rate or a period that the system clock cannot keep."""
+
+
+class FaultTableError(BackplaneError):
+    """A fault that cannot be injected."""

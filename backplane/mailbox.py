@@ -29,10 +29,14 @@ class Verdict(IntEnum):
 
 
 class Reading(NamedTuple):
-    """What a read gave: the message, all zero before the first one, and the verdict."""
+    """What a read gave: the message, all zero before the first one, and the verdict.
+
+    `is_lost`: its writer is dead, hangs, or has been silent for longer than a writer of its period may be.
+    """
 
     value: Message
     verdict: Verdict
+    is_lost: bool = False
 
     @property
     def is_new(self) -> bool:

@@ -37,6 +37,11 @@ class System(IntEnum):
     CLOCK_SKIPPED = 39  # ticks that the clock itself left out
     FOLLOWER_PID = 40  # a recorder for which lockstep waits; 0: none
     FOLLOWER_TICK = 41  # everything up to here is recorded
+    TICK_NS = 42  # CLOCK_MONOTONIC at which the clock gave out the newest tick
+    FAULTS = 43  # rises with every change in the fault table that tasks must see; the clock's
+    DEMAND = 44  # Demand of the utility lines on the arm; the clock's
+    CLOCK_PID = 45
+    CLOCK_LOST = 46  # 1 + tick at which the clock was found lost; 0: it is not
     SYSRESET = 48
     ACFAIL = 49
     EMERGENCY_STOP = 50
@@ -51,8 +56,16 @@ class Run(IntEnum):
     STOPPED = 2
 
 
+class Demand(IntEnum):
+    """Values of `System.DEMAND`: what the safety of the rack asks of the arm, the stronger the greater."""
+
+    NONE = 0
+    STOP = 1  # controlled stop: ramp to rest, then brake
+    BRAKE = 2  # brake at once
+
+
 class Block(IntEnum):
-    """Words of a task's control block. RELEASED is the clock's, all others the task's."""
+    """Words of a task's control block. RELEASED is the clock's, LOST of whoever finds it, all others the task's."""
 
     RELEASED = 0  # newest release, as a tick; -1: none yet
     DEADLINE = 1  # tick before which that cycle, or plan, must be finished
@@ -73,6 +86,7 @@ class Block(IntEnum):
     TRACE_HEAD = 16  # trace records written
     LEVEL_STATE = 17  # state of the level, as in its status
     PLANS = 18  # plans made
+    LOST = 19  # 1 + tick at which the task was found dead or hanging; 0: it is not. The clock clears it
 
 
 class TaskState(IntEnum):

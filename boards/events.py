@@ -5,15 +5,40 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-EventKind = Literal["launch", "ready", "start", "printed", "died", "hang", "stop", "end", "recorder"]
+EventKind = Literal[
+    "launch",
+    "ready",
+    "start",
+    "printed",
+    "died",
+    "hang",
+    "stop",
+    "end",
+    "recorder",
+    "fault",
+    "detection",
+    "miss",
+    "reaction",
+    "recovery",
+]
 
 
 @dataclass(frozen=True)
 class Event:
-    """One event. `time_ns` is CLOCK_REALTIME, `tick` the system clock's (-1: before the run)."""
+    """One event. `time_ns` is CLOCK_REALTIME, `tick` the system clock's (-1: before the run).
+
+    What faults, detections, reactions and recoveries say to programs: `code`, an alarm's name in lower case, or "begins"
+    and "ends" of a fault; `fault`, its entry in the fault table (-1: none); `subject`, the mailbox, joint or task
+    concerned; `value`; `since`, the tick since which it holds.
+    """
 
     time_ns: int
     tick: int
     kind: EventKind
     board: str
     text: str
+    code: str = ""
+    fault: int = -1
+    subject: str = ""
+    value: float = 0.0
+    since: int = -1

@@ -7,17 +7,31 @@ stay outside, in the board that runs it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
+from backplane.alarms import Alarm
 from backplane.mailbox import Reading, Verdict
 from backplane.message import Message, MessageType
+from backplane.words import Demand
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 
-__all__ = ["Executor", "Input", "LevelContext", "Pace", "Planner", "Ports", "Reading", "Verdict"]
+__all__ = [
+    "Demand",
+    "Executor",
+    "Fault",
+    "Finding",
+    "Input",
+    "LevelContext",
+    "Pace",
+    "Planner",
+    "Ports",
+    "Reading",
+    "Verdict",
+]
 
 
 class Input(NamedTuple):
@@ -43,6 +57,26 @@ class Pace(NamedTuple):
 
     every: int
     within_cycles: int
+
+
+class Fault(NamedTuple):
+    """A fault that is injected into what a level drives: its kind, as in "sensor-nan", and what the kind takes.
+
+    `seed` makes everything random in it repeatable; `since` is the tick at which it began.
+    """
+
+    kind: str
+    parameters: Mapping[str, float]
+    seed: int
+    since: int
+
+
+class Finding(NamedTuple):
+    """What a level has found wrong, for its board to ring: see `backplane.alarms.Alarm` for subject and value."""
+
+    alarm: Alarm
+    subject: int = -1
+    value: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,9 +118,16 @@ class Executor(ABC):
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, MessageType]] = {}
+    faults: ClassVar[tuple[str, ...]] = ()
+    """Kinds of faults that can be injected into what the level drives."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
+        self.demand = Demand.NONE  # what the safety of the rack asks of the arm in this cycle; set by the board
+        self.findings: list[Finding] = []  # filled in `process`; the board rings and clears them
+
+    def inject(self, faults: Sequence[Fault]) -> None:
+        """Take over the faults that are injected from now on, all that are active; empty: none is."""
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start; the board then holds SYSFAIL."""

@@ -6,7 +6,18 @@ from itertools import pairwise
 
 import pytest
 
-from backplane.address_map import BLOCK_SIZE, HEAD_SIZE, LINE, PAGE, AddressMap, mailbox_size, trace_size
+from backplane.address_map import (
+    ALARM_SIZE,
+    BLOCK_SIZE,
+    FAULT_ENTRIES,
+    FAULT_ENTRY_SIZE,
+    HEAD_SIZE,
+    LINE,
+    PAGE,
+    AddressMap,
+    mailbox_size,
+    trace_size,
+)
 from backplane.layout import Layout, TaskSpec, depth_for
 from backplane.words import Block, Head, System
 from tests.backplane.bus import layout, mailbox, task
@@ -22,7 +33,7 @@ def full() -> Layout:
 
 def test_windows_follow_each_other_on_pages(full: Layout) -> None:
     places = AddressMap(full)
-    assert [window.board for window in places.windows] == ["writer", "reader"]
+    assert [window.board for window in places.windows] == ["clock", "writer", "reader"]
     assert places.windows[0].address == HEAD_SIZE
     assert all(window.address % PAGE == window.size % PAGE == 0 for window in places.windows)
     assert all(first.address + first.size == second.address for first, second in pairwise(places.windows))
@@ -33,6 +44,8 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
     places = AddressMap(full)
     areas = [(places.blocks[t.name], BLOCK_SIZE + trace_size(t)) for t in full.tasks]
     areas += [(places.mailboxes[m.name], mailbox_size(m)) for m in full.mailboxes]
+    areas += [(address, ALARM_SIZE) for address in places.alarms.values()]
+    areas += [(places.faults, FAULT_ENTRIES * FAULT_ENTRY_SIZE)]
     areas.sort()
     assert all(address % LINE == 0 for address, _ in areas)
     assert all(address + size <= following for (address, size), (following, _) in pairwise(areas))
@@ -40,7 +53,7 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
 
 def test_what_a_board_writes_lies_in_its_window(full: Layout) -> None:
     places = AddressMap(full)
-    window = places.windows[0]
+    window = next(window for window in places.windows if window.board == "writer")
     for address in (*places.mailboxes.values(), places.blocks["writer"], places.blocks["writer.planner"]):
         assert window.address <= address < window.address + window.size
 

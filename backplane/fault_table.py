@@ -1,0 +1,159 @@
+"""The fault table: which faults are injected into a rack, in shared memory, in the system controller's window.
+
+Whoever injects adds an entry. The clock alone decides, at the beginning of a tick, which faults begin and which are
+over, so that every task of the tick sees the same and a run in lockstep repeats with its faults. What a kind means,
+and what its parameters are, is known above: here are numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from backplane.address_map import CLOCK, FAULT_ENTRIES, FAULT_ENTRY_SIZE
+from backplane.byte_lock import ByteLock
+from backplane.errors import FaultTableError
+from backplane.segment import Segment
+from backplane.words import System
+
+PARAMETERS = 8
+"""Parameters of one fault, at most."""
+NEVER = 1 << 62
+"""`until` of a fault that lasts until the end of the run."""
+
+
+class Stage(IntEnum):
+    """Values of `Entry.STAGE`."""
+
+    FREE = 0
+    WAITING = 1  # for its tick, or its condition
+    ACTIVE = 2
+    OVER = 3
+
+
+class Entry(IntEnum):
+    """Words of an entry. STAGE, FROM and UNTIL are the clock's once it waits, STRUCK and COUNT of whoever acts."""
+
+    STAGE = 0
+    KIND = 1
+    TASK = 2  # index among the layout's tasks; -1: the clock
+    MAILBOX = 3  # index among the layout's mailboxes; -1: every one that the task writes, or none
+    FROM = 4  # first tick of the fault; -1: as soon as possible, or when its condition holds
+    UNTIL = 5  # first tick behind it; known once it has begun
+    TICKS = 6  # how long it lasts; 0: until the end of the run, or only once, as the kind has it
+    PHASE = 7  # when in its first tick it strikes, in 1/1000 of a tick of real time
+    SEED = 8
+    WHEN_BOX = 9  # condition: index of a mailbox; -1: none
+    WHEN_FIELD = 10  # index of a field in it
+    WHEN_VALUE = 11  # number that the field must equal
+    STRUCK_TICK = 12  # tick at which it first acted; -1: not yet
+    STRUCK_NS = 13  # CLOCK_MONOTONIC at that time
+    COUNT = 14  # times it acted
+    PARAMETER = 16  # eight of them, as bits of float64
+
+
+@dataclass(frozen=True)
+class Injection:
+    """One fault as its entry holds it: see `Entry`. `when` is (mailbox, field, value), indices and a number."""
+
+    kind: int
+    task: int
+    mailbox: int = -1
+    tick: int = -1
+    ticks: int = 0
+    phase: int = 0
+    seed: int = 0
+    when: tuple[int, int, int] | None = None
+    parameters: tuple[float, ...] = ()
+
+
+class FaultEntry:
+    """One entry of the table: `words` and `parameters` are views of shared memory."""
+
+    def __init__(self, segment: Segment, index: int) -> None:
+        address = segment.map.faults + index * FAULT_ENTRY_SIZE
+        self.index = index
+        self.words = segment.words[address // 8 : (address + FAULT_ENTRY_SIZE) // 8]
+        first = address + 8 * Entry.PARAMETER
+        self.parameters = segment.view(first, 8 * PARAMETERS).cast("d")
+
+    def __getitem__(self, word: Entry) -> int:
+        """Return a word of the entry."""
+        return self.words[word]
+
+    @property
+    def stage(self) -> Stage:
+        """Where the fault stands."""
+        return Stage(self.words[Entry.STAGE])
+
+    def acted(self, tick: int, time_ns: int) -> None:
+        """Count that the fault acts now; the first time is kept."""
+        if self.words[Entry.STRUCK_TICK] < 0:
+            self.words[Entry.STRUCK_NS] = time_ns
+            self.words[Entry.STRUCK_TICK] = tick
+        self.words[Entry.COUNT] += 1
+
+
+class FaultTable:
+    """The table of one rack. `entries` are all of them, free ones too."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._words = segment.words
+        self._tasks = {task.name: index for index, task in enumerate(segment.layout.tasks)} | {CLOCK: -1}
+        self.entries = [FaultEntry(segment, index) for index in range(FAULT_ENTRIES)]
+
+    @property
+    def generation(self) -> int:
+        """Rises whenever a fault begins or is over: a task that has seen this number need not look again."""
+        return self._words[System.FAULTS]
+
+    def add(self, injection: Injection) -> FaultEntry:
+        """Fill a free entry; its fault begins when the clock finds it due. Raises `FaultTableError`."""
+        lock = ByteLock(self._segment, self._segment.map.faults)
+        try:
+            # The bound of this wait is the time in which another process fills an entry.
+            while not lock.take():
+                continue
+            entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
+            if entry is None:
+                raise FaultTableError(f"the fault table is full: {len(self.entries)} faults were injected in this run")
+            _fill(entry, injection)
+        finally:
+            lock.close()
+        return entry
+
+    def active(self, task: str) -> list[FaultEntry]:
+        """Return the active faults of a task; "clock" is the clock."""
+        index = self._tasks[task]
+        return [e for e in self.entries if e.words[Entry.STAGE] == Stage.ACTIVE and e.words[Entry.TASK] == index]
+
+    def staged(self, stages: Sequence[Stage]) -> list[FaultEntry]:
+        """Return the entries in one of these stages."""
+        return [e for e in self.entries if e.words[Entry.STAGE] in stages]
+
+
+def _fill(entry: FaultEntry, injection: Injection) -> None:
+    words, when = entry.words, injection.when or (-1, 0, 0)
+    for word, value in (
+        (Entry.KIND, injection.kind),
+        (Entry.TASK, injection.task),
+        (Entry.MAILBOX, injection.mailbox),
+        (Entry.FROM, injection.tick),
+        (Entry.UNTIL, NEVER),
+        (Entry.TICKS, injection.ticks),
+        (Entry.PHASE, injection.phase),
+        (Entry.SEED, injection.seed),
+        (Entry.WHEN_BOX, when[0]),
+        (Entry.WHEN_FIELD, when[1]),
+        (Entry.WHEN_VALUE, when[2]),
+        (Entry.STRUCK_TICK, -1),
+        (Entry.STRUCK_NS, 0),
+        (Entry.COUNT, 0),
+    ):
+        words[word] = value
+    for place, parameter in enumerate(injection.parameters):
+        entry.parameters[place] = parameter
+    # Last: from here the clock may begin it.
+    words[Entry.STAGE] = Stage.WAITING
