@@ -27,8 +27,8 @@ EventKind = Literal[
 class Event:
     """One event. `time_ns` is CLOCK_REALTIME, `tick` the system clock's (-1: before the run).
 
-    What faults, detections, reactions and recoveries say to programs: `code`, an alarm's name in lower case, or "begins"
-    and "ends" of a fault; `fault`, its entry in the fault table (-1: none); `subject`, the mailbox, joint or task
+    What faults, detections, reactions and recoveries say to programs: `code`, an alarm's name in lower case, "begins"
+    or "ends"; `fault`, its entry in the fault table (-1: none); `subject`, the mailbox, joint or task
     concerned; `value`; `since`, the tick since which it holds.
     """
 
