@@ -68,6 +68,10 @@ class Alarm(IntEnum):
     BRAKES_OPENED = 48  # [-1; ticks they were closed]
 
 
+MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
+"""Alarms of cycles that were missed: seen and counted, and nobody need act. All others name a fault, or an act."""
+
+
 class AlarmWriter:
     """The writing end of an alarm ring: a task's, or the clock's ("clock").
 
@@ -87,7 +91,7 @@ class AlarmWriter:
         found = tick if since is None else since
         self._slots[count % ALARM_DEPTH] = (tick, monotonic_ns(), code, subject, value, found, 0, 0)
         self._head[0] = count
-        if self._attention is not None:
+        if self._attention is not None and code not in MISSES:
             # Never a wait: the counter of an eventfd takes more than any run can ring.
             eventfd_write(self._attention, 1)
 

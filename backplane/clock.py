@@ -40,6 +40,11 @@ class SystemClock:
             return self._words[_TICK]
         return (monotonic_ns() - self._words[_EPOCH]) // self._words[_PERIOD]
 
+    @property
+    def period_ns(self) -> int:
+        """Time from tick to tick, in ns of the wall clock."""
+        return self._words[_PERIOD]
+
     def time_of(self, tick: int) -> int:
         """Return the CLOCK_MONOTONIC time of a tick, in ns."""
         return self._words[_EPOCH] + tick * self._words[_PERIOD]

@@ -6,6 +6,7 @@
 - `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
 - `ClockError`: a rate off the grid, a period that is no period.
 - `FaultTableError`: more faults than one run can have.
+- `EmergencyStopError`: a reset of the emergency stop while an input is not good.
 """
 
 from __future__ import annotations
@@ -29,3 +30,7 @@ class ClockError(BackplaneError):
 
 class FaultTableError(BackplaneError):
     """A fault that cannot be injected."""
+
+
+class EmergencyStopError(BackplaneError):
+    """A latch that cannot be reset."""

@@ -120,6 +120,7 @@ class FaultTable:
             if entry is None:
                 raise FaultTableError(f"the fault table is full: {len(self.entries)} faults were injected in this run")
             _fill(entry, injection)
+            self._words[System.INJECTED] += 1
         finally:
             lock.close()
         return entry

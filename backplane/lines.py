@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from backplane.errors import EmergencyStopError
 from backplane.segment import Segment
-from backplane.words import System
+from backplane.words import Block, System
 
 
 class UtilityLines:
@@ -12,6 +13,7 @@ class UtilityLines:
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
         self._slots = sorted({task.slot for task in segment.layout.tasks})
+        self._blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
 
     def release_sysfail(self, slot: int) -> None:
         """Say that the board in `slot` has passed its self-test."""
@@ -40,3 +42,20 @@ class UtilityLines:
     def emergency_stop(self) -> bool:
         """The emergency-stop latch."""
         return bool(self._words[System.EMERGENCY_STOP])
+
+    @property
+    def bad_inputs(self) -> list[str]:
+        """What forbids a reset of the latch, as text: utility lines that are asserted, boards that are lost."""
+        found = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
+        found += ["ACFAIL"] if self.acfail else []
+        return found + [f"board '{name}' is lost" for name, block in self._blocks.items() if block[Block.LOST]]
+
+    def latch_emergency_stop(self) -> None:
+        """Set the latch: the arm brakes, and stays braked until the latch is reset."""
+        self._words[System.EMERGENCY_STOP] = 1
+
+    def reset_emergency_stop(self) -> None:
+        """Clear the latch. Raises `EmergencyStopError` with every input that is not good; it stays set then."""
+        if bad := self.bad_inputs:
+            raise EmergencyStopError(f"the emergency stop stays latched: {', '.join(bad)}")
+        self._words[System.EMERGENCY_STOP] = 0

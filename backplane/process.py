@@ -5,16 +5,30 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+GONE = "ZX"
+"""States of a process that has ended."""
+STOPPED = "Tt"
+"""States of a process that a signal, or a debugger, has stopped."""
+
 
 def start_time(pid: int) -> int:
     """Return when a process started, in kernel clock ticks since boot; 0 when there is none or it is a zombie."""
+    fields = _stat(pid)
+    return int(fields[19]) if fields and fields[0] not in GONE else 0
+
+
+def state_of(pid: int) -> str:
+    """Return the kernel's letter for what a process does: R, S, D, T (stopped), Z (dead, not reaped); X: no process."""
+    return (_stat(pid) or "X")[0]
+
+
+def _stat(pid: int) -> list[str]:
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except (FileNotFoundError, ProcessLookupError):
-        return 0
+        return []
     # The command name, in parentheses, may itself hold spaces and parentheses.
-    fields = stat.rpartition(")")[2].split()
-    return 0 if fields[0] in "ZX" else int(fields[19])
+    return stat.rpartition(")")[2].split()
 
 
 def is_alive(pid: int, started: int = 0) -> bool:

@@ -8,16 +8,23 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from time import monotonic_ns
 
 import posix_ipc
 
+from backplane.alarms import Alarm, AlarmWriter
 from backplane.clock import SystemClock
-from backplane.process import is_alive
+from backplane.process import GONE, STOPPED, is_alive, state_of
 from backplane.segment import Segment
 from backplane.semaphores import wake_semaphore
-from backplane.words import Block, Head
+from backplane.words import Block, Head, System
 
 _RELEASED = int(Block.RELEASED)
+_TICK = int(System.TICK)
+CLOCK_TICKS = 3
+"""Ticks after which a release that does not come is the clock's: it is looked at then."""
+CLOCK_SILENT_S = 0.5
+"""Time without a tick after which the clock is called stopped though its process could run."""
 CHECK_S = 0.25
 """A wait that takes longer looks whether the launcher still lives."""
 SPINS = 100_000
@@ -31,14 +38,21 @@ class NextCycle:
     plan: until then it is taken late, as of its own tick, for its result depends on ticks alone all the same.
     """
 
-    def __init__(self, segment: Segment, task: str, poll: bool = False) -> None:
+    def __init__(
+        self, segment: Segment, task: str, poll: bool = False, clock_alarms: AlarmWriter | None = None
+    ) -> None:
+        """Wait for the releases of `task`; with `clock_alarms` look at a clock that is silent, and tell there."""
         self._spec = segment.layout.task(task)
         self._clock = SystemClock(segment)
         self._block = segment.block(task)
         self._semaphore = wake_semaphore(segment.rack, task)
         self._launcher = segment.words[Head.LAUNCHER_PID], segment.words[Head.LAUNCHER_START]
+        self._words = segment.words
         self._poll = poll
-        self._slack = self._spec.every * (self._spec.within_cycles - 1)
+        self._clock_alarms = None if self._clock.is_lockstep else clock_alarms
+        self._clock_is_silent = False
+        # A restarted planner takes nothing that was released before its time.
+        self._slack = 0
         self._last = self._block[Block.RELEASED]
         self._not_before = 0
         self.skipped = 0
@@ -65,16 +79,40 @@ class NextCycle:
         release = max(expected, newest - self._slack)
         self.skipped = (release - expected) // every
         self._last = release
+        self._slack = every * (self._spec.within_cycles - 1)
         if self._poll:
             self._take_posts(1 + self.skipped)
         return release
 
     def _block_on_semaphore(self) -> bool:
         try:
-            self._semaphore.acquire(CHECK_S)
+            self._semaphore.acquire(CHECK_S if self._clock_alarms is None else self._patience_s())
         except posix_ipc.BusyError:
+            if self._clock_alarms is not None and self._last >= 0:
+                self._look_at_clock(self._clock_alarms)
             return is_alive(*self._launcher)
         return True
+
+    def _patience_s(self) -> float:
+        """Return how long to wait for the next release, s, before the clock is looked at."""
+        if self._last < 0:
+            return CHECK_S
+        every = self._spec.every
+        late = self._clock.time_of(self._last + every - self._last % every + CLOCK_TICKS) - monotonic_ns()
+        again = CLOCK_TICKS * self._clock.period_ns
+        return min((late if late > 0 else again) * 1e-9, CHECK_S)
+
+    def _look_at_clock(self, alarms: AlarmWriter) -> None:
+        """Tell, once, of a clock that gives out no ticks: its process is stopped or dead, or silent for too long."""
+        now, newest = self._clock.now(), self._words[_TICK]
+        if now - newest < CLOCK_TICKS:
+            self._clock_is_silent = False
+            return
+        silent_s = (now - newest) * self._clock.period_ns * 1e-9
+        stopped = state_of(self._words[System.CLOCK_PID]) in STOPPED + GONE
+        if not self._clock_is_silent and (stopped or silent_s > CLOCK_SILENT_S):
+            self._clock_is_silent = True
+            alarms.ring(now, Alarm.CLOCK_STOPPED, value=now - newest, since=newest + 1)
 
     def _spin(self) -> bool:
         block, last = self._block, self._last

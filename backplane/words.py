@@ -41,7 +41,8 @@ class System(IntEnum):
     FAULTS = 43  # rises with every change in the fault table that tasks must see; the clock's
     DEMAND = 44  # Demand of the utility lines on the arm; the clock's
     CLOCK_PID = 45
-    CLOCK_LOST = 46  # 1 + tick at which the clock was found lost; 0: it is not
+    INJECTED = 46  # faults put into the fault table so far
+    LOSSES = 47  # rises when a board was found dead; the crate's
     SYSRESET = 48
     ACFAIL = 49
     EMERGENCY_STOP = 50
@@ -98,6 +99,7 @@ class TaskState(IntEnum):
     RUNNING = 3
     ENDED = 4
     FAILED = 5
+    GIVEN_UP = 6  # lost, and not to be restarted; the Rack's
 
 
 class Box(IntEnum):

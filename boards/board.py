@@ -12,7 +12,8 @@ from backplane.errors import BackplaneError
 from backplane.lines import UtilityLines
 from backplane.segment import Segment
 from backplane.words import Block, TaskState
-from boards.clock_board import ClockWiring, run_clock
+from boards.clock_board import run_clock
+from boards.clock_wiring import ClockWiring
 from boards.executor_task import ExecutorTask
 from boards.planner_task import PlannerTask
 from boards.processor import die_with_parent, name_process, set_priority, take_processor
@@ -28,6 +29,8 @@ SELF_TEST_FAILED = 3
 def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
     """Run `board` in the forked child of the crate; return its exit status."""
     die_with_parent(crate)
+    # The crate's own priority is not its boards': each takes what its config gives it when it is ready.
+    set_priority(0)
     name_process(f"{segment.rack}:{name}")
     try:
         return board(segment)
@@ -39,16 +42,16 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
         return 1
 
 
-def run_task_board(segment: Segment, wiring: TaskWiring, ready: int) -> int:
+def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
     """Build a task's level, test it, take the processor, and cycle until the run is over.
 
-    `ready` is an eventfd that counts the boards whose self-test has passed.
+    `attention` is the eventfd of whoever watches the rack: a board that is ready, or has an alarm, rings there.
     """
     block = segment.block(wiring.task)
     block[Block.PID] = os.getpid()
     block[Block.STATE] = TaskState.STARTING
     try:
-        _run_level(segment, wiring, ready)
+        _run_level(segment, wiring, attention)
     except BaseException:
         block[Block.STATE] = TaskState.FAILED
         UtilityLines(segment).assert_sysfail(segment.layout.task(wiring.task).slot)
@@ -57,17 +60,20 @@ def run_task_board(segment: Segment, wiring: TaskWiring, ready: int) -> int:
     return 0
 
 
-def _run_level(segment: Segment, wiring: TaskWiring, ready: int) -> None:
+def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
     spec, block = segment.layout.task(wiring.task), segment.block(wiring.task)
     level = load(wiring.target)(wiring.context)
     try:
         level.self_test()
+        if wiring.fails_self_test:
+            raise LevelError("the self-test fails, as its fault in the config says")
         UtilityLines(segment).release_sysfail(spec.slot)
         processor = take_processor(spec)
         block[Block.CORE], block[Block.PRIORITY] = processor.core, processor.priority
-        task = _task(segment, wiring, level)
+        task = _task(segment, wiring, level, attention)
         block[Block.STATE] = TaskState.READY
-        os.eventfd_write(ready, 1)
+        os.eventfd_write(attention, 1)
+        task.tell_clock()
         task.run()
     finally:
         # Ordinary scheduling for what is left: closing files must not hold up another board's cycle.
@@ -75,18 +81,18 @@ def _run_level(segment: Segment, wiring: TaskWiring, ready: int) -> None:
         level.close()
 
 
-def run_clock_board(segment: Segment, wiring: ClockWiring) -> int:
+def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> int:
     """Take the processor and run the system clock."""
     os.sched_setaffinity(0, {wiring.core})
     set_priority(wiring.priority)
-    run_clock(segment, wiring)
+    run_clock(segment, wiring, attention)
     return 0
 
 
-def _task(segment: Segment, wiring: TaskWiring, level: Executor | Planner) -> Task:
+def _task(segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int) -> Task:
     if isinstance(level, Executor):
-        return ExecutorTask(segment, wiring, level)
-    return PlannerTask(segment, wiring, level)
+        return ExecutorTask(segment, wiring, level, attention)
+    return PlannerTask(segment, wiring, level, attention)
 
 
 def load(target: str) -> type[Executor] | type[Planner]:

@@ -2,35 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import time
-from dataclasses import dataclass
 
-from backplane.clock_driver import ClockDriver, Ended, LockstepDriver, RealtimeDriver
+from backplane.address_map import CLOCK
+from backplane.alarms import Alarm, AlarmWriter
+from backplane.clock import SystemClock
+from backplane.clock_driver import ClockDriver, Ended
+from backplane.lockstep_driver import LockstepDriver
 from backplane.message import State
 from backplane.protocols import open_observer
+from backplane.realtime_driver import RealtimeDriver
 from backplane.segment import Segment
-from backplane.words import System
+from backplane.words import Run, System
+from boards.clock_wiring import ClockWiring
+from boards.system_controller import SystemController
 
 HEAD_START_NS = 20_000_000
 """From the start of the clock board to tick 0: its own start-up is not a late tick."""
-
-
-@dataclass(frozen=True)
-class ClockWiring:
-    """How a run goes in time. `period_ns` is of the wall clock, the speed factor counted in.
-
-    The run ends after `stop_tick` ticks (0: never), or `linger` ticks after the mailbox `ends_run` says
-    done or error.
-    """
-
-    lockstep: bool
-    period_ns: int
-    stop_tick: int
-    ends_run: str | None
-    linger: int
-    history: int
-    core: int
-    priority: int
 
 
 class EndOfRun:
@@ -50,15 +39,24 @@ class EndOfRun:
         return self._stop_tick
 
 
-def run_clock(segment: Segment, wiring: ClockWiring) -> None:
-    """Run the clock until the run is over."""
-    segment.words[System.EPOCH_NS] = time.monotonic_ns() + HEAD_START_NS
-    driver_of_run(segment, wiring, EndOfRun(segment, wiring)).run()
+def run_clock(segment: Segment, wiring: ClockWiring, attention: int | None = None) -> None:
+    """Run the clock until the run is over; a restarted clock goes on with the grid that it finds."""
+    words = segment.words
+    words[System.CLOCK_PID] = os.getpid()
+    alarms = AlarmWriter(segment, CLOCK, attention)
+    if words[System.STATE] != Run.RUNNING:
+        words[System.EPOCH_NS] = time.monotonic_ns() + HEAD_START_NS
+    else:
+        now, newest = SystemClock(segment).now(), words[System.TICK]
+        alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
+    driver = driver_of_run(segment, wiring, EndOfRun(segment, wiring), alarms)
+    driver.controller = SystemController(segment, wiring, driver)
+    driver.run()
 
 
-def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended) -> ClockDriver:
+def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: AlarmWriter) -> ClockDriver:
     """Return the clock's driver for the run's mode."""
     if not wiring.lockstep:
-        return RealtimeDriver(segment, ended)
+        return RealtimeDriver(segment, ended, alarms)
     at_once = any(mailbox.protocol != "time-slice" for mailbox in segment.layout.mailboxes)
-    return LockstepDriver(segment, ended, at_once, wiring.history)
+    return LockstepDriver(segment, ended, at_once, wiring.history, alarms)

@@ -3,7 +3,7 @@
 Importing numpy, MuJoCo and the planning libraries takes a second; forked boards share it. The crate stays
 single-threaded, so that forking is safe at any time, and it is the boards' parent: it reaps them, and the
 kernel kills them should it end. Started by the Rack as
-`python -m boards.crate LINE READY`: descriptors of the line and of the eventfd on which boards report ready.
+`python -m boards.crate LINE ATTENTION`: descriptors of the line and of the eventfd on which boards ring.
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ from contextlib import suppress
 
 from backplane import semaphores
 from backplane.segment import Segment
+from backplane.words import Block, Run, System, TaskState
 from boards.board import enter, run_clock_board, run_task_board
 from boards.channel import Channel
-from boards.clock_board import ClockWiring
-from boards.crate_messages import Ended, Forked, Open, Opened, PowerOff, PowerOn, Preload
+from boards.clock_wiring import ClockWiring
+from boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
+from boards.faults.hog import hog
+from boards.processor import set_priority
 from boards.wiring import TaskWiring
 
 LEAVE_S = 0.5
@@ -34,9 +37,9 @@ LEAVE_S = 0.5
 class Crate:
     """The boards' parent. Lives until the Rack closes the line."""
 
-    def __init__(self, line: Channel, ready: int) -> None:
+    def __init__(self, line: Channel, attention: int) -> None:
         self._line = line
-        self._ready = ready
+        self._attention = attention
         self._segment: Segment | None = None
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
         self._poll = select.poll()
@@ -67,16 +70,19 @@ class Crate:
                         importlib.import_module(name)
                 gc.collect()
                 gc.freeze()
-            case Open(rack):
+            case Open(rack, priority):
                 self._segment = Segment.attach(rack)
                 semaphores.open_all(self._segment.layout)
+                set_priority(priority)
                 self._line.send(Opened())
             case PowerOn(name, TaskWiring() as task):
-                self._fork(name, lambda segment: run_task_board(segment, task, self._ready))
+                self._fork(name, lambda segment: run_task_board(segment, task, self._attention))
             case PowerOn(name, ClockWiring() as clock):
-                self._fork(name, lambda segment: run_clock_board(segment, clock))
-            case PowerOff():
-                self._kill()
+                self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
+            case PowerOn(name, HogWiring(entry)):
+                self._fork(name, lambda segment: hog(segment, entry))
+            case PowerOff(name):
+                self._kill(name)
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
         assert self._segment is not None, "the Rack opens the segment first"
@@ -96,18 +102,36 @@ class Crate:
         self._line.send(Forked(name, pid))
 
     def _reap(self, pidfd: int) -> None:
+        seen_ns = time.monotonic_ns()
         name, pid = self._boards.pop(pidfd)
+        tick = self._mark_lost(name)
         self._poll.unregister(pidfd)
         os.close(pidfd)
         _, status = os.waitpid(pid, 0)
         try:
-            self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status)))
+            self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
         except OSError:
             return
 
-    def _kill(self) -> None:
-        for pidfd in self._boards:
-            signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+    def _mark_lost(self, name: str) -> int:
+        """Say on the backplane that a board is dead, for the clock and its neighbours; return the tick."""
+        assert self._segment is not None, "boards are forked behind the segment"
+        words = self._segment.words
+        tick = words[System.TICK]
+        if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
+            block = self._segment.block(name)
+            if block[Block.STATE] != TaskState.FAILED:
+                block[Block.STATE] = TaskState.ABSENT
+            block[Block.LOST] = block[Block.LOST] or tick + 1
+            words[System.LOSSES] += 1
+            # In lockstep the clock waits to know.
+            semaphores.clock_semaphore(self._segment.rack).release()
+        return tick
+
+    def _kill(self, board: str | None = None) -> None:
+        for pidfd, (name, _) in self._boards.items():
+            if board in (None, name):
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
     def _leave(self) -> None:
         """The Rack is gone: the boards see it and end; what has not ended in time is killed."""
@@ -127,10 +151,11 @@ class Crate:
 
 def main() -> None:
     """Serve as the crate of the Rack at the other end of the inherited socket."""
-    # Ctrl-C reaches the whole foreground group; how the run ends is the Rack's decision.
+    # Ctrl-C, and what ends a group, reach every process of it; how the run ends is the Rack's decision.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    line, ready = (int(fd) for fd in sys.argv[1:])
-    Crate(Channel(socket.socket(fileno=line)), ready).run()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    line, attention = (int(fd) for fd in sys.argv[1:])
+    Crate(Channel(socket.socket(fileno=line)), attention).run()
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from boards.channel import Channel
-from boards.crate_messages import PowerOff
 from boards.errors import LaunchError
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -19,18 +18,18 @@ SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL
 
 
 class CrateLine:
-    """A running crate: its line, its eventfd of ready boards, and what its boards print."""
+    """A running crate: its line, the eventfd on which its boards ring, and what they print."""
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
-        self.ready = os.eventfd(0, os.EFD_NONBLOCK)
+        self.attention = os.eventfd(0, os.EFD_NONBLOCK)
         # A file in memory: a board that prints never waits for a reader.
         self._printed = os.memfd_create("boards")
         self._read_to = 0
         self._process = subprocess.Popen(
             # Unbuffered: a board leaves by no way that would write out what it has printed.
-            [sys.executable, "-u", "-m", "boards.crate", str(theirs.fileno()), str(self.ready)],
-            pass_fds=(theirs.fileno(), self.ready),
+            [sys.executable, "-u", "-m", "boards.crate", str(theirs.fileno()), str(self.attention)],
+            pass_fds=(theirs.fileno(), self.attention),
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
             stderr=self._printed,
@@ -58,10 +57,10 @@ class CrateLine:
         except OSError:
             raise LaunchError("\n".join(self.printed()) or "the crate has ended") from None
 
-    def power_off(self) -> None:
-        """Have the crate kill every board; no error when it is gone itself."""
+    def ask(self, request: object) -> None:
+        """Hand a request to the crate; when it is gone, whoever hears the line learns that."""
         with suppress(LaunchError):
-            self.send(PowerOff())
+            self.send(request)
 
     def close(self, timeout_s: float) -> None:
         """Close the line, whereupon the crate ends its boards and itself; kill it should it not."""
@@ -71,5 +70,5 @@ class CrateLine:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        os.close(self.ready)
+        os.close(self.attention)
         os.close(self._printed)

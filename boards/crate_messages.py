@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from boards.clock_board import ClockWiring
+from boards.clock_wiring import ClockWiring
 from boards.wiring import TaskWiring
 
 
@@ -18,22 +18,35 @@ class Preload:
 
 @dataclass(frozen=True)
 class Open:
-    """Attach to a rack's segment and open its semaphores."""
+    """Attach to a rack's segment and open its semaphores; take this SCHED_FIFO priority, if allowed.
+
+    The crate sees deaths, and must not wait for planners to do so; no board waits for it.
+    """
 
     rack: str
+    priority: int
+
+
+@dataclass(frozen=True)
+class HogWiring:
+    """A hog, and the entry of the fault table that it does."""
+
+    entry: int
 
 
 @dataclass(frozen=True)
 class PowerOn:
-    """Fork one board: a task, or the clock."""
+    """Fork one board: a task, the clock, or a hog, which is no board and takes one's core away."""
 
     name: str
-    wiring: TaskWiring | ClockWiring
+    wiring: TaskWiring | ClockWiring | HogWiring
 
 
 @dataclass(frozen=True)
 class PowerOff:
-    """Kill every board that still runs."""
+    """Kill one board, or every board that still runs."""
+
+    name: str | None = None
 
 
 @dataclass(frozen=True)
@@ -51,8 +64,13 @@ class Forked:
 
 @dataclass(frozen=True)
 class Ended:
-    """A board's process has ended; `status` is negative for a signal, as in subprocess."""
+    """A board's process has ended; `status` is negative for a signal, as in subprocess.
+
+    `seen_ns` is when the crate saw it, CLOCK_MONOTONIC, and `tick` the system clock's then.
+    """
 
     name: str
     pid: int
     status: int
+    seen_ns: int
+    tick: int

@@ -5,16 +5,19 @@ from __future__ import annotations
 from time import monotonic_ns
 
 from backplane.segment import Segment
+from backplane.words import Demand, System
 from boards.task import Task
 from boards.wiring import TaskWiring
 from levels.level import Executor
+
+_DEMAND, _DEMANDS = int(System.DEMAND), tuple(Demand)
 
 
 class ExecutorTask(Task):
     """Runs a level's executor every cycle."""
 
-    def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor) -> None:
-        super().__init__(segment, wiring)
+    def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None) -> None:
+        super().__init__(segment, wiring, executor, attention)
         self.executor = executor
 
     def cycle(self, tick: int) -> None:
@@ -22,7 +25,21 @@ class ExecutorTask(Task):
         start = monotonic_ns()
         self.inputs.read(tick)
         read = monotonic_ns()
-        self.executor.process(self.inputs.values, self.outputs.messages, tick)
+        executor = self.executor
+        executor.demand = _DEMANDS[self.words[_DEMAND]]
+        executor.process(self.inputs.values, self.outputs.messages, tick)
+        if executor.findings or executor.acted or self.faults.loads:
+            self._tell(tick)
         processed = monotonic_ns()
         in_time = self.outputs.write(tick, self.clock.now(), self.inputs)
         self.finish(tick, start, read, processed, tick + self.spec.every, in_time)
+
+    def _tell(self, tick: int) -> None:
+        """Ring what the level has found, count the faults that acted, and compute as long as they say."""
+        executor = self.executor
+        for alarm, subject, value in executor.findings:
+            self.alarms.ring(tick, alarm, subject, value)
+        executor.findings.clear()
+        self.faults.count(executor.acted, tick)
+        executor.acted.clear()
+        self.faults.burn(tick)

@@ -1,17 +1,20 @@
-"""Signs of life: a task that has finished nothing for longer than its bound hangs."""
+"""Signs of life, as the host sees them: a task that has finished nothing for much longer than it may hangs.
+
+In real time the clock's watchdog finds out sooner; this finds a clock that has no tick, and what hangs in lockstep.
+"""
 
 from __future__ import annotations
 
 import time
 
+from backplane.address_map import CLOCK
 from backplane.segment import Segment
 from backplane.words import Block, Run, System
 
 BEATS = 4
 """Cycles without a sign of life: three gave a false trip in 24,000 at 400 Hz."""
-LEAST_S = 1.0
+LEAST_S = 2.0
 """The launcher itself is an ordinary process on a machine full of real-time ones: it looks no closer than this."""
-CLOCK = "clock"
 LOCKSTEP_S = 60.0
 """In lockstep a plan takes as long as it takes; time stands still meanwhile."""
 
@@ -38,11 +41,14 @@ class Heartbeat:
             return []
         now = time.monotonic()
         for name, block in self._blocks.items():
-            # A task that has nothing to do is alive: its newest release is finished.
-            if block[Block.DONE] != self._seen[name][0] or block[Block.DONE] == block[Block.RELEASED]:
+            # A task that has nothing to do is alive: its newest release is finished. One that is lost is known to be.
+            idle = block[Block.DONE] == block[Block.RELEASED] or block[Block.LOST]
+            if block[Block.DONE] != self._seen[name][0] or idle:
                 self._seen[name] = block[Block.DONE], now
+                self._reported.discard(name)
         if self._words[System.TICK] != self._seen[CLOCK][0]:
             self._seen[CLOCK] = self._words[System.TICK], now
+            self._reported.discard(CLOCK)
         found = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]
         self._reported.update(found)
         return found

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from backplane.fault_table import Injection
 from backplane.layout import Layout
 from backplane.message import State
 from backplane.protocols import open_observer
 from backplane.segment import Segment
-from backplane.words import Block
-from boards.clock_board import ClockWiring
+from backplane.words import Block, Demand
+from boards.clock_wiring import ClockWiring
 from boards.config import context, shared_out, wire
 from boards.config.cores import obtained_core
 from boards.config.ports import TaskPorts, all_ports
 from boards.config.schema import RackConfig
+from boards.faults.kinds import KINDS
+from boards.faults.request import injections
 from boards.outcome import Cause
 from boards.wiring import TaskWiring
 
@@ -30,13 +33,16 @@ class Launch:
     config: RackConfig
     layout: Layout
     tasks: tuple[TaskWiring, ...]
+    faults: tuple[Injection, ...]
 
     @classmethod
     def of(cls, config: RackConfig) -> Launch:
         """Wire a config. Raises `ConfigError` with every mistake."""
         layout = wire(config)
-        tasks = tuple(_task(config, layout, ports) for ports in all_ports(config, []))
-        return cls(config, layout, tasks)
+        faults = injections(config, layout)
+        failing = {layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"}
+        tasks = tuple(_task(config, layout, ports, ports.task in failing) for ports in all_ports(config, []))
+        return cls(config, layout, tasks, faults)
 
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return how the run goes in time; it lasts `seconds` of simulated time, or until the task ends."""
@@ -50,7 +56,19 @@ class Launch:
             history=round(HISTORY_S * 1e9 / tick_ns),
             core=obtained_core(clock.core),
             priority=clock.priority,
+            restart_ticks=max(1, round(self.config.supervision.lockstep_restart_s * 1e9 / tick_ns)),
+            on_loss={task.name: self._on_loss(task.board) for task in self.layout.tasks if task.role == "executor"},
         )
+
+    def _on_loss(self, board: str) -> Demand:
+        """Return what the loss of a board asks of the arm; where its neighbour holds, nothing."""
+        return {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}[self.config.board[board].on_loss]
+
+    @property
+    def crate_priority(self) -> int:
+        """SCHED_FIFO priority of the crate: below every board's that has one, above everything ordinary."""
+        priorities = [task.priority for task in self.layout.tasks if task.priority and task.role == "executor"]
+        return max(min(priorities, default=0) - 1, 0)
 
     @property
     def ends_run(self) -> str | None:
@@ -98,7 +116,7 @@ def modules(config: RackConfig) -> tuple[str, ...]:
     return tuple(dict.fromkeys(target.partition(":")[0] for target in targets))
 
 
-def _task(config: RackConfig, layout: Layout, ports: TaskPorts) -> TaskWiring:
+def _task(config: RackConfig, layout: Layout, ports: TaskPorts, fails_self_test: bool) -> TaskWiring:
     board, spec = config.board[ports.board], layout.task(ports.task)
     tight = spec.role == "planner" and board.coupling == "tight"
     locked = layout.mailbox(f"{ports.board}.plan").protocol == "lock" if tight else False
@@ -110,4 +128,6 @@ def _task(config: RackConfig, layout: Layout, ports: TaskPorts) -> TaskWiring:
         context=context(config, ports.board),
         poll=(board.wake or config.clock.wake) == "poll" and spec.role == "executor",
         critical_priority=board.priority if locked else 0,
+        guards_clock=spec.role == "executor" and spec.every == min(task.every for task in layout.tasks),
+        fails_self_test=fails_self_test,
     )

@@ -18,8 +18,8 @@ from levels.level import Planner
 class PlannerTask(Task):
     """Runs a level's planner: asks every cycle whether a plan is wanted, and gives each plan its cycles."""
 
-    def __init__(self, segment: Segment, wiring: TaskWiring, planner: Planner) -> None:
-        super().__init__(segment, wiring)
+    def __init__(self, segment: Segment, wiring: TaskWiring, planner: Planner, attention: int | None = None) -> None:
+        super().__init__(segment, wiring, planner, attention)
         self.planner = planner
         self.slice = self.spec.every * self.spec.within_cycles
         self._critical_priority = wiring.critical_priority
@@ -38,6 +38,7 @@ class PlannerTask(Task):
         self.block[Block.DEADLINE] = tick + self.slice
         self.tell_clock()
         self.planner.plan(self.inputs.values, self.outputs.messages.plan, tick)
+        self.faults.burn(tick)
         processed = monotonic_ns()
         with self._critical_section():
             in_time = self.outputs.write(tick, self.clock.now(), self.inputs)

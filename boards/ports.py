@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+from backplane.alarms import AlarmWriter
+from backplane.fault_table import FaultEntry
 from backplane.message import Message
 from backplane.protocols import open_reader, open_writer
 from backplane.segment import Segment
@@ -13,7 +15,7 @@ from levels.level import Ports, Reading, Verdict
 class InputPorts:
     """The mailboxes that a task reads; `values` holds what the last `read` gave, by port."""
 
-    def __init__(self, segment: Segment, mailboxes: Mapping[str, str]) -> None:
+    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter) -> None:
         self.readers = {port: open_reader(segment, name) for port, name in mailboxes.items()}
         self.values = Ports(**{port: Reading(r.message, Verdict.NONE) for port, r in self.readers.items()})
         self._slots = [(self.values.__dict__, port, reader.read) for port, reader in self.readers.items()]
@@ -42,9 +44,12 @@ class InputPorts:
 class OutputPorts:
     """The mailboxes that a task writes; `messages` holds the outgoing message of each port."""
 
-    def __init__(self, segment: Segment, mailboxes: Mapping[str, str]) -> None:
+    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter) -> None:
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
         self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
+
+    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
+        """Write with these faults from now on."""
 
     def message(self, port: str) -> Message | None:
         """Return the outgoing message of a port, if there is such a port."""

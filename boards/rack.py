@@ -13,22 +13,31 @@ from types import TracebackType
 from typing import Self
 
 from backplane import semaphores
+from backplane.address_map import CLOCK
+from backplane.alarms import Alarm
 from backplane.digest import digest
+from backplane.fault_table import FaultTable
+from backplane.lines import UtilityLines
 from backplane.segment import Segment, unlink
 from backplane.words import Block, Run, System, TaskState
+from boards.alarm_watch import AlarmWatch, Heard
 from boards.clean import remove_dead
 from boards.config import load
 from boards.config.schema import RackConfig
 from boards.crate_line import CrateLine
-from boards.crate_messages import Ended, Forked, Open, Opened, PowerOn, Preload
+from boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
 from boards.errors import LaunchError
 from boards.events import Event, EventKind
+from boards.faults.kinds import KINDS
 from boards.heartbeat import Heartbeat
 from boards.launch import Launch, modules
 from boards.outcome import Cause, Outcome
+from boards.recovery import Recovery
+from boards.supervision import Supervision
 
 LAUNCH_S = 60.0
 """Bound of the launch: a stranger's model with many meshes compiles for a while in every board."""
+UP = (TaskState.READY, TaskState.RUNNING)
 LEAVE_S = 2.0
 """Bound of the boards' own end."""
 
@@ -48,6 +57,7 @@ class Rack:
         self._crate: CrateLine | None = None
         self._pids: dict[str, int] = {}
         self._faults: list[str] = []
+        self._is_beyond_help = False
         self._cause: Cause | None = None
 
     @classmethod
@@ -81,44 +91,56 @@ class Rack:
         self._plan = plan = Launch.of(self.config)
         remove_dead(self.config.name)
         self.segment = Segment.create(plan.layout, self.config.text())
-        self._set_clock()
+        self._set_words()
         semaphores.create(plan.layout)
-        crate.send(Open(self.config.name))
+        crate.send(Open(self.config.name, plan.crate_priority))
         self._tell("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
         self._expect(Opened)
         # The crate has them open and every board inherits them: with no name nothing can be left behind.
         semaphores.unlink(plan.layout)
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
-        self._await_ready(len(plan.tasks))
+        self._await_ready()
+        self._inject()
         for note in plan.notes(self.segment):
             self._tell("ready", "", note)
 
-    def _set_clock(self) -> None:
+    def _set_words(self) -> None:
         words, clock = self.segment.words, self.config.clock
+        # The latch starts set: whatever happens before the explicit reset, the arm's brakes stay closed.
+        words[System.EMERGENCY_STOP] = 1
         words[System.LOCKSTEP] = clock.mode == "lockstep"
         words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
 
-    def _await_ready(self, count: int) -> None:
-        crate, ready, deadline = self._line, 0, time.monotonic() + LAUNCH_S
-        while ready < count:
-            for fd in _wait([crate.line.fileno(), crate.ready], deadline - time.monotonic()):
-                if fd == crate.ready:
-                    ready += os.eventfd_read(crate.ready)
-                else:
-                    self._hear()
+    def _await_ready(self) -> None:
+        deadline = time.monotonic() + LAUNCH_S
+        while absent := [t.name for t in self._plan.layout.tasks if self._state(t.name) not in UP]:
+            self._listen(deadline - time.monotonic())
             if self._faults:
-                raise LaunchError("\n".join(crate.printed()) or self._faults[0])
+                raise LaunchError("\n".join(self._line.printed()) or self._faults[0])
             if time.monotonic() > deadline:
-                absent = [t.name for t in self._plan.layout.tasks if self._state(t.name) < TaskState.READY]
                 raise LaunchError(f"boards {', '.join(absent)}: not ready within {LAUNCH_S:g} s")
+
+    def _inject(self) -> None:
+        """Fill the fault table with the config's faults; what is a process of its own is started here."""
+        table = FaultTable(self.segment)
+        for injection in self._plan.faults:
+            entry = table.add(injection)
+            if KINDS[injection.kind].where == "core":
+                self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock: the run begins. It lasts `seconds` of simulated time, or until the task ends."""
         clock = self._plan.clock(seconds)
+        wirings = {wiring.task: wiring for wiring in self._plan.tasks}
+        supervision = Supervision(self.config, self._plan.layout)
+        self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
+        self._alarms = AlarmWatch(self.segment, self.config)
         self._heartbeat = Heartbeat(self.segment)
-        self._line.send(PowerOn("clock", clock))
-        self._tell("start", "clock", self.config.clock.mode)
+        # Whoever starts a run resets the latch, as an operator would; it refuses while an input is not good.
+        UtilityLines(self.segment).reset_emergency_stop()
+        self._line.ask(PowerOn(CLOCK, clock))
+        self._tell("start", CLOCK, self.config.clock.mode)
 
     def run(self, seconds: float | None = None) -> Outcome:
         """Run for `seconds` of simulated time, or until the task ends; return how it ended."""
@@ -130,17 +152,21 @@ class Rack:
 
     def watch(self, timeout_s: float) -> bool:
         """Watch the boards for that long, or until something happens; False when the run is over."""
-        if self.outcome is not None:
-            return False
-        for fd in _wait([self._line.line.fileno()], timeout_s):
-            assert fd == self._line.line.fileno()
-            self._hear()
-        for line in self._line.printed():
-            self._tell("printed", "", line)
-        for task in self._heartbeat.hanging():
-            self._lose("hang", task, f"board '{task}' gives no sign of life")
-        if self.segment.words[System.STATE] == Run.STOPPED or self._cause == "board lost":
-            self._end()
+        deadline = time.monotonic() + timeout_s
+        while self.outcome is None:
+            self._listen(deadline - time.monotonic())
+            for line in self._line.printed():
+                self._tell("printed", "", line)
+            for heard in self._alarms.drain():
+                self._take(heard)
+            for board in self._heartbeat.hanging():
+                self._tell("detection", board, f"'{board}' gives no sign of life", "hang")
+                self._recovery.end_hanging(board)
+            self._recovery.advance()
+            if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help:
+                self._end()
+            if time.monotonic() >= deadline:
+                break
         return self.outcome is None
 
     def stop(self, why: str) -> None:
@@ -149,17 +175,39 @@ class Rack:
         self._tell("stop", "", why)
         self.segment.words[System.STOP_REQUEST] = 1
 
+    def _listen(self, timeout_s: float) -> None:
+        """Hear the crate, and whoever rings, for that long or until there is something."""
+        line, attention = self._line.line.fileno(), self._line.attention
+        for fd in _wait([line, attention], timeout_s):
+            if fd == attention:
+                os.eventfd_read(attention)
+            else:
+                self._hear()
+
     def _hear(self) -> None:
         message = self._line.line.receive()
         match message:
             case Forked(name, pid):
                 self._pids[name] = pid
-            case Ended(name, _, status):
+            case Ended(name, _, status) as end:
                 self._pids.pop(name, None)
-                if self.outcome is None and (status != 0 or self.segment.words[System.STATE] != Run.STOPPED):
-                    self._lose("died", name, f"board '{name}' ended: {_status(status)}")
+                is_board = name == CLOCK or name in self.segment.map.blocks
+                over = self.outcome is not None or self.segment.words[System.STATE] == Run.STOPPED
+                if is_board and not (over and status == 0):
+                    self._lose(end)
             case None:
-                self._lose("died", "crate", "the crate ended, and every board with it")
+                self._is_beyond_help = True
+                text = "the crate ended, and every board with it"
+                self._tell("died", "crate", text, "died")
+                self._give_up("crate", text)
+
+    def _take(self, heard: Heard) -> None:
+        """Make an event of an alarm, and act where it is the Rack that must."""
+        self._keep(heard.event)
+        if heard.alarm == Alarm.HANG:
+            self._recovery.end_hanging(self._plan.layout.tasks[heard.subject].name)
+        elif heard.alarm == Alarm.CLOCK_STOPPED:
+            self._recovery.end_hanging(CLOCK)
 
     def _expect(self, kind: type) -> None:
         there = _wait([self._line.line.fileno()], LAUNCH_S)
@@ -167,13 +215,30 @@ class Rack:
             late = f"the crate did not open the segment in {LAUNCH_S:g} s"
             raise LaunchError("\n".join(self._line.printed()) or late)
 
-    def _lose(self, kind: EventKind, board: str, text: str) -> None:
+    def _lose(self, end: Ended) -> None:
+        """Tell of a board's end, and restart it or give it up."""
+        text = f"board '{end.name}' ended: {_status(end.status)}"
+        self._tell("died", end.name, text, "died", end.seen_ns, end.tick)
+        if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
+            self._give_up(end.name, text)
+            return
+        restart = self._recovery.lose(end.name, end.tick)
+        if restart is None:
+            self._is_beyond_help = end.name == CLOCK
+            self._give_up(end.name, f"{text}; its restarts are used up")
+        else:
+            nth = f"restart {restart.number} of at most {restart.most} in {restart.within_s:g} s"
+            self._tell("reaction", end.name, nth, "restart")
+
+    def _give_up(self, board: str, text: str) -> None:
         self._faults.append(text)
         self._cause = "board lost"
-        self._tell(kind, board, text)
+        self._tell("reaction", board, f"'{board}' is given up", "given_up")
 
     def _end(self) -> None:
         """Take the end of the run down: why, how far, and the digest; then let the boards go."""
+        for heard in self._alarms.drain():
+            self._keep(heard.event)
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
         state, reason = self._plan.final_state(self.segment)
@@ -193,8 +258,8 @@ class Rack:
         try:
             if hasattr(self, "segment"):
                 self._let_go()
-            if self._cause == "board lost":
-                crate.power_off()
+            if self._cause == "board lost" or self._has_lost():
+                crate.ask(PowerOff())
             # A crate that has no boards yet may still be importing for them.
             crate.close(LEAVE_S if self._pids else 0)
         finally:
@@ -203,14 +268,27 @@ class Rack:
                 unlink(self.segment.rack)
                 self.segment.close()
 
+    def _has_lost(self) -> bool:
+        """Say whether a board is lost that may not end by itself."""
+        return hasattr(self, "segment") and any(self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks)
+
     def _let_go(self) -> None:
         """Tell the boards and the clock that the run is over."""
         self.segment.words[System.STOP_REQUEST] = 1
         self.segment.words[System.STATE] = Run.STOPPED
 
-    def _tell(self, kind: EventKind, board: str, text: str) -> None:
-        running = hasattr(self, "segment") and self.segment.words[System.STATE] != Run.STARTING
-        event = Event(time.time_ns(), self.segment.words[System.TICK] if running else -1, kind, board, text)
+    def _tell(
+        self, kind: EventKind, board: str, text: str, code: str = "", at_ns: int | None = None, tick: int | None = None
+    ) -> None:
+        """Tell of something now, or at CLOCK_MONOTONIC `at_ns` and `tick`."""
+        if tick is None:
+            running = hasattr(self, "segment") and self.segment.words[System.STATE] != Run.STARTING
+            tick = self.segment.words[System.TICK] if running else -1
+        now_ns = time.time_ns()
+        stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
+        self._keep(Event(stamp_ns, tick, kind, board, text, code))
+
+    def _keep(self, event: Event) -> None:
         self.events.append(event)
         if self._on_event:
             self._on_event(event)

@@ -5,32 +5,42 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from time import monotonic_ns
 
+from backplane.alarms import AlarmWriter
 from backplane.clock import SystemClock
 from backplane.segment import Segment
 from backplane.semaphores import clock_semaphore
 from backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
 from backplane.wake import NextCycle
-from backplane.words import Block, TaskState
+from backplane.words import Block, System, TaskState
+from boards.clock_guard import ClockGuard
+from boards.faults.task_faults import TaskFaults
 from boards.ports import InputPorts, OutputPorts
 from boards.wiring import TaskWiring
+from levels.level import Executor, Planner
 
 # Plain integers for the hot path.
 _DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _CORRUPT, _BUS_ERRORS = (
     int(Block[name]) for name in ("DONE", "CYCLES", "MISSED", "SKIPPED", "LEVEL_STATE", "CORRUPT", "BUS_ERRORS")
 )
+_FAULTS = int(System.FAULTS)
 _MISS, _SKIP, _BUS_ERROR, _DAMAGED = (int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT))
 
 
 class Task(ABC):
     """One task on its board, behind a level's executor or planner."""
 
-    def __init__(self, segment: Segment, wiring: TaskWiring) -> None:
-        self.spec = segment.layout.task(wiring.task)
+    def __init__(self, segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int | None = None) -> None:
+        self.spec = spec = segment.layout.task(wiring.task)
         self.block = segment.block(wiring.task)
+        self.words = segment.words
         self.clock = SystemClock(segment)
-        self.next_cycle = NextCycle(segment, wiring.task, wiring.poll)
-        self.inputs = InputPorts(segment, wiring.inputs)
-        self.outputs = OutputPorts(segment, wiring.outputs)
+        self.alarms = AlarmWriter(segment, wiring.task, attention)
+        self.next_cycle = NextCycle(segment, wiring.task, wiring.poll, self.alarms if wiring.guards_clock else None)
+        self.inputs = InputPorts(segment, wiring.inputs, self.alarms)
+        self.outputs = OutputPorts(segment, wiring.outputs, self.alarms)
+        self.faults = TaskFaults(segment, spec, self.outputs, level)
+        self._generation = 0
+        self._guard = ClockGuard(segment, spec, self.alarms) if wiring.guards_clock else None
         self.trace = TraceWriter(segment, wiring.task)
         self.status = self.outputs.message("status")
         self._bus_errors = self._corrupt = 0
@@ -39,7 +49,12 @@ class Task(ABC):
     def run(self) -> None:
         """Cycle until the run is over."""
         self.block[Block.STATE] = TaskState.RUNNING
+        words = self.words
         while (tick := self.next_cycle.wait()) is not None:
+            if words[_FAULTS] != self._generation:
+                self._generation = self.faults.refresh()
+            if self._guard is not None:
+                self._guard.look(tick, self.next_cycle.skipped)
             self.cycle(tick)
         self.count_bus()
 

@@ -12,7 +12,8 @@ from levels.level import LevelContext
 class TaskWiring:
     """One task: `target` is "package.module:Class"; `inputs` and `outputs` map ports to mailboxes.
 
-    `critical_priority` is the SCHED_FIFO priority that a tight planner takes for its plan update.
+    `critical_priority` is the SCHED_FIFO priority that a tight planner takes for its plan update. `guards_clock`: the
+    task, one of the fastest, looks after the clock. `fails_self_test` is a fault of the config.
     """
 
     task: str
@@ -22,3 +23,5 @@ class TaskWiring:
     context: LevelContext
     poll: bool = False
     critical_priority: int = 0
+    guards_clock: bool = False
+    fails_self_test: bool = False

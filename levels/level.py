@@ -125,6 +125,7 @@ class Executor(ABC):
         self.context = context
         self.demand = Demand.NONE  # what the safety of the rack asks of the arm in this cycle; set by the board
         self.findings: list[Finding] = []  # filled in `process`; the board rings and clears them
+        self.acted: list[int] = []  # places, in what was injected, of the faults that acted in this cycle; likewise
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Take over the faults that are injected from now on, all that are active; empty: none is."""

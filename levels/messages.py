@@ -220,9 +220,9 @@ SERVO_PLAN = MessageType(
 
 SERVO_STATUS = status(
     "servo_status",
-    1,
-    Field("position", "f8", "rad", "joint positions, measured", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities, measured", ("joints",)),
+    2,
+    Field("position", "f8", "rad", "joint positions, measured; while sensors lie, as far as known", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
     Field("torque", "f8", "N m", "torque given to the arm in this cycle, behind the limit gate", ("joints",)),
     Field("target", "f8", "rad", "set point interpolated for this cycle", ("joints",)),
     Field("target_velocity", "f8", "rad/s", "set point interpolated for this cycle", ("joints",)),
@@ -230,17 +230,28 @@ SERVO_STATUS = status(
     Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
     Field("grip_force", "f8", "N", "force given to the gripper"),
     Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
+    Field("stopped", "u1", "1", "1: set points are not followed: a demand, a fault of sensors or motors, or brakes"),
+    Field("braked", "u1", "1", "1: the brakes are closed"),
+    Field("demand", "u1", "Demand", "what the safety of the rack asks of the arm in this cycle"),
     Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),
     Field("touches", "u4", "1", "contacts that no task means, counted at every substep"),
+    Field("violations", "u4", "1", "substeps in which a position, velocity or torque was beyond its limit"),
 )
 
 ARM_STATE = MessageType(
     "arm_state",
-    1,
+    2,
     (
         Field("tick", "i8", "tick", "tick that the state belongs to"),
         Field("clipped", "u4", "1", "cycles in which the limit gate cut a command"),
         Field("touches", "u4", "1", "contacts that no task means"),
+        Field("violations", "u4", "1", "substeps in which a limit was broken"),
+        Field("waited", "i4", "tick", "ticks since the last command"),
+        Field("braked", "u1", "1", "1: the brakes are closed"),
+        Field("rest", "f8", "rad", "where closed brakes hold the joints", ("joints",)),
+        Field("position", "f8", "rad", "joint positions as the servo level trusts them", ("joints",)),
+        Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
+        Field("doubt", "f8", "rad", "how far from the truth those positions may be", ("joints",)),
         Field("state", "f8", "", "mjSTATE_INTEGRATION of the simulated cell", ("state",)),
     ),
 )
@@ -264,5 +275,6 @@ WORLD_MODEL = MessageType(
         Field("position", "f8", "m", "body origins", ("bodies", 3)),
         Field("quaternion", "f8", "1", "body orientations", ("bodies", 4)),
         Field("velocity", "f8", "m/s", "body velocities, estimated", ("bodies", 3)),
+        Field("sensed", "i8", "tick", "cycle of the world model that last took over a new scene"),
     ),
 )

@@ -27,10 +27,11 @@ class WorldParams(Table):
 class WorldModel(Executor):
     """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body starts or stops moving.
 
-    The revision is the tick behind the last such change, so it rises across a restart of this board too.
+    The revision is the tick behind the last such change, so it rises across a restart of this board too. Until it has
+    seen a scene, a restarted board shows what it knew, with the age of that.
     """
 
-    inputs = {"scene": Input(SCENE, "servo.scene")}
+    inputs = {"scene": Input(SCENE, "servo.scene"), "last": Input(WORLD_MODEL, "own.model")}
     outputs = {"model": WORLD_MODEL}
 
     def __init__(self, context: LevelContext) -> None:
@@ -42,9 +43,13 @@ class WorldModel(Executor):
         self._moving = np.zeros(bodies, dtype=bool)
         self._slow_s = np.zeros(bodies)
         self._seen_tick = -1
+        self._started = False
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take over a new scene; without one, poses stay and velocities are zero."""
+        if not self._started:
+            self._started = True
+            write.model.copy_from(read.last.value)
         if not read.scene.is_new:
             write.model.velocity[:] = 0.0
             return
@@ -57,7 +62,7 @@ class WorldModel(Executor):
             self._follow(scene, write.model, elapsed_s, tick)
         self._position[:], self._quaternion[:] = scene.position, scene.quaternion
         write.model.position, write.model.quaternion = scene.position, scene.quaternion
-        self._seen_tick = tick
+        write.model.sensed = self._seen_tick = tick
 
     def _follow(self, scene: Message, model: Message, elapsed_s: float, tick: int) -> None:
         """Estimate velocities, and see who starts and who stops."""

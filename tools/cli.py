@@ -8,8 +8,12 @@ import typer
 
 from tools.answer import Failure, fail
 from tools.bench.command import bench
+from tools.campaign.command import campaign
 from tools.check import check
 from tools.clean import clean
+from tools.estop import estop
+from tools.inject import inject
+from tools.injecting.kinds import KindsCommand
 from tools.list import list_racks
 from tools.record import record
 from tools.replay import replay
@@ -32,10 +36,13 @@ app.command("list")(list_racks)
 app.command()(status)
 app.command()(stop)
 app.command()(clean)
+app.command(cls=KindsCommand)(inject)
+app.command()(estop)
 app.command()(record)
 app.command()(replay)
 app.command()(report)
 app.command()(bench)
+app.command()(campaign)
 
 
 def main() -> None:

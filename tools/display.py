@@ -13,8 +13,11 @@ from boards.events import Event
 from tools.live_table import console, line_of, table_of
 from tools.snapshot import Snapshot
 
-QUIET = ("launch", "start", "end")
-"""Events that the view itself shows."""
+QUIET = ("launch", "start", "end", "miss")
+"""Events that the view itself shows: the table counts the misses."""
+STYLES = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
+OTHERS = "yellow"
+"""Colour of events that are no part of a fault's course."""
 
 
 class Display(Protocol):
@@ -44,7 +47,8 @@ class LiveDisplay:
     def tell(self, event: Event) -> None:
         """Print the event above the table."""
         if event.kind not in QUIET:
-            self._live.console.print(_line(event), style="yellow", highlight=False, markup=False)
+            style = STYLES.get(event.kind, OTHERS)
+            self._live.console.print(_line(event), style=style, highlight=False, markup=False)
 
 
 class PlainDisplay:
@@ -81,7 +85,8 @@ class SilentDisplay:
 
 
 def _line(event: Event) -> str:
-    return f"{event.kind}: {event.text}" if not event.board else f"{event.kind}: {event.board}: {event.text}"
+    who = f"{event.board}: " if event.board else ""
+    return f"{f'tick {event.tick} ' if event.code else ''}{event.kind}: {who}{event.text}"
 
 
 @contextmanager

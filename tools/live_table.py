@@ -7,22 +7,26 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from tools.snapshot import Progress, Snapshot, TaskRow
+from tools.snapshot import LOST, Progress, Snapshot, TaskRow
 
 COLUMNS = (
-    *("slot", "task", "core", "sched", "Hz", "tick", "cycles", "missed", "skipped"),
+    *("slot", "task", "core", "sched", "Hz", "tick", "cycles", "missed", "skipped", "restarts"),
     *("exec ms", "late ms", "state"),
 )
 """Headings; `exec` and `late` are the longest since the last look."""
 TEXTS = ("task", "sched", "state")
-NARROWEST = 110
+STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green"}
+NOTHING = "none"
+"""The demand on an arm that is free to move."""
+NARROWEST = 120
 """Columns of characters that the table takes where no terminal says otherwise."""
 
 
 def table_of(snapshot: Snapshot) -> RenderableType:
-    """Return the whole view of a rack: head line, boards, what they complain of, progress."""
+    """Return the whole view of a rack: head line, boards, what they complain of, active faults, progress."""
     reasons = [Text(f"{row.task}: {row.reason}", style="red") for row in snapshot.tasks if row.reason]
-    parts: list[RenderableType] = [_head(snapshot), _boards(snapshot.tasks), *reasons]
+    faults = [Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults]
+    parts: list[RenderableType] = [_head(snapshot), _boards(snapshot.tasks), *reasons, *faults]
     if snapshot.progress is not None:
         parts.append(_bar(snapshot.progress))
     return Group(*parts)
@@ -42,17 +46,23 @@ def line_of(snapshot: Snapshot) -> str:
     at = snapshot.progress
     if at is not None:
         line += f"  task {at.state}, action {at.actions_done}/{at.actions}, move {at.moves_done}/{at.moves}"
+    lost = [f"{row.task} {LOST}" for row in snapshot.tasks if row.state == LOST]
     reasons = [f"{row.task}: {row.reason}" for row in snapshot.tasks if row.reason]
-    return "  ".join([line, *snapshot.lines, *reasons])
+    return "  ".join([line, *snapshot.lines, *_demanded(snapshot), *lost, *reasons])
 
 
 def _head(snapshot: Snapshot) -> Text:
     line = Text(f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}")
     if snapshot.clock_skipped:
         line.append(f", clock left out {snapshot.clock_skipped}", style="yellow")
-    for name in snapshot.lines:
+    for name in [*snapshot.lines, *_demanded(snapshot)]:
         line.append(f"  {name}", style="bold red")
     return line
+
+
+def _demanded(snapshot: Snapshot) -> list[str]:
+    """Return what is demanded of the arm, if anything is."""
+    return [f"arm: {snapshot.demand}"] if snapshot.demand != NOTHING else []
 
 
 def _boards(rows: tuple[TaskRow, ...]) -> Table:
@@ -75,9 +85,10 @@ def _cells(row: TaskRow) -> list[str | Text]:
         str(row.cycles),
         Text(str(row.missed), style="red" if row.missed else ""),
         Text(str(row.skipped), style="red" if row.skipped else ""),
+        Text(str(row.restarts), style="yellow" if row.restarts else ""),
         _ms(row.exec_ms),
         _ms(row.lateness_ms),
-        Text(row.state, style={"error": "red", "failed": "red", "done": "green"}.get(row.state, "")),
+        Text(row.state, style=STATES.get(row.state, "")),
     ]
 
 

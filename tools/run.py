@@ -17,6 +17,9 @@ Seconds = Annotated[
 Speed = Annotated[
     float | None, typer.Option(metavar="X", help="run this many times faster than real time, or slower: 0.5")
 ]
+Faults = Annotated[
+    str | None, typer.Option(metavar="FILE", help="script of faults by name, or a path; behind the config's own")
+]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
@@ -28,6 +31,7 @@ def run(
     seconds: Seconds = None,
     speed: Speed = None,
     settings: Settings = [],  # noqa: B006  typer copies it
+    faults: Faults = None,
     out: Out = None,
     no_record: NoRecord = False,
     view: View = False,
@@ -47,7 +51,7 @@ def run(
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
-    found = load(config, overrides)
+    found = load(config, overrides, faults)
     folder = None if no_record else folder_of(out, found.name)
     with display_for(silent=as_json) as display:
         result = run_rack(found, seconds, folder, display, view)

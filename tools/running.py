@@ -18,6 +18,7 @@ from boards.events import Event
 from boards.outcome import Outcome
 from boards.rack import Rack
 from tools.answer import Failure
+from tools.campaign.ending import Strike, strikes
 from tools.display import Display
 from tools.event_log import EventLog
 from tools.recorder.process import RecorderProcess
@@ -32,7 +33,10 @@ COUNTED = (
 
 @dataclass(frozen=True)
 class RunResult:
-    """A run that has ended: its outcome, and what every task's control block counted."""
+    """A run that has ended: its outcome, what every task's control block counted, and what was injected into it.
+
+    `clock_offset_ns` turns CLOCK_MONOTONIC, in which boards stamp, into the time of the events.
+    """
 
     rack: str
     outcome: Outcome
@@ -40,6 +44,8 @@ class RunResult:
     clock_skipped: int
     tasks: dict[str, dict[str, int]]
     recording: str
+    faults: tuple[Strike, ...]
+    clock_offset_ns: int
 
     @property
     def worked(self) -> bool:
@@ -91,7 +97,16 @@ def run_rack(
         recording = recorder.finish() if recorder is not None else "none"
         _hear(sources, segment, log)
     skipped = segment.words[System.CLOCK_SKIPPED]
-    result = RunResult(config.name, outcome, wall_s, skipped, _counters(segment), recording)
+    result = RunResult(
+        rack=config.name,
+        outcome=outcome,
+        wall_s=wall_s,
+        clock_skipped=skipped,
+        tasks=_counters(segment),
+        recording=recording,
+        faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
+        clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+    )
     log.end(result.document())
     return result
 

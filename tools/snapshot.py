@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 
+from backplane.fault_table import FaultTable, Stage
 from backplane.layout import TaskSpec
 from backplane.lines import UtilityLines
 from backplane.message import State
 from backplane.protocols import open_observer
 from backplane.segment import Segment
 from backplane.trace import trace_ring
-from backplane.words import Block, Run, System, TaskState
+from backplane.words import Block, Box, Demand, Run, System, TaskState
+from boards.faults.text import describe
 
+LOST = "lost"
+"""State of a task that is dead or hangs, until its new process has rejoined."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports how far the whole task is."""
 
@@ -20,7 +25,7 @@ TASK_STATUS = "task_status"
 class TaskRow:
     """One task now. Times are the longest of the newest cycles looked at, in ms; None before the first.
 
-    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling.
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `restarts` counts its new processes.
     """
 
     task: str
@@ -34,6 +39,7 @@ class TaskRow:
     plans: int
     missed: int
     skipped: int
+    restarts: int
     exec_ms: float | None
     lateness_ms: float | None
     reason: str
@@ -53,7 +59,10 @@ class Progress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A rack now. `time_s` is simulated time; `lines` are the utility lines that are asserted."""
+    """A rack now. `time_s` is simulated time; `lines` are the utility lines that are asserted.
+
+    `demand` is what the safety of the rack asks of the arm, "none" as a rule; `faults` are those that are active.
+    """
 
     rack: str
     run: str
@@ -61,6 +70,8 @@ class Snapshot:
     time_s: float
     clock_skipped: int
     lines: tuple[str, ...]
+    demand: str
+    faults: tuple[str, ...]
     tasks: tuple[TaskRow, ...]
     progress: Progress | None
 
@@ -71,6 +82,8 @@ class Viewer:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._lines = UtilityLines(segment)
+        self._faults = FaultTable(segment)
+        self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
         written = {m.name: m.message for m in segment.layout.mailboxes}
@@ -93,6 +106,8 @@ class Viewer:
             time_s=tick * layout.clock_ns * 1e-9,
             clock_skipped=words[System.CLOCK_SKIPPED],
             lines=tuple(self._asserted()),
+            demand=Demand(words[System.DEMAND]).name.lower(),
+            faults=tuple(describe(fault, layout, self._joints) for fault in self._faults.staged((Stage.ACTIVE,))),
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
         )
@@ -107,7 +122,9 @@ class Viewer:
         block = self._segment.block(task.name)
         exec_ms, lateness_ms = self._times_ms(task.name)
         state, reason = TaskState(block[Block.STATE]).name.lower(), ""
-        if task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
+        if block[Block.LOST]:
+            state = LOST
+        elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
             state, reason = State(status.value.state).name.lower(), status.value.reason
         return TaskRow(
             task=task.name,
@@ -121,10 +138,17 @@ class Viewer:
             plans=block[Block.PLANS],
             missed=block[Block.MISSED],
             skipped=block[Block.SKIPPED],
+            restarts=self._restarts(task.name),
             exec_ms=exec_ms,
             lateness_ms=lateness_ms,
             reason=reason,
         )
+
+    def _restarts(self, task: str) -> int:
+        """Return how often a new process took over the task's mailboxes: each is a writer in a new epoch."""
+        segment = self._segment
+        heads = [segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == task]
+        return max([0, *(segment.words[head + Box.EPOCH] - 1 for head in heads)])
 
     def _times_ms(self, task: str) -> tuple[float | None, float | None]:
         """Return the longest execution and lateness of the cycles since the last look that saw any."""
@@ -139,3 +163,8 @@ class Viewer:
             return None
         at = status.value
         return Progress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
+
+
+def joint_names(config: str) -> tuple[str, ...]:
+    """Return the joints of the arm in a resolved config, base to tool; none without an arm."""
+    return tuple(tomllib.loads(config).get("robot", {}).get("joints", ()))

@@ -2,7 +2,7 @@
 
 from boards.config.context import context
 from boards.config.cores import shared_out
-from boards.config.files import CONFIGS, names
+from boards.config.files import CONFIGS, FAULTS, names
 from boards.config.loading import load, loads
 from boards.config.ports import TaskPorts, task_ports
 from boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
@@ -11,6 +11,7 @@ from boards.config.wiring import wire
 __all__ = [
     "CLOCK_SLOT",
     "CONFIGS",
+    "FAULTS",
     "BoardConfig",
     "ClockConfig",
     "RackConfig",

@@ -10,6 +10,8 @@ from boards.errors import ConfigError, Mistake
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 """The project's own configs, beside this package in a checkout and in an installation."""
+FAULTS = CONFIGS / "faults"
+"""Scripts of faults, for `--faults`."""
 WHOLE_TABLES = ("robot", "scene", "task")
 """Half of one arm is no arm: these are replaced as a whole where others are merged key by key."""
 
@@ -21,17 +23,39 @@ def read(name_or_path: str | Path) -> Tables:
 
     A name means a config of the project; what holds a '/' or ends in '.toml' is a path. Raises `ConfigError`.
     """
+    return _read(_path(name_or_path, "config", CONFIGS), ())
+
+
+def with_faults(tables: Tables, name_or_path: str | Path) -> Tables:
+    """Return config tables with the faults of a script behind their own.
+
+    A script holds `[[fault]]` tables and nothing else. A name means one of the project's own. Raises `ConfigError`.
+    """
+    path = _path(name_or_path, "--faults", FAULTS)
+    script = _tables(path)
+    wrong = [
+        Mistake(f"{path.name}: {key}", None, "a script of faults holds [[fault]] tables and nothing else")
+        for key, value in script.items()
+        if key != "fault" or not isinstance(value, list)
+    ]
+    if wrong:
+        raise ConfigError(wrong)
+    own = tables.get("fault", [])
+    return {**tables, "fault": [*(own if isinstance(own, list) else []), *script.get("fault", [])]}
+
+
+def names(folder: Path = CONFIGS) -> list[str]:
+    """Return the names of the project's own racks, or of what else lies in a folder of configs."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def _path(name_or_path: str | Path, place: str, folder: Path) -> Path:
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
-    path = Path(text).expanduser() if is_path else CONFIGS / f"{text}.toml"
+    path = Path(text).expanduser() if is_path else folder / f"{text}.toml"
     if not path.is_file():
-        raise ConfigError([Mistake("config", text, f"no such file; by name: {', '.join(names())}; or a path")])
-    return _read(path.resolve(), ())
-
-
-def names() -> list[str]:
-    """Return the names of the project's own racks."""
-    return sorted(path.stem for path in CONFIGS.glob("*.toml"))
+        raise ConfigError([Mistake(place, text, f"no such file; by name: {', '.join(names(folder))}; or a path")])
+    return path.resolve()
 
 
 def parse(text: str, place: str = "config") -> Tables:
@@ -67,15 +91,19 @@ def _read(path: Path, chain: tuple[Path, ...]) -> Tables:
     if path in chain:
         loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
         raise ConfigError([Mistake(f"{path.name}: extends", None, f"extends itself: {loop}")])
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError([Mistake(str(path), None, f"cannot be read: {error}")]) from None
-    own = anchor(parse(text, path.name), path.parent)
+    own = anchor(_tables(path), path.parent)
     merged: Tables = {}
     for base in _bases(own.pop("extends", []), path):
         merged = merge(merged, _read(base, (*chain, path)), WHOLE_TABLES)
     return merge(merged, own, WHOLE_TABLES)
+
+
+def _tables(path: Path) -> Tables:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError([Mistake(str(path), None, f"cannot be read: {error}")]) from None
+    return parse(text, path.name)
 
 
 def _bases(extends: Any, path: Path) -> list[Path]:

@@ -8,21 +8,27 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from boards.config.classes import extend_path
-from boards.config.files import CONFIGS, Tables, anchor, parse, read
+from boards.config.faults import fault_mistakes
+from boards.config.files import CONFIGS, Tables, anchor, parse, read, with_faults
 from boards.config.overrides import override
 from boards.config.rules import mistakes_in
 from boards.config.schema import RackConfig
 from boards.config.schema_mistakes import mistakes_of
 from boards.config.wiring import Wiring
 from boards.errors import ConfigError, Mistake
+from boards.faults.config import readable
 
 
-def load(name_or_path: str | Path, overrides: Sequence[str] = ()) -> RackConfig:
+def load(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None) -> RackConfig:
     """Return the config of that name or in that file, with `key.sub=value` overrides.
 
-    Paths in an override are relative to the current folder. Raises `ConfigError` with every mistake.
+    The faults of the script `faults`, by name or path, come behind its own. Paths in an override are relative to the
+    current folder. Raises `ConfigError` with every mistake.
     """
-    return resolve(anchor(override(read(name_or_path), overrides), Path.cwd()))
+    tables = read(name_or_path)
+    if faults is not None:
+        tables = with_faults(tables, faults)
+    return resolve(anchor(override(tables, overrides), Path.cwd()))
 
 
 def loads(text: str) -> RackConfig:
@@ -37,18 +43,20 @@ def resolve(tables: Tables) -> RackConfig:
     except ValidationError as error:
         broken = _broken(error)
         intact = _intact(tables, broken)
-        rest = _mistakes(intact, broken) if intact is not None else []
+        rest = _mistakes(intact, broken, tables.get("fault")) if intact is not None else []
         raise ConfigError([*mistakes_of(error, RackConfig, tables), *rest]) from None
     if mistakes_in(config):
-        raise ConfigError(_mistakes(config, frozenset()))
+        raise ConfigError(_mistakes(config, frozenset(), tables.get("fault")))
     extend_path(config.python_path)
     return config
 
 
-def _mistakes(config: RackConfig, broken: frozenset[str]) -> list[Mistake]:
+def _mistakes(config: RackConfig, broken: frozenset[str], faults: object) -> list[Mistake]:
     """Return everything wrong with a config, its wiring too: one run of a command shows every mistake there is."""
     extend_path(config.python_path)
-    return [*mistakes_in(config, broken), *Wiring(config, broken).mistakes]
+    untold = frozenset(place.removeprefix("board.") for place in broken if place.startswith("board."))
+    of_faults = fault_mistakes(readable(faults), config, untold=untold)
+    return [*mistakes_in(config, broken), *Wiring(config, broken).mistakes, *of_faults]
 
 
 def _broken(error: ValidationError) -> frozenset[str]:

@@ -13,6 +13,7 @@ from pydantic import Field, StringConstraints
 from backplane.clock import ticks_of
 from backplane.layout import Protocol
 from boards.config.text import to_toml
+from boards.faults.config import FaultConfig
 from levels.robot import Positive, RobotConfig, Table
 from levels.scene import SceneConfig
 
@@ -23,6 +24,7 @@ LAST_SLOT = 21
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
 Wake = Literal["signal", "poll"]
+OnLoss = Literal["hold", "stop", "brake"]
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
@@ -30,6 +32,7 @@ MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z]
 Slot = Annotated[int, Field(gt=CLOCK_SLOT, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
+Restarts = Annotated[int, Field(ge=0, le=10_000)]
 
 
 class ClockConfig(Table):
@@ -48,6 +51,17 @@ class ProtocolConfig(Table):
 
     default: Protocol = Field("time-slice", description="protocol of every mailbox not named below")
     mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
+
+
+class SupervisionConfig(Table):
+    """`[supervision]`: boards that die or hang are restarted. When restarts are used up, the arm is braked for good."""
+
+    restarts: Restarts = Field(5, description="restarts of one task within within_s, at most; 0: never")
+    within_s: Positive = Field(10.0, description="time over which restarts are counted, s of the wall clock")
+    lockstep_restart_s: Positive = Field(
+        0.5,
+        description="in lockstep, simulated time from a task's loss to its return, s; real time takes its own",
+    )
 
 
 class BoardConfig(Table):
@@ -72,6 +86,12 @@ class BoardConfig(Table):
     planner_reads: dict[str, MailboxName] = Field({}, description="the same for the planner")
     params: dict[str, Any] = Field({}, description="parameters of the level, by name")
     ends_run: bool = Field(False, description="the run ends when this level's status says done or error")
+    restarts: Restarts | None = Field(None, description="as in supervision, for this board's tasks; 0: never")
+    restarts_within_s: Positive | None = Field(None, description="as supervision.within_s, for this board's tasks, s")
+    on_loss: OnLoss = Field(
+        "hold",
+        description="while this board is lost: the level below holds, or the arm ramps to rest and brakes, or brakes",
+    )
 
 
 class RackConfig(Table):
@@ -88,6 +108,8 @@ class RackConfig(Table):
     scene: SceneConfig = Field(SceneConfig(), description="what stands in the cell besides the arm")
     task: dict[str, Any] = Field({}, description="program of the task level")
     board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
+    supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of boards")
+    fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
 
     @property
     def clock_ns(self) -> int:
@@ -103,4 +125,4 @@ class RackConfig(Table):
 
     def text(self) -> str:
         """Return the config as TOML that loads again with the same meaning, by itself."""
-        return to_toml(self.model_dump(mode="json", exclude_none=True))
+        return to_toml(self.model_dump(mode="json", exclude_none=True, by_alias=True))

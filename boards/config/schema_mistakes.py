@@ -54,9 +54,13 @@ def _declared(model: type[BaseModel], keys: list[int | str]) -> tuple[type[BaseM
         if is_name:  # the name of a table among tables of one kind, as in [board.servo]
             is_name = False
             continue
-        owner, field = table, table.model_fields.get(key) if table is not None else None
+        owner, field = table, _field(table, key) if table is not None else None
         table, is_name = _table(field), field is not None and get_origin(field.annotation) is dict
     return owner, field
+
+
+def _field(table: type[BaseModel], key: str) -> FieldInfo | None:
+    return next((field for name, field in table.model_fields.items() if key == (field.alias or name)), None)
 
 
 def _table(field: FieldInfo | None) -> type[BaseModel] | None:
@@ -65,6 +69,6 @@ def _table(field: FieldInfo | None) -> type[BaseModel] | None:
 
 
 def _unknown(key: str, owner: type[BaseModel] | None) -> str:
-    known = list(owner.model_fields) if owner is not None else []
+    known = [field.alias or name for name, field in owner.model_fields.items()] if owner is not None else []
     near = difflib.get_close_matches(key, known, 1)
     return f"unknown key; did you mean '{near[0]}'?" if near else f"unknown key; known: {', '.join(known)}"

@@ -9,6 +9,7 @@ from backplane.layout import Layout, MailboxSpec, TaskSpec, depth_for
 from backplane.message import MessageType
 from boards.config.cell import cell_sizes
 from boards.config.cores import obtained_core
+from boards.config.faults import fault_mistakes, places
 from boards.config.fields import field_specs
 from boards.config.ports import TaskPorts, all_ports
 from boards.config.rules import mistakes_in
@@ -28,9 +29,11 @@ def wire(config: RackConfig) -> Layout:
     sizes = {} if mistakes else cell_sizes(config, mistakes)
     if not mistakes:
         mistakes += wiring.check_sizes(sizes)
-    if mistakes:
+    layout = None if mistakes else wiring.layout(sizes)
+    mistakes += fault_mistakes(places(config), config, layout)
+    if layout is None or mistakes:
         raise ConfigError(mistakes)
-    return wiring.layout(sizes)
+    return layout
 
 
 class Wiring:

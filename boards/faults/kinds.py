@@ -18,7 +18,10 @@ task itself; `core`: a process beside it; `arm`: the level that drives the arm; 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that a kind takes: its unit, range and meaning. `default` None: it must be given."""
+    """A number that a kind takes: its unit, range and meaning. `default` None: it must be given.
+
+    No parameter is called as a key of every fault is: see `boards.faults.config.FaultConfig`.
+    """
 
     name: str
     unit: str
@@ -26,6 +29,7 @@ class Parameter:
     default: float | None
     least: float
     most: float
+    is_whole: bool = False
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Kind:
 
 
 def _joint(default: float = 0) -> Parameter:
-    return Parameter("joint", "1", "joint concerned, from 0; -1: all", default, -1, 15)
+    return Parameter("joint", "1", "joint concerned, from 0; -1: all", default, -1, 15, is_whole=True)
 
 
 def _probability(default: float) -> Parameter:
@@ -67,8 +71,8 @@ KINDS: tuple[Kind, ...] = (
         (Alarm.LATE, Alarm.STARVED),
         "1 cycle",
         (
-            Parameter("cycles", "cycles", "how much longer", 1.5, 0.0, 100.0),
-            Parameter("random", "1", "1: uniformly between 0 and that", 0, 0, 1),
+            Parameter("by", "cycles", "how much longer", 1.5, 0.0, 100.0),
+            Parameter("random", "1", "1: uniformly between 0 and that", 0, 0, 1, is_whole=True),
         ),
         realtime=True,
     ),
@@ -78,7 +82,7 @@ KINDS: tuple[Kind, ...] = (
         "the planner computes beyond its d cycles",
         (Alarm.PLAN_LATE,),
         "d + 1 cycles",
-        (Parameter("cycles", "cycles", "how far beyond", 2.0, 0.5, 100.0),),
+        (Parameter("by", "cycles", "how far beyond", 2.0, 0.5, 100.0),),
         realtime=True,
     ),
     Kind(
@@ -104,7 +108,7 @@ KINDS: tuple[Kind, ...] = (
         "messages are held back",
         (Alarm.HELD_BACK,),
         "the delay + 1 read",
-        (Parameter("cycles", "cycles", "writer's cycles for which they are held", 2, 1, 50),),
+        (Parameter("by", "cycles", "writer's cycles for which they are held", 2, 1, 50, is_whole=True),),
         takes_mailbox=True,
     ),
     Kind(
@@ -122,7 +126,7 @@ KINDS: tuple[Kind, ...] = (
         "bits are flipped in the slot",
         (Alarm.DAMAGED,),
         "1 read",
-        (_probability(1.0), Parameter("bits", "1", "bits flipped", 3, 1, 64)),
+        (_probability(1.0), Parameter("bits", "1", "bits flipped", 3, 1, 64, is_whole=True)),
         takes_mailbox=True,
     ),
     Kind(
@@ -131,7 +135,7 @@ KINDS: tuple[Kind, ...] = (
         "writes without pause",
         (Alarm.BABBLE,),
         "1 read",
-        (Parameter("writes", "1", "writes in one cycle", 32, 3, 1000),),
+        (Parameter("writes", "1", "writes in one cycle", 32, 3, 1000, is_whole=True),),
         takes_mailbox=True,
     ),
     Kind(
@@ -149,19 +153,27 @@ KINDS: tuple[Kind, ...] = (
         "the holder of a lock is stopped or killed",
         (Alarm.LOCKED,),
         "the lock's time-out",
-        (Parameter("killed", "1", "1: killed; 0: stopped", 0, 0, 1),),
+        (Parameter("killed", "1", "1: killed; 0: stopped", 0, 0, 1, is_whole=True),),
         realtime=True,
         takes_mailbox=True,
         once=True,
     ),
-    Kind("clock-stop", "clock", "SIGSTOP of the clock's board", (Alarm.CLOCK_STOPPED,), "3 ticks", realtime=True),
+    Kind(
+        "clock-stop",
+        "clock",
+        "SIGSTOP of the clock's board",
+        (Alarm.CLOCK_STOPPED,),
+        "3 ticks",
+        realtime=True,
+        once=True,
+    ),
     Kind(
         "clock-skip",
         "clock",
         "ticks are left out",
         (Alarm.CLOCK_SKIPPED,),
         "1 tick",
-        (Parameter("ticks", "ticks", "how many in a row", 1, 1, 20),),
+        (Parameter("ticks", "ticks", "how many in a row", 1, 1, 20, is_whole=True),),
         once=True,
     ),
     Kind(

@@ -1,4 +1,4 @@
-"""What the servo level needs of an arm: sense, drive, and let time pass."""
+"""What the servo level needs of an arm: sense, drive, brake, and let time pass."""
 
 from __future__ import annotations
 
@@ -8,32 +8,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backplane.message import Message
+from levels.level import Finding
 
 Array = NDArray[np.float64]
 
 
 class Sensed(NamedTuple):
-    """What the arm's sensors say now: joints (joints,), rad and rad/s; gripper, m and m/s, 0 without one."""
+    """What the arm's sensors say: joints (joints,), rad and rad/s; gripper, m and m/s, 0 without one.
+
+    `tick` is that of the sample.
+    """
 
     position: Array
     velocity: Array
     opening: float
     opening_velocity: float
+    tick: int
 
 
-class Arm(Protocol):
-    """An arm with torque-driven joints and a force-driven gripper.
+class Link(Protocol):
+    """What lies between the servo level and an arm: samples come up, torques go down."""
 
-    `tick` is the tick that its state belongs to. `torque` (joints,), N m, and `grip_force`, N, are what it was given
-    last, behind the limit gate; `clipped` counts the cycles in which the gate cut a command. `fault` is empty, or says
-    why the arm has stopped for good.
+    def sense(self) -> Sensed:
+        """Return the newest sample. The arrays are valid until the next call."""
+
+    def drive(self, torque: Array, grip_force: float) -> Finding | None:
+        """Open the brakes and give torques (joints,), N m, and the gripper's force, N, through the limit gate.
+
+        They hold for the coming tick. What no servo level may ask for is not given: the brakes close, and what was
+        wrong is returned.
+        """
+
+
+class Arm(Link, Protocol):
+    """An arm with torque-driven joints that have brakes, and a force-driven gripper.
+
+    `tick` is the tick that its state belongs to. `torque` (joints,), N m, and `grip_force`, N, are what its motors were
+    told last, behind the limit gate; `clipped` counts the cycles in which the gate cut a command. `waited` counts the
+    ticks since the last command. `fault` is empty, or says why the arm has stopped for good.
     """
 
     tick: int
     torque: Array
     grip_force: float
     clipped: int
+    waited: int
     fault: str
+
+    @property
+    def braked(self) -> bool:
+        """Whether the brakes are closed."""
 
     @property
     def touches(self) -> int:
@@ -43,11 +67,19 @@ class Arm(Protocol):
     def first_touch(self) -> str:
         """The first of them: what touched what, and when; empty: there was none."""
 
-    def sense(self) -> Sensed:
-        """Return what the sensors say. The arrays are valid until the next call."""
+    @property
+    def violations(self) -> int:
+        """Steps of the simulation in which a limit was broken."""
 
-    def drive(self, torque: Array, grip_force: float) -> None:
-        """Give torques (joints,), N m, and the gripper's force, N, for the coming cycle, through the limit gate."""
+    @property
+    def first_violation(self) -> str:
+        """The first of them: which limit, by how much, and when; empty: there was none."""
+
+    def brake(self) -> None:
+        """Close the brakes: they stop and hold the joints, the motors give nothing. The gripper keeps its force."""
+
+    def weaken(self, most: Array | None) -> None:
+        """Let the motors give no more than `most` (joints,), N m, whatever they are told; None: they are sound."""
 
     def step(self, ticks: int) -> None:
         """Let `ticks` ticks pass."""
@@ -56,7 +88,7 @@ class Arm(Protocol):
         """Fill a `levels.messages.SCENE` with the poses of bodies and tool as sensed."""
 
     def save(self, state: Message) -> None:
-        """Fill a `levels.messages.ARM_STATE` with all that the future depends on."""
+        """Fill in a `levels.messages.ARM_STATE` all that the arm's future depends on."""
 
     def restore(self, state: Message) -> None:
         """Go on from a `levels.messages.ARM_STATE`."""

@@ -1,4 +1,4 @@
-"""The drives' own stop, for when no torque command comes, or one that is no number: brake, then stand still."""
+"""The joints' brakes: they act without the motors, on a joint whose motor is off as well."""
 
 from __future__ import annotations
 
@@ -16,23 +16,28 @@ STANDSTILL = 0.01
 class Brake:
     """Stops the joints with `braking` (joints,), rad/s2, at most, and holds them where they came to rest.
 
-    This is "safe stop 2" of IEC 61800-5-2. `stiffness`, rad/s, is the bandwidth of the hold.
+    `rest` (joints,), rad, is where that is. `stiffness`, rad/s, is the bandwidth of the hold.
     """
 
     def __init__(self, braking: Array, dynamics: Dynamics, stiffness: float = 20.0) -> None:
         self._braking, self._dynamics = braking, dynamics
         self._stiffness = stiffness
-        self._rest: Array | None = None
+        self.closed = False
+        self.rest: Array = np.zeros(len(braking))
 
-    def release(self) -> None:
+    def close(self, q: Array) -> None:
+        """Close at positions `q`, rad."""
+        if not self.closed:
+            self.closed = True
+            np.copyto(self.rest, q)
+
+    def open(self) -> None:
         """Let the arm move again."""
-        self._rest = None
+        self.closed = False
 
     def torque(self, q: Array, qd: Array) -> Array:
         """Return the torques (joints,), N m, that stop or hold the arm at state `q`, `qd`."""
-        if self._rest is None:
-            self._rest = q.copy()
-        np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
-        wanted = self._stiffness**2 * (self._rest - q) - 2.0 * self._stiffness * qd
+        np.copyto(self.rest, q, where=np.abs(qd) > STANDSTILL)
+        wanted = self._stiffness**2 * (self.rest - q) - 2.0 * self._stiffness * qd
         inertia, bias = self._dynamics.terms(q, qd)
         return np.asarray(inertia @ np.clip(wanted, -self._braking, self._braking) + bias)

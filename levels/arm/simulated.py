@@ -8,38 +8,47 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from backplane.alarms import Alarm
 from backplane.message import Message
 from levels.arm.arm import Sensed
 from levels.arm.brake import Brake
 from levels.arm.contact_monitor import ContactMonitor
+from levels.arm.limit_monitor import LimitMonitor
 from levels.arm.limits import LimitGate
 from levels.arm.motion import ObstacleMotion
 from levels.cell import STATE, Cell
 from levels.dynamics import Dynamics
+from levels.level import Finding
 from levels.scene import SceneConfig
 
 Array = NDArray[np.float64]
 
-PATIENCE_TICKS = 4
-"""Ticks for which the drives go on with the last command when none comes; then they brake. After as many missed beats
-the supervisor calls a board dead."""
+PATIENCE_CYCLES = 2
+"""Torque cycles for which the motors go on with the last command when none comes; then the brakes close."""
+FARTHEST = 1.001
+"""Multiple of a torque limit beyond which a command is none that a servo level gives: it keeps the limits itself."""
 
 
 class SimulatedArm:
     """Implements `Arm`: `substeps` MuJoCo steps a tick; simulated time is tick times period, always.
 
-    A command holds for one tick. It passes the limit gate in every tick, also in those that the servo level missed.
+    A command is for one torque cycle, `every` ticks. It passes the limit gate in every tick, also in those that the
+    servo level missed.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int) -> None:
+    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1) -> None:
         self._cell, self._model = cell, cell.model
         self._data = cell.start()
         self._clock_ns = clock_ns
+        self._patience = PATIENCE_CYCLES * every
         self._substeps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
         self._dynamics = Dynamics(cell)
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, self._dynamics)
         self._brake = Brake(cell.limits.acceleration, self._dynamics)
-        self._monitor = ContactMonitor(cell)
+        self._brake.close(cell.home)  # until the first command
+        self._contacts = ContactMonitor(cell)
+        self._limits = LimitMonitor(cell, self._substeps)
+        self._most: Array | None = None
         obstacles = cell.bodies[len(cell.object_qpos) :]
         names = scene.obstacles
         self._motions = [
@@ -49,7 +58,8 @@ class SimulatedArm:
         self._sensed = (np.zeros(len(cell.qpos)), np.zeros(len(cell.qpos)))
         self._sound = np.zeros(mujoco.mj_stateSize(cell.model, STATE))
         self._command: Array = np.zeros(len(cell.qpos))
-        self._waited = PATIENCE_TICKS  # the brakes are on until the first command
+        self._given = False  # for the coming tick
+        self.waited = self._patience
         self.tick = 0
         self.torque: Array = np.zeros(len(cell.qpos))
         self.grip_force = 0.0
@@ -59,14 +69,29 @@ class SimulatedArm:
         mujoco.set_mju_user_warning(lambda _: None)
 
     @property
+    def braked(self) -> bool:
+        """Whether the brakes are closed."""
+        return self._brake.closed
+
+    @property
     def touches(self) -> int:
         """Contacts that no task means, summed over all steps."""
-        return self._monitor.count
+        return self._contacts.count
 
     @property
     def first_touch(self) -> str:
         """The first such contact: which geoms, and when; empty: there was none."""
-        return self._monitor.first
+        return self._contacts.first
+
+    @property
+    def violations(self) -> int:
+        """Steps of the simulation in which a limit was broken."""
+        return self._limits.count
+
+    @property
+    def first_violation(self) -> str:
+        """The first of them: which limit, by how much, and when; empty: there was none."""
+        return self._limits.first
 
     def sense(self) -> Sensed:
         """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
@@ -75,23 +100,46 @@ class SimulatedArm:
         np.take(d.qpos, cell.qpos, out=position)
         np.take(d.qvel, cell.dof, out=velocity)
         if cell.gripper_qpos is None:
-            return Sensed(position, velocity, 0.0, 0.0)
-        return Sensed(position, velocity, float(d.qpos[cell.gripper_qpos]), float(d.qvel[cell.gripper_dof]))
+            return Sensed(position, velocity, 0.0, 0.0, self.tick)
+        opening, speed = float(d.qpos[cell.gripper_qpos]), float(d.qvel[cell.gripper_dof])
+        return Sensed(position, velocity, opening, speed, self.tick)
 
-    def drive(self, torque: Array, grip_force: float) -> None:
-        """Give torques and gripper force for the coming tick. What is no number is never given: the drives brake."""
-        self._waited = 0
-        np.copyto(self._command, torque)
+    def drive(self, torque: Array, grip_force: float) -> Finding | None:
+        """Open the brakes and give torques and gripper force for the coming torque cycle.
+
+        What is no number, or beyond the torque limits, is never given: the brakes close, and it is returned.
+        """
         if math.isfinite(grip_force) and self._cell.gripper_actuator is not None:
             self.grip_force = grip_force
+        wrong = self._wrong(torque)
+        if wrong is not None:
+            self.clipped += 1
+            self.brake()
+            return wrong
+        self.waited = 0
+        self._brake.open()
+        np.copyto(self._command, torque)
         self._give()
+        return None
+
+    def brake(self) -> None:
+        """Close the brakes; the motors give nothing, the gripper keeps its force."""
+        self._brake.close(self.sense().position)
+        self._give()
+
+    def weaken(self, most: Array | None) -> None:
+        """Let the motors give no more than `most` (joints,), N m, from the next command on; None: they are sound."""
+        self._most = most
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time goes on."""
         for _ in range(ticks):
-            if self._waited:
+            if self.waited >= self._patience:
+                self._brake.close(self.sense().position)
+            if not self._given:
                 self._give()
-            self._waited += 1
+            self._given = False
+            self.waited += 1
             if not self.fault:
                 self._simulate()
             self.tick += 1
@@ -111,37 +159,49 @@ class SimulatedArm:
         """Fill an `ARM_STATE`."""
         mujoco.mj_getState(self._model, self._data, state.state, STATE)
         state.tick, state.clipped, state.touches = self.tick, self.clipped, self.touches
+        state.violations = self.violations
+        state.waited, state.braked, state.rest = self.waited, self.braked, self._brake.rest
 
     def restore(self, state: Message) -> None:
         """Go on, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
         d, cell = self._data, self._cell
         mujoco.mj_setState(self._model, d, state.state, STATE)
-        self.tick, self.clipped, self._monitor.count = state.tick, state.clipped, state.touches
+        self.tick, self.clipped, self._contacts.count = state.tick, state.clipped, state.touches
+        self._limits.count = state.violations
+        self._brake.closed, self.waited = bool(state.braked), state.waited
+        np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
         self.grip_force = float(d.ctrl[cell.gripper_actuator]) if cell.gripper_actuator is not None else 0.0
-        self._waited = 0
+        self._given = True
 
     @property
     def _now_s(self) -> float:
         return self.tick * self._clock_ns * 1e-9
 
+    def _wrong(self, torque: Array) -> Finding | None:
+        """Return what is wrong with a command that no servo level gives."""
+        share = np.abs(torque) / self._cell.bounds.torque
+        if (share <= FARTHEST).all():
+            return None
+        if np.isfinite(torque).all():
+            joint = int(share.argmax())
+            return Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint]))
+        return Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax()))
+
     def _give(self) -> None:
-        """Pass the command, or the brake's, through the limit gate to the motors."""
+        """Pass the command to the motors, or the brakes' torque to the joints, through the limit gate."""
         d, cell = self._data, self._cell
-        q, qd, _, _ = self.sense()
-        valid = bool(np.isfinite(self._command).all())
-        if valid and self._waited < PATIENCE_TICKS:
-            self._brake.release()
-            wanted = self._command
-        else:
-            wanted = self._brake.torque(q, qd)
-        passed, cut = self._gate.admit(wanted, q, qd)
-        self.clipped += cut or not valid
-        np.copyto(self.torque, passed)
-        d.ctrl[cell.actuators] = passed
+        q, qd, _, _, _ = self.sense()
+        closed = self._brake.closed
+        passed, cut = self._gate.admit(self._brake.torque(q, qd) if closed else self._command, q, qd)
+        self.clipped += cut
+        d.qfrc_applied[cell.dof] = passed if closed else 0.0
+        np.copyto(self.torque, 0.0 if closed else passed)
+        d.ctrl[cell.actuators] = self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
         if cell.gripper_actuator is not None:
             d.ctrl[cell.gripper_actuator] = self.grip_force
+        self._given = True
 
     def _simulate(self) -> None:
         """Simulate one tick; if that ends in a fault, the state before it stays."""
@@ -149,9 +209,11 @@ class SimulatedArm:
         mujoco.mj_getState(m, d, self._sound, STATE)
         for mocap, motion in self._motions:
             d.mocap_pos[mocap] = motion.position(self._now_s)
-        for _ in range(self._substeps):
+        for substep in range(self._substeps):
             mujoco.mj_step(m, d)
-            self._monitor.look(d, d.time)
+            self._contacts.look(d, d.time)
+            self._limits.look(d, substep)
+        self._limits.judge(self._now_s)
         self.fault = self._broken()
         if self.fault:
             mujoco.mj_setState(m, d, self._sound, STATE)

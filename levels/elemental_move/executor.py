@@ -9,7 +9,7 @@ import numpy as np
 
 from backplane.message import Message, MessageType, State
 from levels.elemental_move.params import ElementalMoveParams
-from levels.elemental_move.plans import PlansAtHand
+from levels.elemental_move.plans import PlansAtHand, joins
 from levels.elemental_move.segments import SegmentWindow
 from levels.level import Executor, Input, LevelContext, Ports
 from levels.messages import (
@@ -28,7 +28,8 @@ from levels.params import read_params
 class ElementalMoveExecutor(Executor):
     """Hands segments down as soon as their plans are there, and asks for another path where the arm is blocked.
 
-    It reads back what it wrote itself, so that it goes on where it was when its board has been restarted.
+    It reads back what it wrote itself, so that it goes on where it was when its board has been restarted. While the
+    board above is lost the arm is held on its path.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {
@@ -38,7 +39,8 @@ class ElementalMoveExecutor(Executor):
         "last_command": Input(MOVE_COMMAND, "own.command"),
         "last_status": Input(MOVE_STATUS, "own.status"),
     }
-    outputs: ClassVar[Mapping[str, MessageType]] = {"command": MOVE_COMMAND, "status": MOVE_STATUS}
+    # The status first: killed between the two, the board finds a window whose done moves it only takes out again.
+    outputs: ClassVar[Mapping[str, MessageType]] = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -60,7 +62,7 @@ class ElementalMoveExecutor(Executor):
         if not self._started:
             self._go_on(read, write, segments)
         status = read.status.value
-        self._plans.take(read.plan, self._done, self._handed_down)
+        self._plans.take(read.plan, self._done, self._handed_down, write.status.end)
         self._take_window(read.command.value, status, segments)
         if not self._error:
             self._take_done(status, segments)
@@ -70,7 +72,7 @@ class ElementalMoveExecutor(Executor):
             self._fill(read.command.value, segments, tick)
         if self._error:
             segments.clear()
-        write.command.hold = self._request > 0 or self._error > 0
+        write.command.hold = self._request > 0 or self._error > 0 or read.command.is_lost
         self._report(read.command.value, status, segments, write.status)
 
     def _go_on(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
@@ -132,6 +134,10 @@ class ElementalMoveExecutor(Executor):
             # The cycle's number: no request of an earlier life of this board has the same.
             self._request = tick // self.context.every
         elif (plan := self._plans.anew(self._request)) is not None:
+            if not (plan.error or joins(plan, status.position)):
+                # The arm has been moved meanwhile.
+                self._request = tick // self.context.every
+                return
             if plan.error:
                 self._wait(plan, tick)
                 return

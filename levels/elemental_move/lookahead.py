@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backplane.message import Message
-from levels.messages import Verb
+from levels.messages import SegmentKind, Verb
 from levels.planning.move import Move
 from levels.planning.path import Path
 from levels.planning.pose import Pose
@@ -52,6 +52,14 @@ def next_move(window: Sequence[Move], newest: int) -> Move | None:
             if move.is_motion:
                 return move
             newest = move.id
+    return None
+
+
+def end_handed_down(command: Message, move: Move) -> Array | None:
+    """Return where the path of `move` in a `MOVE_COMMAND` ends, (joints,), rad; None: it is not in there."""
+    for segment in command.segments[: command.count]:
+        if segment["move"] == move.id and segment["kind"] == SegmentKind.PATH:
+            return np.array(segment["waypoints"][segment["count"] - 1])
     return None
 
 

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from backplane.message import Message, MessageType
 from levels.cell import build_cell
-from levels.elemental_move.lookahead import Job, Published, Refusal, next_move, situation_before
+from levels.elemental_move.lookahead import Job, Published, Refusal, end_handed_down, next_move, situation_before
 from levels.elemental_move.params import ElementalMoveParams
 from levels.errors import Refused
 from levels.level import Input, LevelContext, Planner, Ports
 from levels.messages import (
+    MOVE_COMMAND,
     MOVE_PLAN,
     MOVE_STATUS,
     PRIMITIVE_STATUS,
@@ -48,6 +49,7 @@ class ElementalMovePlanner(Planner):
     inputs: ClassVar[Mapping[str, Input]] = {
         "command": Input(TASK_COMMAND, "above.command"),
         "status": Input(MOVE_STATUS, "own.status"),
+        "handed_down": Input(MOVE_COMMAND, "own.command"),
         "primitive": Input(PRIMITIVE_STATUS, "below.status"),
         "scene": Input(SCENE, "servo.scene"),
         "world": Input(WORLD_MODEL, "world.model"),
@@ -75,13 +77,14 @@ class ElementalMovePlanner(Planner):
     def wanted(self, read: Ports, tick: int) -> bool:
         """Say whether a path is asked for, is blocked, or is not yet there."""
         ports = (read.command, read.status, read.primitive, read.scene, read.world)
-        if not all(port.is_there for port in ports):
+        # What is planned for an executor that is lost rests on what it knew: it says anew when it is back.
+        if not all(port.is_there for port in ports) or read.status.is_lost:
             return False
         self._window = read_window(read.command.value)
         status = read.status.value
         self._forget(status, tick)
         self._note_grip(read)
-        self._job = self._asked_for(status, tick) or self._blocked(read) or self._ahead(read)
+        self._job = self._asked_for(read, tick) or self._blocked(read) or self._ahead(read)
         return self._job is not None and self._may_try(self._job, read.world.value.revision, tick)
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
@@ -102,14 +105,14 @@ class ElementalMovePlanner(Planner):
         write.waypoints[:count], write.blend[:count] = path
         self._note_path(job, path, visible_at)
 
-    def _asked_for(self, status: Message, tick: int) -> Job | None:
-        """Return the job that the executor asks for where the arm is blocked."""
+    def _asked_for(self, read: Ports, tick: int) -> Job | None:
+        """Return the job that the executor asks for where the arm is blocked; its end stays, for what comes behind."""
+        status = read.status.value
         if not status.replan or (status.replan == self._answered and tick < self._answer_due):
             return None
         for move in self._window:
             if move.id == status.current:
-                known = [p.path.end for p in self._published if p.move.id == move.id]
-                return Job(move, np.array(status.start), known[0] if known else None, status.replan)
+                return Job(move, np.array(status.start), end_handed_down(read.handed_down.value, move), status.replan)
         return None
 
     def _blocked(self, read: Ports) -> Job | None:
@@ -131,7 +134,8 @@ class ElementalMovePlanner(Planner):
         move = next_move(self._window, newest)
         if move is None:
             return None
-        if self._published and self._published[-1].move.id >= status.planned:
+        # What the executor has it knows better: it may not have taken the newest path made.
+        if self._published and self._published[-1].move.id > status.planned:
             return Job(move, self._published[-1].path.end)
         if status.planned > status.done:
             return Job(move, np.array(status.end))

@@ -11,6 +11,8 @@ from backplane.mailbox import Reading
 from backplane.message import Message
 from levels.messages import WINDOW, Error, Verb
 
+SAME_PLACE_RAD = 0.005
+"""Paths join where the end of one and the beginning of the next are not farther apart than this in any joint."""
 CAPACITY = 2 * WINDOW
 """Plans kept: the planner is never farther ahead than its window, and moves just done leave with the next plan."""
 
@@ -22,10 +24,12 @@ class PlansAtHand:
         self._by_move: dict[int, Message] = {}
         self._anew: Message | None = None
 
-    def take(self, plan: Reading, done: int, handed_down: int) -> None:
-        """Take over a plan that is new, of a move behind the newest one handed down.
+    def take(self, plan: Reading, done: int, handed_down: int, end: NDArray[np.float64]) -> None:
+        """Take over a plan that is new, of a move behind the newest one handed down, if it begins where those end.
 
-        Plans of moves before `done` are given up, and behind a refusal all.
+        `end` (joints,), rad, is where the moves end for which no plan is at hand any more. A plan that does not join
+        rests on one that has been lost or made again; its planner makes it anew. Plans of moves before `done` are
+        given up, and behind a refusal, or a path that ends elsewhere than the one before, all.
         """
         if not plan.is_new:
             return
@@ -34,9 +38,14 @@ class PlansAtHand:
         if message.replan:
             self._anew = message
             return
-        if message.move <= handed_down:
+        for move in [m for m in self._by_move if m < done]:
+            del self._by_move[move]
+        before = self.end(message.move - 1)
+        if message.move <= handed_down or not (message.error or joins(message, end if before is None else before)):
             return
-        for move in [m for m in self._by_move if m < done or (message.error and m > message.move)]:
+        known = self._by_move.get(message.move)
+        stays = known is not None and not (known.error or message.error) and is_same(end_of(known), end_of(message))
+        for move in [m for m in self._by_move if m > message.move and not stays]:
             del self._by_move[move]
         if len(self._by_move) < CAPACITY:
             self._by_move[message.move] = message
@@ -64,7 +73,19 @@ class PlansAtHand:
     def end(self, move: int) -> NDArray[np.float64] | None:
         """Return where the newest path up to that of `move` ends, (joints,) in rad; None: no such path is at hand."""
         paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
-        if not paths:
-            return None
-        plan = self._by_move[max(paths)]
-        return np.asarray(plan.waypoints[plan.count - 1])
+        return end_of(self._by_move[max(paths)]) if paths else None
+
+
+def joins(plan: Message, place: NDArray[np.float64]) -> bool:
+    """Say whether the path of a `MOVE_PLAN` begins at `place` (joints,), rad."""
+    return is_same(np.asarray(plan.waypoints[0]), place)
+
+
+def end_of(plan: Message) -> NDArray[np.float64]:
+    """Return where the path of a `MOVE_PLAN` ends, (joints,), rad."""
+    return np.asarray(plan.waypoints[plan.count - 1])
+
+
+def is_same(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Say whether two configurations (joints,), rad, are one place for a path to go on from."""
+    return float(np.abs(a - b).max()) <= SAME_PLACE_RAD

@@ -27,10 +27,13 @@ from levels.primitive.path_motion import SetPoint
 from levels.primitive.path_work import PathWork, WorkRules
 from levels.primitive.plans import Plans
 from levels.primitive.segment import Segment, read_segment, window
-from levels.primitive.tracking import Tracking
+from levels.primitive.sight import Sight
+from levels.primitive.tracking import Straying, Tracking
 
 Work = PathWork | GripperWork
 
+SEEN_CYCLES = 2
+"""Cycles by which the world model lags behind the servo: what rests now is seen at rest since then."""
 DELAY_CYCLES = 3
 """Cycles from the sensing of the world model to the set point commanded last: what moves has gone on meanwhile."""
 
@@ -39,7 +42,8 @@ class PrimitiveExecutor(Executor):
     """Does the segments of the window, oldest first; each from rest to rest, the next one planned meanwhile.
 
     Released at tick T it writes the set point due two cycles later: the first brings it to the servo, over the second
-    the servo interpolates to it. What it must not forget when its board dies it finds in its own last messages.
+    the servo interpolates to it. What it must not forget when its board dies it finds in its own last messages. While
+    the board above is lost it rests on its path, as with `hold`; while the servo does not follow it waits.
     """
 
     inputs = {
@@ -59,7 +63,10 @@ class PrimitiveExecutor(Executor):
         self._rules = WorkRules(context.robot.joints, cell.limits, self._params, context.period_s)
         self._guard = Guard(cell, context.scene, self._params.lookahead, DELAY_CYCLES * context.period_s)
         self._gripper = context.robot.gripper
+        self._sight = Sight(self._guard, round(self._params.blind / context.tick_s), bool(context.scene.bodies))
         self._tracking = Tracking()
+        straying = self._rules.cycles(self._params.straying)
+        self._straying = Straying(context.robot.joints, self._params.following, straying)
         self._plans = Plans()
         self._memory: Memory | None = None
         self._work: Work | None = None
@@ -67,8 +74,9 @@ class PrimitiveExecutor(Executor):
         self._faulty = 0
         self._position = cell.home.copy()
         self._rest = SetPoint(self._position, *np.zeros((2, len(cell.home))))
-        self._blind_cycles = 0
         self._tick: int | None = None
+        # True when the servo has been away since the last path: the arm may not be where that ended.
+        self._displaced = False
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Sample command, status, plan and world model; write the next set point and this level's status."""
@@ -78,9 +86,9 @@ class PrimitiveExecutor(Executor):
         self._tick = tick
         serials = window(read.command.value)
         self._plans.accept(read.plan, serials)
-        self._blind_cycles = 0 if read.world.is_new else self._blind_cycles + 1
         if self._tracking.update(read.status):
-            self._take_up(read)
+            self._take_up(read, tick)
+        self._sight.update(read.world, read.status.value.position, tick)
         if self._tracking.in_step:
             self._go_on(read, serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._rules.cycles(self._params.silent):
@@ -88,43 +96,51 @@ class PrimitiveExecutor(Executor):
         self._write_set_point(write.command, tick)
         self._write_status(read, write.status, serials, tick)
 
-    def _take_up(self, read: Ports) -> None:
+    def _take_up(self, read: Ports, tick: int) -> None:
         """Go on from where the servo holds the arm."""
-        servo = read.status.value
+        servo, work = read.status.value, self._work
+        self._displaced = self._memory is not None
         if self._memory is None:
             force = self._gripper.force if self._gripper is not None else 0.0
             self._memory = Memory(opening=servo.opening, force=force)
         self._fault = None
+        self._straying.forget()
         self._position[:] = servo.target
-        self._guard.carry(self._memory.held, servo.position, read.world.value)
-        if isinstance(self._work, PathWork):
-            self._work.begin_near(self._position)
+        self._sight.carry(self._memory.held, tick - SEEN_CYCLES * self.context.every)
+        if isinstance(work, PathWork):
+            work.begin_near(self._position, work.progress)
+            self._displaced = False
+        elif work is not None:
+            work.begin()
 
     def _go_on(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish it, drop it, begin it, step it."""
-        self._finish(read)
+        hold = bool(read.command.value.hold) or read.command.is_lost
+        if read.status.is_new:
+            self._finish(read.status.value, tick)
+            self._straying.update(read.status.value)
         withdrawn = self._withdraw(serials)
         if self._work is None and self._fault is None:
-            self._begin(read, serials)
+            self._begin(read, serials, hold)
         work = self._work
         if work is None:
             return
         if self._fault is None:
-            self._fault = work.fault or self._plans.refusal(work.segment.id) or self._straying(read.status.value)
+            self._fault = work.fault or self._plans.refusal(work.segment.id) or self._straying.fault
         if isinstance(work, PathWork):
-            hold = bool(read.command.value.hold) or withdrawn or self._fault is not None or self._is_blind(read)
+            hold = hold or withdrawn or self._fault is not None or self._straying.strays or not self._sight.is_enough
             plan = self._plans.trajectory(work.segment.id, work.motion.s)
             due_s = (tick + self.context.every) * self.context.tick_s
             work.step(hold, plan, read.world.value, due_s, passed_s)
             self._position[:] = work.motion.set_point.position
 
-    def _finish(self, read: Ports) -> None:
+    def _finish(self, servo: Message, tick: int) -> None:
         work, memory = self._work, self._memory
-        if work is None or memory is None or self._fault is not None or not work.done(read.status.value):
+        if work is None or memory is None or self._fault is not None or not work.done(servo):
             return
         if isinstance(work, GripperWork):
             memory.held = work.held_after
-            self._guard.carry(memory.held, read.status.value.position, read.world.value)
+            self._sight.carry(memory.held, tick - SEEN_CYCLES * self.context.every)
         memory.done, self._work = work.segment.id, None
 
     def _withdraw(self, serials: list[int]) -> bool:
@@ -134,11 +150,14 @@ class PrimitiveExecutor(Executor):
             return False
         if isinstance(self._work, PathWork) and not self._work.motion.resting:
             return True
+        if isinstance(self._work, PathWork) and self._memory is not None:
+            # Messages may come out of order: what is withdrawn may be wanted again, and goes on then.
+            self._memory.interrupted, self._memory.progress = serial, self._work.progress
         self._work, self._fault = None, None
         return False
 
-    def _begin(self, read: Ports, serials: list[int]) -> None:
-        """Begin the oldest segment that is not done."""
+    def _begin(self, read: Ports, serials: list[int], hold: bool) -> None:
+        """Begin the oldest segment that is not done; with `hold`, the gripper waits."""
         memory = self._memory
         serial = next((s for s in serials if memory is not None and s > memory.done), 0)
         if not serial or memory is None:
@@ -146,6 +165,8 @@ class PrimitiveExecutor(Executor):
         self._faulty = serial
         try:
             segment = read_segment(read.command.value, serial)
+            if hold and segment.kind is SegmentKind.GRIPPER:
+                return
             begin = self._begin_path if segment.kind is SegmentKind.PATH else self._begin_gripper
             self._work = begin(segment, memory, read)
         except ValueError as error:
@@ -163,25 +184,13 @@ class PrimitiveExecutor(Executor):
         self._guard.watch(segment, path, read.status.value.opening, read.world.value)
         work = PathWork(segment, path, self._guard, self._rules)
         if segment.id == memory.interrupted:
-            work.begin_near(self._position)
+            work.begin_near(self._position, memory.progress)
+        elif self._displaced:
+            work.begin_near(self._position, 0.0)
         else:
             work.begin_at(self._position)
+        self._displaced = False
         return work
-
-    def _straying(self, servo: Message) -> Fault | None:
-        away = np.abs(servo.position - servo.target)
-        permitted = self._params.following
-        if away.max() <= permitted:
-            return None
-        joint = int(away.argmax())
-        name = self.context.robot.joints[joint]
-        reason = f"joint '{name}' is {away[joint]:.4f} rad from its set point; at most {permitted} is valid"
-        return Fault(Error.FOLLOWING, reason)
-
-    def _is_blind(self, read: Ports) -> bool:
-        """Say whether the world model is missing, where there is something to see."""
-        stale = self._blind_cycles > self._rules.cycles(self._params.blind)
-        return bool(self.context.scene.bodies) and (stale or not read.world.is_there)
 
     def _wanted(self, read: Ports, serials: list[int]) -> tuple[int, float]:
         """Return the segment that a trajectory is wanted for, and where on its path it is to begin; 0: none."""
@@ -214,12 +223,15 @@ class PrimitiveExecutor(Executor):
         status.state = self._state(serials, memory)
         status.error, status.reason, status.earliest = fault or (0, "", 0.0)
         status.done, status.held = memory.done, memory.held if memory.held is not None else -1
-        status.current = work.segment.id if work is not None else memory.interrupted
-        status.opening = read.status.value.opening
+        interrupted = memory.interrupted if memory.interrupted in serials else 0
+        status.current = work.segment.id if work is not None else interrupted
+        if read.status.is_there:
+            status.opening = read.status.value.opening
         status.position[:] = self._position
         path_work = work if isinstance(work, PathWork) else None
-        status.progress = path_work.progress if path_work is not None else 0.0
-        status.blocked = path_work is not None and path_work.blocked
+        status.progress = path_work.progress if path_work is not None else memory.progress * bool(interrupted)
+        # Out of step it is not for the world that motion holds.
+        status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
         status.resting = path_work is None or path_work.motion.resting
         status.ends = path_work.ends_s((tick + 2 * self.context.every) * self.context.tick_s) if path_work else 0.0
         status.wants, status.begin = self._wanted(read, serials)

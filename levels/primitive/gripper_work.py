@@ -7,7 +7,7 @@ from levels.messages import Error
 from levels.primitive.fault import Fault
 from levels.primitive.path_work import WorkRules
 from levels.primitive.segment import Segment
-from levels.primitive.tracking import HANDOVER_CYCLES, Quiet
+from levels.primitive.tracking import HANDOVER_CYCLES
 from levels.robot import GripperConfig
 
 
@@ -18,10 +18,13 @@ class GripperWork:
         self.segment = segment
         self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
         self.fault: Fault | None = None
-        self._permitted_m_s = rules.params.settled_opening
+        self._rules = rules
+        self.begin()
+
+    def begin(self) -> None:
+        """Wait anew until the gripper has come to rest: at the beginning, and when the servo has been away."""
         self._cycles = 0
-        # Before the command has reached it, the gripper rests too.
-        self._quiet = Quiet(rules.params.settled_cycles, rules.cycles(rules.params.settling))
+        self._quiet = self._rules.quiet()
 
     @property
     def held_after(self) -> int | None:
@@ -31,11 +34,12 @@ class GripperWork:
     def done(self, status: Message) -> bool:
         """Say whether the gripper has come to rest."""
         self._cycles += 1
+        # Before the command has reached it, the gripper rests too.
         if self._cycles <= HANDOVER_CYCLES:
             return False
-        speed = abs(status.opening_velocity)
-        settled = self._quiet.settled(speed < self._permitted_m_s)
+        speed, permitted = abs(status.opening_velocity), self._rules.params.settled_opening
+        settled = self._quiet.settled(speed < permitted)
         if self._quiet.overdue and not settled:
-            reason = f"gripper still moves at {speed:.4f} m/s; below {self._permitted_m_s} is at rest"
+            reason = f"gripper still moves at {speed:.4f} m/s; below {permitted} is at rest"
             self.fault = Fault(Error.FOLLOWING, reason)
         return settled

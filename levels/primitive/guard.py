@@ -53,12 +53,13 @@ class Guard:
         self._least = self._clearance
         self._ahead = np.zeros((self._rows, 3))
 
-    def carry(self, row: int | None, q: Array, world: Message) -> None:
-        """Take object `row` along with the tool, from where it is while the arm is at `q`; None: carry nothing."""
-        if row is None:
-            self._checker.hold(None)
-        else:
-            self._checker.hold(row, *self._grasps.pose_of(world.position[row], world.quaternion[row], q))
+    def carry(self, row: int, q: Array, world: Message) -> None:
+        """Take object `row` along with the tool, from where it is while the arm is at `q` (joints,), rad."""
+        self._checker.hold(row, *self._grasps.pose_of(world.position[row], world.quaternion[row], q))
+
+    def carry_nothing(self) -> None:
+        """Take nothing along."""
+        self._checker.hold(None)
 
     def watch(self, segment: Segment, path: BlendedPath, opening: float, world: Message) -> None:
         """Begin to watch a new path, to be gone with the gripper at `opening`, in m."""

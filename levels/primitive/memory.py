@@ -9,10 +9,13 @@ from levels.level import Ports
 
 @dataclass
 class Memory:
-    """Newest segment done, segment that was under way (0: none), object held, and what the gripper was told (m, N)."""
+    """Newest segment done, segment that was interrupted (0: none) and the part of its path behind, object held, and
+    what the gripper was told (m, N).
+    """
 
     done: int = 0
     interrupted: int = 0
+    progress: float = 0.0
     held: int | None = None
     opening: float = 0.0
     force: float = 0.0
@@ -26,6 +29,7 @@ def recall(read: Ports) -> Memory | None:
     return Memory(
         done=status.value.done,
         interrupted=status.value.current,
+        progress=status.value.progress,
         held=status.value.held if status.value.held >= 0 else None,
         opening=command.value.opening,
         force=command.value.force,

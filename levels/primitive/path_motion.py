@@ -64,11 +64,18 @@ class PathMotion:
         """Rest at the begin of the path, at `position` (joints,); return a joint's largest distance between them."""
         return self._rest(0.0, position)
 
-    def rest_near(self, position: Array) -> float:
-        """Rest where the path is nearest, at `position` (joints,); return a joint's largest distance between them."""
+    def rest_near(self, position: Array, progress: float) -> float:
+        """Rest where the path is nearest, at `position` (joints,); return a joint's largest distance between them.
+
+        Of places equally near, as where a path comes back to itself, it is the one nearest to `progress`, 0 to 1.
+        """
         points = self.path.sample(NEAREST_STEP_RAD)
-        nearest = int(np.argmin(np.linalg.norm(points - position, axis=1)))
-        return self._rest(self.path.length * nearest / max(len(points) - 1, 1), position)
+        away = np.linalg.norm(points - position, axis=1)
+        before, behind = np.append(np.inf, away[:-1]), np.append(away[1:], np.inf)
+        near = np.flatnonzero((away <= before) & (away <= behind) & (away <= away.min() + NEAREST_STEP_RAD))
+        last = max(len(points) - 1, 1)
+        nearest = near[np.argmin(np.abs(near / last - progress))]
+        return self._rest(self.path.length * nearest / last, position)
 
     def follow(self, trajectory: Trajectory) -> None:
         """Set out along `trajectory`, which begins at rest where the motion rests."""

@@ -74,10 +74,15 @@ class PathWork:
             begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
             self.fault = Fault(Error.LIMIT, f"{begins}; at most {permitted} is valid")
 
-    def begin_near(self, position: Array) -> None:
-        """Be ready to go on from `position` (joints,), rad; blocked when that is off the path."""
+    def begin_near(self, position: Array, progress: float) -> None:
+        """Be ready to go on from `position` (joints,), rad; blocked when that is off the path.
+
+        `progress`, 0 to 1, is about how much of the path is behind.
+        """
         self._fresh = False
-        self.astray = self.motion.rest_near(position) > self._rules.params.astray
+        self._clear_cycles = 0
+        self._quiet = self._rules.quiet()
+        self.astray = self.motion.rest_near(position, progress) > self._rules.params.astray
         self.blocked = self.astray
 
     def step(self, hold: bool, trajectory: Trajectory | None, world: Message, now_s: float, duration_s: float) -> None:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from backplane.message import Message
 from levels.level import Reading
+from levels.messages import Error
+from levels.primitive.fault import Fault
 
 MISSED_STATUSES = 3
 """Cycles in a row without a new status after which the servo is silent."""
@@ -18,7 +23,7 @@ class Tracking:
     """Tells from the servo's status whether it is in step with this level.
 
     The two fall out of step when one of them starts anew or misses so many cycles that the servo holds by itself.
-    They come in step where the servo holds the arm at rest, and motion goes on from there.
+    They come in step where the servo holds the arm at rest and is not stopped, and motion goes on from there.
     """
 
     def __init__(self) -> None:
@@ -28,18 +33,52 @@ class Tracking:
 
     def update(self, status: Reading) -> bool:
         """Take in one status; True in the cycle in which servo and level come in step."""
-        self.silent_cycles = 0 if status.is_new else self.silent_cycles + 1
+        heard = status.is_new and not status.is_lost
+        self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
         servo = status.value
         left_alone = bool(servo.holding) and self._cycles_in_step > HANDOVER_CYCLES
-        if self.silent_cycles > MISSED_STATUSES or left_alone:
+        if self.silent_cycles > MISSED_STATUSES or left_alone or servo.stopped:
             self.in_step = False
-        if self.in_step or not status.is_new or not servo.holding:
+        if self.in_step or not heard or not servo.holding or servo.stopped:
             return False
-        if np.abs(servo.target_velocity).max() > REST_RAD_S:
+        # Written so that what is no number does not rest.
+        if not np.abs(servo.target_velocity).max() <= REST_RAD_S or not np.isfinite(servo.target).all():
             return False
         self.in_step, self._cycles_in_step = True, 0
         return True
+
+
+class Straying:
+    """Counts cycles in which the arm is not where the servo wants it: a few may be, and motion holds meanwhile."""
+
+    def __init__(self, joints: Sequence[str], permitted_rad: float, permitted_cycles: int) -> None:
+        self._joints = joints
+        self._permitted_rad = permitted_rad
+        self._permitted_cycles = permitted_cycles
+        self._cycles = 0
+        self.fault: Fault | None = None
+
+    @property
+    def strays(self) -> bool:
+        """True while a joint is too far from its set point."""
+        return self._cycles > 0
+
+    def forget(self) -> None:
+        """Begin to count anew."""
+        self._cycles, self.fault = 0, None
+
+    def update(self, servo: Message) -> None:
+        """Take in one status; `fault` is set when a joint has been too far away for too long."""
+        away = np.abs(servo.position - servo.target)
+        if away.max() <= self._permitted_rad:
+            self.forget()
+            return
+        self._cycles += 1
+        if self._cycles > self._permitted_cycles:
+            joint = int(away.argmax())
+            place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
+            self.fault = Fault(Error.FOLLOWING, f"{place}; at most {self._permitted_rad} is valid")
 
 
 class Quiet:

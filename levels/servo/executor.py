@@ -1,21 +1,29 @@
-"""The executor of the servo level: one cycle of computed torque."""
+"""The executor of the servo level: one cycle of computed torque, or of a stop."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from backplane.alarms import Alarm
 from backplane.message import Message, State
-from levels.arm import Arm, Sensed, SimulatedArm
+from levels.arm import Arm, FaultyLink, Link, Sensed, SimulatedArm
+from levels.arm.faulty import KINDS
 from levels.cell import build_cell
-from levels.dynamics import Dynamics, Payload
-from levels.level import Executor, Input, LevelContext, Ports
+from levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
 from levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
 from levels.params import read_params
+from levels.servo.actuator_monitor import ActuatorMonitor
+from levels.servo.brake_log import BrakeLog
+from levels.servo.computed_torque import ComputedTorque
 from levels.servo.curves import Motion
 from levels.servo.grip import Grip
 from levels.servo.params import ServoParams
 from levels.servo.reference import Reference
+from levels.servo.sensor_monitor import SensorMonitor
+from levels.servo.stopping import Reaction, Stopping
 
 Array = NDArray[np.float64]
 
@@ -23,8 +31,9 @@ Array = NDArray[np.float64]
 class ServoExecutor(Executor):
     """Follows joint set points with torques, and lets the arm's time pass.
 
-    torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction; M is the planner's.
     A cycle first simulates the ticks since the last one: the arm's time is the clock's also when cycles are missed.
+    On a demand, and while sensors or motors are at fault, the arm holds, stops or is braked instead; afterwards it is
+    taken over where it stands.
     """
 
     inputs = {
@@ -33,74 +42,149 @@ class ServoExecutor(Executor):
         "before": Input(ARM_STATE, "own.state"),
     }
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
+    faults = KINDS
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(ServoParams, context.params)
+        params, every = read_params(ServoParams, context.params), context.every
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self.arm: Arm = SimulatedArm(cell, context.scene, context.clock_ns)
+        self.arm: Arm = SimulatedArm(cell, context.scene, context.clock_ns, every)
+        self._faulty = FaultyLink(self.arm, cell.bounds.torque, every, self.acted)
+        self._link: Link = self.arm
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
-        self._dynamics = Dynamics(cell)
+        self._loop = ComputedTorque(cell, params)
+        braking = cell.limits.acceleration
+        self.sensors = SensorMonitor(cell.bounds, braking, cell.home, context.tick_s, every, params.good_cycles)
+        self.motors = ActuatorMonitor(cell, params.following, context.period_s)
+        self.stopping = Stopping(params, round(params.retry / context.tick_s), every)
+        self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
-        self._stiffness = params.bandwidth**2
-        self._damping = 2.0 * params.damping * params.bandwidth
+        self._rest = np.zeros(len(cell.home))
+        self._wanted = Motion(cell.home, self._rest, self._rest)
         self._started = False
+        self._left = False  # the set points in the last cycle: the arm was braked
+        self._refused: Alarm | None = None  # the torques of the last cycle, and why
+
+    def inject(self, faults: Sequence[Fault]) -> None:
+        """Take over the faults between this level and the arm."""
+        self._faulty.inject(faults)
+        self._link = self._faulty if faults else self.arm
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Let time pass to `tick`, sense, interpolate, drive; report."""
         missed = self._catch_up(read.before.value if read.before.is_there else None, tick)
-        sensed = self.arm.sense()
-        if missed:
-            self.reference.meet(sensed.position, sensed.velocity, tick)
-        command: Message = read.command.value
-        wanted = self.reference.at(command, tick)
-        torque = self._torque(wanted, sensed, read.plan.value if read.plan.is_there else None)
-        grip_force = 0.0 if self._grip is None else self._grip.force(command, sensed.opening, sensed.opening_velocity)
-        self.arm.drive(torque, grip_force)
-        self._report(write.status, command, wanted, sensed)
+        sensed, sensors = self._link.sense(), self.sensors
+        sensors.look(sensed, tick, None if missed or self._left else self._wanted.velocity)
+        self._take_findings()
+        reaction = self.stopping.decide(self.demand, sensors, tick)
+        if reaction is Reaction.BRAKE:
+            self._brake()
+        elif sensors.fresh:
+            self._drive(read, sensed, reaction, missed, tick)
+        else:
+            self.motors.drop()  # without a new sample the arm goes on with its last torque
+        self._brakes.after_cycle(tick, self.findings)
+        self._report(write.status, read.command.value, sensed, reaction)
         self.arm.save(write.state)
+        sensors.remember(write.state)
         self.arm.look(write.scene)
 
     def _catch_up(self, before: Message | None, tick: int) -> bool:
         """Simulate up to `tick`; return whether cycles were missed. A restarted board finds the arm as it was left."""
-        if not self._started and before is not None:
-            self.arm.restore(before)
-            if self._grip is not None:
-                self._grip.keep(self.arm.grip_force)
+        if not self._started:
+            self._start(before, tick)
+            return False
         ticks = tick - self.arm.tick
         self.arm.step(ticks)
-        if not self._started:
-            position, velocity, _, _ = self.arm.sense()
-            self.reference.start(position, velocity, tick)
-            self._started = True
+        self._brakes.after_waiting(tick, self.findings)
+        if ticks == self.context.every:
             return False
-        return ticks > self.context.every
+        self.motors.drop()
+        return True
 
-    def _torque(self, wanted: Motion, sensed: Sensed, plan: Message | None) -> Array:
-        """Return the torques, (joints,), N m, that lead to the motion wanted."""
-        payload = None if plan is None else Payload(plan.payload_mass, plan.payload_offset)
-        terms = self._dynamics.terms(sensed.position, sensed.velocity, payload)
-        inertia = terms.inertia if plan is None else plan.inertia
-        acceleration = (
-            wanted.acceleration
-            + self._damping * (wanted.velocity - sensed.velocity)
-            + self._stiffness * (wanted.position - sensed.position)
-        )
-        return np.asarray(inertia @ acceleration + terms.bias + self._dynamics.friction(wanted.velocity))
+    def _start(self, before: Message | None, tick: int) -> None:
+        if before is not None:
+            self.arm.restore(before)
+            self.sensors.recall(before)
+            if self._grip is not None:
+                self._grip.keep(self.arm.grip_force)
+        if self.arm.braked:
+            self._brakes.start(self.arm.tick)
+        self.arm.step(tick - self.arm.tick)
+        self._brakes.after_waiting(tick, self.findings)
+        self._started = self._left = True
 
-    def _report(self, status: Message, command: Message, wanted: Motion, sensed: Sensed) -> None:
-        arm, holding = self.arm, self.reference.holding
+    def _take_findings(self) -> None:
+        if self.sensors.findings:
+            self.findings += self.sensors.findings
+            self.sensors.findings.clear()
+
+    def _brake(self) -> None:
+        """Brake, and let the set points go."""
+        self.arm.brake()
+        self.motors.drop()
+        self._wanted = Motion(self.sensors.position, self.sensors.velocity, self._rest)
+        self._left = True
+
+    def _drive(self, read: Ports, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
+        """Do one cycle with torques; where that goes wrong, or a stop has come to rest, brake."""
+        command: Message = read.command.value
+        plan: Message | None = read.plan.value if read.plan.is_there else None
+        position, velocity = self.sensors.position, self.sensors.velocity
+        wanted = self._next_motion(command, reaction, missed, tick)
+        terms = self._loop.terms(position, velocity, plan)
+        failed = self.motors.look(velocity, terms, wanted.position - position)
+        if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
+            return self._brake()
+        if reaction is Reaction.STOP and (self._left or not wanted.velocity.any()):
+            return self._brake()
+        torque = self._loop.torque(wanted, position, velocity, terms, plan)
+        grip_force = 0.0 if self._grip is None else self._grip.force(command, sensed.opening, sensed.opening_velocity)
+        refused = self._link.drive(torque, grip_force)
+        if refused is not None:
+            return self._refuse(refused)
+        self._wanted, self._left, self._refused = wanted, False, None
+        return self.motors.begin(velocity, terms, self.arm.torque)
+
+    def _next_motion(self, command: Message, reaction: Reaction, missed: bool, tick: int) -> Motion:
+        """Return the motion wanted; an arm that was braked is taken over where it stands."""
+        sensors, reference = self.sensors, self.reference
+        if self._left:
+            reference.start(sensors.position, sensors.velocity, tick)
+        elif missed:
+            reference.meet(sensors.position, sensors.velocity, tick)
+        return reference.at(command, tick) if reaction is Reaction.NONE else reference.rest(tick)
+
+    def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
+        if not self.stopping.trying:
+            self.findings.append(finding)
+        return self.stopping.motor_fails(self.context.robot.joints[finding.subject], tick)
+
+    def _refuse(self, finding: Finding) -> None:
+        """Take in that the arm did not let a torque through and has closed its brakes."""
+        if finding.alarm is not self._refused:
+            self.findings.append(finding)
+        self._refused = finding.alarm
+        self._brake()
+
+    def _report(self, status: Message, command: Message, sensed: Sensed, reaction: Reaction) -> None:
+        arm, sensors, wanted = self.arm, self.sensors, self._wanted
+        holding = self._left or self.reference.holding
         status.echo = command.id
-        status.position, status.velocity, status.torque = sensed.position, sensed.velocity, arm.torque
+        status.position, status.velocity, status.torque = sensors.position, sensors.velocity, arm.torque
         status.target, status.target_velocity = wanted.position, wanted.velocity
         status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
         status.grip_force = arm.grip_force
-        status.holding = holding
-        status.clipped = arm.clipped + self.reference.refused
-        status.touches = arm.touches
+        status.holding, status.braked = holding, arm.braked
+        status.stopped, status.demand = self._left or reaction is not Reaction.NONE, self.demand
+        status.clipped = arm.clipped + self.reference.refused + self._loop.cut
+        status.touches, status.violations = arm.touches, arm.violations
+        status.state = State.IDLE if holding else State.EXECUTING
         if arm.fault:
             status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, arm.fault
-            return
-        status.state = State.IDLE if holding else State.EXECUTING
-        if arm.touches and status.error == Error.NONE:
+        elif arm.violations and status.error in (Error.NONE, Error.TOUCHED):
+            status.error, status.reason = Error.LIMIT, arm.first_violation
+        elif arm.touches and status.error == Error.NONE:
             status.error, status.reason = Error.TOUCHED, arm.first_touch
+        elif status.error == Error.NONE:
+            status.reason = self.stopping.reason

@@ -84,6 +84,14 @@ class Reference:
             self.start(last.position, last.velocity, self._due)
         return self._motion(tick)
 
+    def rest(self, tick: int) -> Motion:
+        """Return the motion wanted at `tick`, whatever comes from above: ramp to rest and hold."""
+        self._next = None
+        if not self.holding:
+            now = self._motion(tick)
+            self.start(now.position, now.velocity, tick)
+        return self._motion(tick)
+
     def _receive(self, command: Message, due: int, tick: int) -> None:
         """Take a copy of a set point. It waits until the one before it is due: not every protocol is as punctual."""
         finite = bool(np.isfinite(command.position).all() and np.isfinite(command.velocity).all())

@@ -30,6 +30,7 @@ class TaskPlanner(Planner):
 
     inputs: ClassVar[Mapping[str, Input]] = {
         "status": Input(TASK_STATUS, "own.status"),
+        "made": Input(TASK_PLAN, "own.plan"),
         "servo": Input(SERVO_STATUS, "servo.status"),
         "world": Input(WORLD_MODEL, "world.model"),
     }
@@ -45,13 +46,18 @@ class TaskPlanner(Planner):
         self._cycles = cycles_of(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
-        self._planned = False
+        self._plan: Message | None = None
+        self._visible_at = 0
+        self._since: int | None = None
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Say whether the program is still to be planned and the world can be planned with."""
-        known = read.status.is_there and read.status.value.moves
-        if not self._program.action or self._planned or known:
+        self._since = tick if self._since is None else self._since
+        followed = read.status.is_there and read.status.value.echo
+        if not self._program.action or followed or self._is_on_its_way(read, tick, self._since):
             return False
+        if self._plan is not None:
+            return True
         if not (read.servo.is_there and read.world.is_there):
             return False
         objects = len(self.context.scene.objects)
@@ -59,14 +65,31 @@ class TaskPlanner(Planner):
         return bool(np.all(speeds < AT_REST_M_S))
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Decompose the whole program into `write`, or refuse it there."""
-        self._planned = True
+        """Decompose the whole program into `write`, or refuse it there; a plan that was lost is published again."""
+        self._visible_at = tick + self._slice
+        if self._plan is not None:
+            write.copy_from(self._plan)
+            return
         write.clear()
         write.id = 1
         try:
             self._decompose(read, write, tick)
         except Refused as refused:
             write.error, write.reason, write.count = refused.code, str(refused), 0
+        self._plan = Message(write.record.dtype)
+        self._plan.copy_from(write)
+
+    @property
+    def _slice(self) -> int:
+        return self.context.within_cycles * self.context.every
+
+    def _is_on_its_way(self, read: Ports, tick: int, since: int) -> bool:
+        """Say whether the executor may still come to show a plan: of this process, or of one before it."""
+        if self._plan is not None:
+            # Visible there, it takes a cycle to be read and to be seen in the status.
+            return tick <= self._visible_at + self.context.every
+        # One that died just after it had published is not seen at once.
+        return read.made.is_there or 0 < since <= tick < since + self._slice
 
     def _decompose(self, read: Ports, write: Message, tick: int) -> None:
         from levels.task.actions import rehearse

@@ -8,7 +8,10 @@ from itertools import pairwise
 
 import pytest
 
-from backplane.clock_driver import ClockDriver, Ended, LockstepDriver, RealtimeDriver, by_priority
+from backplane.clock_driver import ClockDriver, Ended
+from backplane.lockstep_driver import LockstepDriver
+from backplane.realtime_driver import RealtimeDriver
+from backplane.released_task import by_priority
 from backplane.segment import Segment
 from backplane.semaphores import wake_semaphore
 from backplane.words import Block, Head, Run, System

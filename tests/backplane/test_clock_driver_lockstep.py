@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from backplane.clock_driver import LockstepDriver
+from backplane.lockstep_driver import LockstepDriver
 from backplane.segment import Segment
 from backplane.semaphores import clock_semaphore
 from backplane.wake import NextCycle

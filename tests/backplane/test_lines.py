@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from backplane.errors import EmergencyStopError
 from backplane.lines import UtilityLines
 from backplane.segment import Segment
-from backplane.words import System
+from backplane.words import Block, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 
@@ -38,3 +39,19 @@ def test_each_line_has_its_own_word(bus: Segment, line: str) -> None:
     lines, names = UtilityLines(bus), ("acfail", "sysreset", "emergency_stop")
     bus.words[System[line.upper()]] = 1
     assert [name for name in names if getattr(lines, name)] == [line]
+
+
+def test_the_emergency_stop_latches_until_every_input_is_good(bus: Segment) -> None:
+    lines = UtilityLines(bus)
+    lines.latch_emergency_stop()
+    lines.release_sysfail(2)
+    bus.words[System.ACFAIL] = 1
+    bus.block("high")[Block.LOST] = 1
+    told = "stays latched: SYSFAIL of slot 21, ACFAIL, board 'high' is lost$"
+    with pytest.raises(EmergencyStopError, match=told):
+        lines.reset_emergency_stop()
+    assert lines.emergency_stop
+    lines.release_sysfail(21)
+    bus.words[System.ACFAIL] = bus.block("high")[Block.LOST] = 0
+    lines.reset_emergency_stop()
+    assert not lines.emergency_stop

@@ -44,6 +44,9 @@ within_cycles = 4""",
 LOOSE = ("board.wave.coupling=loose", "board.wave.planner_slot=9")
 """Settings that give the planner of the wave a board of its own."""
 
+NEVER = "supervision.restarts=0"
+"""Setting with which the loss of a board ends the run."""
+
 MakeConfig = Callable[..., RackConfig]
 
 

@@ -2,11 +2,12 @@
 
 What a task released at tick T writes is visible from T + n, a plan from T + within_cycles * n, and all that a task
 reads is what was visible at its release. So a test sees what boards see, without processes and without waiting.
+Tasks can be lost and come back, mailboxes can be disturbed, as in a rack whose boards fail.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,11 +15,15 @@ from typing import Any
 from backplane.mailbox import Reading, Verdict
 from backplane.message import Message, MessageType
 from levels.cell import build_cell, sizes
-from levels.level import Executor, Input, LevelContext, Pace, Planner, Ports
+from levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 
 CLOCK_NS = 2_500_000
+SILENT_CYCLES = 4
+"""Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the one it waits."""
+Disturbance = Callable[[int, bytes], "Sequence[tuple[int, bytes | None]]"]
+"""What a faulty writer makes of a message, visible at a tick: what becomes visible, and when; None: a damaged one."""
 
 
 @dataclass(frozen=True)
@@ -36,24 +41,52 @@ class BoardSpec:
 
 
 class Box:
-    """A mailbox under time-slice: messages wait until they are visible."""
+    """A mailbox under time-slice: messages wait until they are visible.
 
-    def __init__(self, kind: MessageType, sizes_: Mapping[str, int]) -> None:
+    `every` is the cycle of a writer that writes in every one of them; None: planners and tests do not. `lost`: the
+    writer is known to be dead or to hang.
+    """
+
+    def __init__(self, kind: MessageType, sizes_: Mapping[str, int], every: int | None = None) -> None:
         self.kind, self.dtype = kind, kind.dtype(sizes_)
-        self._waiting: deque[tuple[int, bytes]] = deque()
-        self._now = bytes(self.dtype.itemsize)
+        self.lost = False
+        self.disturbance: Disturbance | None = None
+        self._every = every
+        self._waiting: list[tuple[int, bytes | None]] = []
+        self._now: bytes | None = bytes(self.dtype.itemsize)
+        self._good = bytes(self.dtype.itemsize)
         self._serial = 0
+        self._good_since = 0
 
     def publish(self, message: Message, visible_at: int) -> None:
-        """Let `message` be seen from tick `visible_at` on."""
-        self._waiting.append((visible_at, bytes(message.raw)))
+        """Let `message` be seen from tick `visible_at` on, if nothing disturbs that."""
+        data = bytes(message.raw)
+        for one in ((visible_at, data),) if self.disturbance is None else self.disturbance(visible_at, data):
+            insort(self._waiting, one, key=lambda waiting: waiting[0])
 
-    def at(self, tick: int) -> tuple[int, bytes]:
-        """Return serial and bytes of the newest message visible at `tick`; serial 0: none yet."""
+    def withdraw(self, tick: int) -> None:
+        """Undo what is not yet visible at `tick`: its writer died before it was finished."""
+        self._waiting = [one for one in self._waiting if one[0] <= tick]
+
+    def at(self, tick: int) -> tuple[int, bytes | None]:
+        """Return serial and bytes of the newest message visible at `tick`, None if damaged; serial 0: none yet."""
         while self._waiting and self._waiting[0][0] <= tick:
-            self._now = self._waiting.popleft()[1]
+            since, self._now = self._waiting.pop(0)
             self._serial += 1
+            if self._now is not None:
+                self._good, self._good_since = self._now, since
         return self._serial, self._now
+
+    def good_at(self, tick: int) -> bytes:
+        """Return the newest whole message visible at `tick`."""
+        self.at(tick)
+        return self._good
+
+    def is_lost(self, tick: int) -> bool:
+        """Say whether readers are told that the writer is lost or silent."""
+        if self._every is None or not self._serial:
+            return False
+        return self.lost or tick - (self._good_since - self._every) >= SILENT_CYCLES * self._every
 
 
 class Task:
@@ -66,13 +99,15 @@ class Task:
         self._inputs = {port: boxes[source(port_, spec)] for port, port_ in level.inputs.items()}
         self._values = {port: Message(box.dtype) for port, box in self._inputs.items()}
         self._seen = dict.fromkeys(self._inputs, 0)
+        self._has = dict.fromkeys(self._inputs, False)
         self._outputs = outputs
         self.write = Ports(**{port: Message(box.dtype) for port, box in outputs.items()})
 
-    def release(self, tick: int) -> None:
-        """Run one cycle."""
+    def release(self, tick: int, demand: Demand = Demand.NONE) -> None:
+        """Run one cycle, under a demand on the arm."""
         read, span = Ports(**{port: self._read(port, tick) for port in self._inputs}), self.spec.every
         if isinstance(self.level, Executor):
+            self.level.demand = demand
             self.level.process(read, self.write, tick)
             self._publish(tick + span)
         elif self.level.wanted(read, tick):
@@ -81,14 +116,30 @@ class Task:
             self._publish(tick + span)
         self.due = tick + span
 
+    def lose(self, tick: int, finished: bool) -> None:
+        """Die; without `finished`, before the plan that it makes is ready."""
+        self.due = -1
+        for box in self._outputs.values():
+            box.lost = True
+            if isinstance(self.level, Planner) and not finished:
+                box.withdraw(tick)
+
+    def rejoin(self, tick: int) -> None:
+        """Be released from the next tick of the grid on."""
+        self.due = -(-tick // self.spec.every) * self.spec.every
+        for box in self._outputs.values():
+            box.lost = False
+
     def _read(self, port: str, tick: int) -> Reading:
-        serial, data = self._inputs[port].at(tick)
-        value, seen = self._values[port], self._seen[port]
+        box = self._inputs[port]
+        serial, data = box.at(tick)
+        value, seen, is_lost = self._values[port], self._seen[port], box.is_lost(tick)
         self._seen[port] = serial
-        if serial == seen:
-            return Reading(value, Verdict.OLD if serial else Verdict.NONE)
+        if serial == seen or data is None:
+            return Reading(value, Verdict.OLD if self._has[port] else Verdict.NONE, is_lost)
         value.raw[:] = data
-        return Reading(value, Verdict.NEW)
+        self._has[port] = True
+        return Reading(value, Verdict.NEW, is_lost)
 
     def _publish(self, visible_at: int) -> None:
         for port, box in self._outputs.items():
@@ -109,12 +160,16 @@ class Lockstep:
     ) -> None:
         """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`."""
         self.tick = 0
+        self.demand = Demand.NONE
+        self._coming: dict[int, list[Callable[[], None]]] = {}
         self.sizes = sizes(build_cell(robot, scene, CLOCK_NS))
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
-            kinds = dict(board.executor.outputs) | ({"plan": board.planner.output} if board.planner else {})
-            self.boxes |= {f"{board.name}.{port}": Box(kind, self.sizes) for port, kind in kinds.items()}
+            kinds = board.executor.outputs.items()
+            self.boxes |= {f"{board.name}.{port}": Box(kind, self.sizes, board.every) for port, kind in kinds}
+            if board.planner is not None:
+                self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
         self._contexts = {
             b.name: LevelContext(
                 board=b.name,
@@ -144,10 +199,28 @@ class Lockstep:
 
     def restart(self, name: str) -> None:
         """Replace a task ("primitive", "primitive.planner") by a fresh one, as after the death of its board."""
-        spec = self.tasks[name].spec
-        fresh = self._start(spec)[name]
-        fresh.due = -(-self.tick // spec.every) * spec.every
-        self.tasks[name] = fresh
+        self.tasks[name].level.close()
+        self.tasks[name] = self._start(self.tasks[name].spec)[name]
+        self.tasks[name].rejoin(self.tick)
+
+    def lose(self, name: str, ticks: int, finished: bool = True) -> None:
+        """Let a task die now and start anew `ticks` later; without `finished`, a plan under way is never made."""
+        self.tasks[name].lose(self.tick, finished)
+        self.after(ticks, lambda: self.restart(name))
+
+    def disturb(self, mailbox: str, disturbance: Disturbance, ticks: int) -> None:
+        """Let a faulty writer write `mailbox` for `ticks`."""
+        self.boxes[mailbox].disturbance = disturbance
+        self.after(ticks, lambda: setattr(self.boxes[mailbox], "disturbance", None))
+
+    def stop(self, demand: Demand, ticks: int) -> None:
+        """Put a demand on the arm for `ticks`."""
+        self.demand = demand
+        self.after(ticks, lambda: setattr(self, "demand", Demand.NONE))
+
+    def after(self, ticks: int, do: Callable[[], None]) -> None:
+        """Do something before the tick that is `ticks` from now."""
+        self._coming.setdefault(self.tick + ticks, []).append(do)
 
     def message(self, mailbox: str) -> Message:
         """Return an empty message for `mailbox`."""
@@ -158,16 +231,18 @@ class Lockstep:
         self.boxes[mailbox].publish(message, self.tick)
 
     def read(self, mailbox: str) -> Message:
-        """Return a copy of the newest message that is visible now."""
+        """Return a copy of the newest whole message that is visible now."""
         message = self.message(mailbox)
-        message.raw[:] = self.boxes[mailbox].at(self.tick)[1]
+        message.raw[:] = self.boxes[mailbox].good_at(self.tick)
         return message
 
     def step(self) -> None:
         """Run every task that is released in the present tick."""
+        for do in self._coming.pop(self.tick, ()):
+            do()
         for task in self.tasks.values():
             if task.due == self.tick:
-                task.release(self.tick)
+                task.release(self.tick, self.demand)
         self.tick += 1
 
     def run(self, seconds: float, until: Callable[[Lockstep], bool] = lambda rack: False) -> bool:

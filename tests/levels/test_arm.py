@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from backplane.message import Message
 from levels.arm import SimulatedArm
 from levels.arm.motion import ObstacleMotion
-from levels.arm.simulated import PATIENCE_TICKS
+from levels.arm.simulated import PATIENCE_CYCLES
 from levels.cell import Cell, sizes
 from levels.dynamics import Dynamics
 from levels.messages import ARM_STATE, SCENE
@@ -162,7 +162,7 @@ def test_drives_go_on_with_the_last_torque_for_a_while_then_brake_and_stand_stil
         arm.drive(torque(tick), 0.0)
         arm.step(1)
     given = arm.torque.copy()
-    for _ in range(PATIENCE_TICKS - 1):
+    for _ in range(PATIENCE_CYCLES - 1):
         arm.step(1)
         assert np.array_equal(arm.torque, given)
     assert np.abs(arm.sense().velocity).max() > 0.2

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from backplane.message import Message, State
 from levels.elemental_move import ElementalMoveExecutor
@@ -29,6 +30,8 @@ class Bench(Lockstep):
         self.home = np.array(robot.home)
         self.below = self.message("primitive.status")
         self.below.resting, self.below.held, self.below.opening = 1, -1, 0.04
+        self.below.position = self.home
+        self.ends = {0: self.home}
 
     def cycle(self, cycles: int = 1, **below: object) -> None:
         """Show the primitive level's status with the fields `below` changed, and run some cycles."""
@@ -47,13 +50,18 @@ class Bench(Lockstep):
         command.count, command.id = len(verbs), first + len(verbs) - 1
         self.write("task.command", command)
 
-    def plan(self, move: int, offset: float = 0.0, replan: int = 0, error: Error = Error.NONE) -> None:
-        """Publish a path for a move, from home + `offset` on, or a refusal."""
+    def plan(
+        self, move: int, start: NDArray[np.float64] | None = None, replan: int = 0, error: Error = Error.NONE
+    ) -> None:
+        """Publish a path for a move, from where the one before it ends or `start`, or a refusal."""
         plan = self.message("elemental_move.plan")
         plan.move, plan.replan, plan.kind, plan.error = move, replan, SegmentKind.PATH, error
         plan.reason = "something is there" if error else ""
         plan.count = 0 if error else 2
-        plan.waypoints[:2] = self.home + offset, self.home + offset + 0.1
+        begin = self.ends[max(m for m in self.ends if m < move)] if start is None else start
+        plan.waypoints[:2] = begin, begin + 0.1
+        if not (error or replan):
+            self.ends[move] = begin + 0.1
         self.write("elemental_move.plan", plan)
         self.cycle()
 
@@ -170,8 +178,8 @@ def test_blocked_arm_holds_and_asks_for_another_path_from_where_it_rests() -> No
 
 def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> None:
     bench = planned_bench()
-    bench.cycle(2, current=1, blocked=1)
-    bench.plan(1, offset=0.05, replan=bench.status.replan)
+    bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
+    bench.plan(1, bench.home + 0.05, replan=bench.status.replan)
     bench.cycle(1)
     assert bench.segments()[0] == (3, 1)
     assert bench.command.segments[0]["waypoints"][0] == pytest.approx(bench.home + 0.05)
@@ -184,7 +192,7 @@ def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> No
 def test_answer_to_an_older_request_is_not_taken() -> None:
     bench = planned_bench()
     bench.cycle(2, current=1, blocked=1)
-    bench.plan(1, offset=0.05, replan=bench.status.replan - 1)
+    bench.plan(1, replan=bench.status.replan - 1)
     bench.cycle(2)
     assert bench.segments() == [(1, 1), (2, 2)]
 
@@ -239,7 +247,7 @@ def test_another_program_begins_once_the_arm_rests() -> None:
     assert bench.status.done == 0
     bench.cycle(2, resting=1)
     assert bench.status.done == 39
-    bench.plan(40)
+    bench.plan(40, bench.home)
     bench.cycle(2)
     assert bench.segments() == [(3, 40)]
 

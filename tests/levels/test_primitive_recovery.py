@@ -72,7 +72,7 @@ def test_executor_that_skips_cycles_goes_on_along_the_path() -> None:
 
 
 def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
-    rack = PrimitiveRack()
+    rack = PrimitiveRack(params={"silent": 2.0})
     rack.command(*two_paths(rack))
     rack.run(0.3)
     servo = rack.tasks["servo"]

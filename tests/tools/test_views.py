@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 from rich.console import Console
 
+from boards.events import Event
+from tools.display import PlainDisplay
 from tools.live_table import line_of, table_of
 from tools.snapshot import Progress, Snapshot, TaskRow
 
-ROW = TaskRow("servo", 2, 1, 80, 400.0, "executing", 1200, 1201, 0, 3, 4, 0.25, None, "")
+ROW = TaskRow("servo", 2, 1, 80, 400.0, "executing", 1200, 1201, 0, 3, 4, 1, 0.25, None, "")
 PLANNER = replace(ROW, task="servo.planner", priority=0, missed=0, skipped=0, lateness_ms=1.5)
-SNAPSHOT = Snapshot("demo", "running", 1200, 3.0, 0, (), (ROW, PLANNER), Progress(5, 25, 1, 4, "executing", ""))
+PROGRESS = Progress(5, 25, 1, 4, "executing", "")
+SNAPSHOT = Snapshot("demo", "running", 1200, 3.0, 0, (), "none", (), (ROW, PLANNER), PROGRESS)
 
 
 def shown(snapshot: Snapshot, width: int) -> str:
@@ -22,9 +26,10 @@ def shown(snapshot: Snapshot, width: int) -> str:
 
 
 def test_the_table_has_a_line_for_every_task() -> None:
-    lines = shown(SNAPSHOT, 110).splitlines()
+    lines = shown(SNAPSHOT, 120).splitlines()
     servo = next(line for line in lines if " servo " in line)
-    assert servo.split() == ["2", "servo", "1", "FIFO", "80", "400", "1200", "1201", "3", "4", "0.25", "-", "executing"]
+    counts = ["1200", "1201", "3", "4", "1"]
+    assert servo.split() == ["2", "servo", "1", "FIFO", "80", "400", *counts, "0.25", "-", "executing"]
     planner = next(line for line in lines if "servo.planner" in line)
     assert planner.split()[3] == "other"
     assert "action 1/4, move 5/25" in lines[-1]
@@ -32,10 +37,34 @@ def test_the_table_has_a_line_for_every_task() -> None:
 
 def test_reasons_and_utility_lines_are_shown() -> None:
     snapshot = replace(SNAPSHOT, lines=("EMERGENCY STOP",), tasks=(replace(ROW, reason="joint 'j2': too far"),))
-    assert "EMERGENCY STOP" in shown(snapshot, 110)
-    assert "servo: joint 'j2': too far" in shown(snapshot, 110)
+    assert "EMERGENCY STOP" in shown(snapshot, 120)
+    assert "servo: joint 'j2': too far" in shown(snapshot, 120)
     assert line_of(snapshot).endswith("EMERGENCY STOP  servo: joint 'j2': too far")
 
 
 def test_the_line_counts_over_all_tasks() -> None:
     assert "3.00 s  tick 1200  missed 3  skipped 4  task executing, action 1/4, move 5/25" in line_of(SNAPSHOT)
+
+
+def test_faults_demands_and_lost_boards_are_shown() -> None:
+    lost = replace(PLANNER, state="lost")
+    snapshot = replace(SNAPSHOT, demand="brake", faults=("mute of servo (servo.status)",), tasks=(ROW, lost))
+    lines = shown(snapshot, 120).splitlines()
+    assert lines[0].endswith("arm: brake")
+    assert next(line for line in lines if "servo.planner" in line).split()[-1] == "lost"
+    assert "fault: mute of servo (servo.status)" in lines
+    assert line_of(snapshot).endswith("arm: brake  servo.planner lost")
+
+
+def test_an_arm_that_is_free_to_move_is_not_spoken_of() -> None:
+    assert "arm:" not in shown(SNAPSHOT, 120) + line_of(SNAPSHOT)
+
+
+def test_a_display_tells_the_course_of_a_fault_and_leaves_misses_to_the_table(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    display = PlainDisplay()
+    display.tell(Event(0, 7, "fault", "servo", "kill begins", "begins", 0))
+    display.tell(Event(0, 8, "miss", "clock", "'servo' has not finished", "late"))
+    display.tell(Event(0, -1, "printed", "", "hello"))
+    assert capsys.readouterr().out == "tick 7 fault: servo: kill begins\nprinted: hello\n"

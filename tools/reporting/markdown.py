@@ -10,6 +10,7 @@ Report = dict[str, Any]
 SHOWN = 10
 """Misses that the text shows; report.json has them all."""
 
+FAULTS = ["fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after"]
 TIMES = [
     *("task", "R", "cycles", "missed", "skipped", "late p50", "p99", "max", "exec p50", "p99", "max"),
     *("comm p99", "residual min", "deviation", "alpha", "plan age max"),
@@ -41,6 +42,7 @@ def _lines(report: Report) -> Iterator[str]:
     if report["mode"] == "lockstep":
         yield from ("In lockstep there are no deadlines: a tick lasts as long as its tasks take.", "")
     yield from _table(TIMES, [_times_row(name, task) for name, task in report["tasks"].items()])
+    yield from _faults(report)
     yield from _misses(report["misses"])
     yield from _response(report["system_response"])
 
@@ -55,6 +57,36 @@ def _against(against: Report | None) -> Iterator[str]:
     missed = against["first_miss_tick"]
     why = f"the first miss is at tick {missed}" if missed is not None else "neither run has a miss"
     yield f"- parts from {against['folder']} at tick {parting['tick']}, in {parting['mailbox']}; {why}"
+
+
+def _faults(report: Report) -> Iterator[str]:
+    faults, unexplained, restarts = report["faults"], report["unexplained"], report["restarts"]
+    if faults:
+        yield from ("", f"## Faults: {len(faults)}", "")
+        yield from _table(FAULTS, [_fault_row(fault) for fault in faults])
+    if restarts:
+        yield from ("", f"Restarts: {', '.join(f'{task} {count}' for task, count in restarts.items())}.")
+    if unexplained:
+        yield from ("", f"## Detections that no fault of this run explains: {len(unexplained)}", "")
+        rows = [[str(found["tick"]), found["board"], found["code"], found["text"]] for found in unexplained]
+        yield from _table(["tick", "found by", "as", "what"], rows)
+
+
+def _fault_row(fault: Report) -> list[str]:
+    subject = fault["mailbox"] or fault["joint"]
+    is_struck = fault["seen"] != "not struck"
+    found = f"{fault['found_as']} by {fault['found_by']}" if fault["seen"] == "detected" else fault["seen"]
+    in_ms = fault["bound_ms"] is not None
+    unit, after, bound = ("ms", "delay_ms", "bound_ms") if in_ms else ("cycles", "delay_cycles", "bound_cycles")
+    return [
+        fault["kind"],
+        f"{fault['board']} {subject}".strip(),
+        str(fault["struck"]) if is_struck else "-",
+        found,
+        *("-" if fault[key] is None else f"{fault[key]:.3g} {unit}" for key in (after, bound)),
+        ", ".join(fault["reactions"]) or "-",
+        "-" if fault["recovery_ms"] is None else f"{fault['recovery_ms']:.1f} ms",
+    ]
 
 
 def _misses(misses: list[Report]) -> Iterator[str]:

@@ -12,6 +12,7 @@ from backplane.message import State
 from boards.config import RackConfig, loads
 from tools.recording import Recording
 from tools.reporting.difference import first_difference
+from tools.reporting.faults import faults
 from tools.reporting.markdown import markdown
 from tools.reporting.misses import misses
 from tools.reporting.motion import motion
@@ -58,6 +59,7 @@ def report_of(recording: Recording) -> Report:
         "missed": sum(task.get("missed", 0) for task in counted.values()),
         "skipped": sum(task.get("skipped", 0) for task in counted.values()),
         "misses": misses(recording, layout),
+        **faults(recording, layout),
         "tasks": {task.name: _task(recording, config, layout, task, counted) for task in layout.tasks},
         "system_response": system_response(recording, config, layout),
         "task": _task_outcome(recording, layout),

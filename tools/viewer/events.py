@@ -15,10 +15,21 @@ from tools.viewer.lanes import style_lane, write_span
 from tools.viewer.stream import Stream
 
 EVENTS = "events"
+UNSHOWN = ("printed", "miss")
+"""Events that are in the log alone: misses have lanes of their own."""
 RACK = "rack"
 """Lane of events that are of no board."""
-LEVELS = {"died": "ERROR", "hang": "ERROR", "printed": "DEBUG", "stop": "WARN"}
-LOST = ("died", "hang")
+LEVELS = {
+    "died": "ERROR",
+    "hang": "ERROR",
+    "detection": "ERROR",
+    "fault": "WARN",
+    "reaction": "WARN",
+    "stop": "WARN",
+    "miss": "DEBUG",
+    "printed": "DEBUG",
+}
+"""Log levels by kind of event; of any other it is INFO."""
 
 
 class Events:
@@ -27,7 +38,7 @@ class Events:
     def __init__(self, stream: Stream, path: Path, hierarchy: Hierarchy) -> None:
         self._stream, self._path, self._hierarchy = stream, path, hierarchy
         self._read = 0
-        self._lanes: set[str] = set()
+        self._lanes: dict[str, str] = {}  # what each board's lane shows
 
     def advance(self) -> None:
         """Write the events that were added."""
@@ -45,14 +56,24 @@ class Events:
         kind = event["kind"]
         if "tick" not in event:
             return
-        board = event.get("board") or RACK
+        board, code = event.get("board") or RACK, event.get("code", "")
         tick, stamp_ns = max(0, event["tick"]), self._stream.times.monotonic(event["time_ns"])
         line = rr.TextLog(f"{kind}: {board}: {event['text']}", level=LEVELS.get(kind, "INFO"))
         self._stream.at(tick, stamp_ns, (LOG, "events"), line)
-        if kind != "printed":
-            if board not in self._lanes:
-                self._lanes.add(board)
-                style_lane(self._stream, (EVENTS, board), palette.EVENTS)
-            write_span(self._stream, tick, stamp_ns, (EVENTS, board), kind)
-        if kind in LOST:
+        if kind not in UNSHOWN:
+            self._show(tick, stamp_ns, board, kind, code)
+        if kind in ("died", "hang"):
             self._hierarchy.lose(tick, stamp_ns, board)
+        elif code == "hang":
+            self._hierarchy.lose(tick, stamp_ns, event["subject"])
+        elif code == "rejoined":
+            self._hierarchy.recover(tick, stamp_ns, board)
+
+    def _show(self, tick: int, stamp_ns: int, board: str, kind: str, code: str) -> None:
+        if board not in self._lanes:
+            style_lane(self._stream, (EVENTS, board), palette.EVENTS)
+        # The end of a fault ends its span, and nothing that came of it meanwhile.
+        if code == "ends" and self._lanes.get(board) != kind:
+            return
+        self._lanes[board] = "" if code == "ends" else kind
+        write_span(self._stream, tick, stamp_ns, (EVENTS, board), self._lanes[board])

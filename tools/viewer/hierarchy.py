@@ -51,6 +51,12 @@ class Hierarchy:
             self._changes.append((tick, stamp_ns, board, "lost"))
             self._states[board] = "lost"
 
+    def recover(self, tick: int, stamp_ns: int, board: str) -> None:
+        """Take down that a board that was lost is back; what it is at, its cycles tell."""
+        if self._states.get(board) == "lost":
+            self._changes.append((tick, stamp_ns, board, "idle"))
+            self._states[board] = "idle"
+
     def advance(self) -> None:
         """Write what has been taken down, in the order of time."""
         if not self._changes:

@@ -36,6 +36,10 @@ EVENTS: dict[str, Colour] = {
     "end": (70, 180, 90, 255),
     "died": (220, 50, 50, 255),
     "hang": (220, 50, 50, 255),
+    "fault": (190, 90, 210, 255),
+    "detection": (240, 140, 30, 255),
+    "reaction": (220, 90, 60, 255),
+    "recovery": (70, 180, 90, 255),
 }
 """Of a kind that is not here the viewer picks a colour."""
 PHASES: dict[str, Colour] = {

@@ -1,0 +1,98 @@
+"""The clock in lockstep: a tick begins when every task due by then has finished. Exact, repeatable, and fast."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import posix_ipc
+
+from backplane.alarms import AlarmWriter
+from backplane.clock_driver import ClockDriver, Ended
+from backplane.process import is_alive
+from backplane.released_task import ReleasedTask
+from backplane.segment import Segment
+from backplane.semaphores import clock_semaphore
+from backplane.wake import CHECK_S
+from backplane.words import Run, System
+
+
+class LockstepDriver(ClockDriver):
+    """A tick begins when every task due by then has finished.
+
+    `one_at_a_time` releases the tasks of a tick one after the other, each until it is done, planners
+    too: exact with protocols that show a message at once.
+    """
+
+    def __init__(
+        self,
+        segment: Segment,
+        ended: Ended,
+        one_at_a_time: bool,
+        history_ticks: int,
+        alarms: AlarmWriter | None = None,
+    ) -> None:
+        super().__init__(segment, ended, alarms)
+        self._done = clock_semaphore(segment.rack)
+        self._one_at_a_time = one_at_a_time
+        self._history_ticks = history_ticks
+
+    def run(self) -> None:
+        """Give out ticks until the run is over or the launcher is gone."""
+        tick = self.first_tick
+        last = tick - 1
+        self.words[System.STATE] = Run.RUNNING
+        while not self.is_over(tick) and self._wait_for_follower(tick):
+            if self.begin(tick):
+                if not self._step(tick, last):
+                    break
+                last = tick
+            tick += 1
+        self.end()
+
+    def _step(self, tick: int, last: int) -> bool:
+        """Do one tick; False when the launcher is gone."""
+        if not self._one_at_a_time:
+            self.release(tick, last)
+            return self._wait(lambda: all(task.is_finished(tick + 1) for task in self.tasks))
+        self.words[System.TICK] = tick
+        for task in self.tasks:
+            if task.is_due(tick, last):
+                task.release(tick)
+                if task.unanswered:
+                    self.watchdog.look(task, tick)
+                if not self._wait(task.is_settled):
+                    return False
+        return True
+
+    def settle(self, task: ReleasedTask) -> None:
+        """Wait until a task has finished what it was released for, a plan too."""
+        self._wait(task.is_settled)
+
+    def await_state(self, condition: Callable[[], bool]) -> None:
+        """Wait until `condition` holds."""
+        self._wait(condition)
+
+    def _wait(self, condition: Callable[[], bool]) -> bool:
+        while not condition():
+            try:
+                self._done.acquire(CHECK_S)
+            except posix_ipc.BusyError:
+                if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
+                    return False
+                # Somebody may have stopped one with a signal: time must not wait for that.
+                for task in self.tasks:
+                    task.look_whether_stopped()
+        return True
+
+    def _wait_for_follower(self, tick: int) -> bool:
+        """Wait for a recorder before its rings run over: in lockstep time stands still meanwhile."""
+        words = self.words
+        while (pid := words[System.FOLLOWER_PID]) and tick - words[System.FOLLOWER_TICK] > self._history_ticks:
+            if not is_alive(pid):
+                words[System.FOLLOWER_PID] = 0
+            if words[System.STOP_REQUEST] or not self.launcher_is_alive:
+                return False
+            # The recorder posts nothing: it must never be able to disturb the clock in real time.
+            time.sleep(0.001)
+        return True

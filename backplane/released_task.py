@@ -1,0 +1,96 @@
+"""One task as the clock sees it: when it is due, whether it has answered, whether it is lost."""
+
+from __future__ import annotations
+
+from backplane.layout import Layout, TaskSpec
+from backplane.process import STOPPED, state_of
+from backplane.segment import Segment
+from backplane.semaphores import wake_semaphore
+from backplane.words import Block, TaskState
+
+# Plain integers for the hot path.
+_RELEASED, _DEADLINE, _DONE, _LOST = (int(Block[name]) for name in ("RELEASED", "DEADLINE", "DONE", "LOST"))
+
+
+class ReleasedTask:
+    """The clock's end of a task's control block.
+
+    `index` is its place in the layout. `unanswered` counts the releases given since the newest one that was finished.
+    `is_stopped`: a signal has stopped its process, so that lockstep must not wait for it.
+    """
+
+    def __init__(self, segment: Segment, spec: TaskSpec) -> None:
+        self.spec = spec
+        self.index = segment.layout.tasks.index(spec)
+        self.block = segment.block(spec.name)
+        self.unanswered = 0
+        self.is_stopped = False
+        self._semaphore = wake_semaphore(segment.rack, spec.name)
+
+    def is_due(self, tick: int, last: int) -> bool:
+        """Say whether a release of the task lies in (last, tick]; none does while it works on a plan, or is lost."""
+        release = tick - tick % self.spec.every
+        return release > last and self.block[_DEADLINE] <= release and not self.block[_LOST]
+
+    def release(self, tick: int) -> None:
+        """Wake the task for its newest release."""
+        block, release = self.block, tick - tick % self.spec.every
+        if self.is_stopped:
+            self.look_whether_stopped()
+        self.unanswered = 0 if block[_DONE] == block[_RELEASED] else self.unanswered + 1
+        block[_DEADLINE] = release + self.spec.every
+        block[_RELEASED] = release
+        self._semaphore.release()
+
+    def is_idle(self) -> bool:
+        """Say whether the newest release is finished."""
+        return self.block[_DONE] == self.block[_RELEASED]
+
+    def is_settled(self) -> bool:
+        """Say whether there is nothing to wait for: it has finished, or will not."""
+        return self.is_idle() or bool(self.block[_LOST]) or self.is_stopped
+
+    def is_finished(self, tick: int) -> bool:
+        """Say whether nothing of the task must be waited for before `tick` begins."""
+        return self.block[_DEADLINE] > tick or self.is_settled()
+
+    def look_whether_stopped(self) -> None:
+        """Find out whether a signal has stopped its process."""
+        self.is_stopped = state_of(self.block[Block.PID]) in STOPPED
+
+    def wake(self) -> None:
+        """Wake the task without a release."""
+        self._semaphore.release()
+
+    @property
+    def lost_tick(self) -> int:
+        """Tick at which the task was found lost; -1: it is not."""
+        return self.block[_LOST] - 1
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether a lost task's new process waits for its first release."""
+        return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING)
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether a lost task will not come back."""
+        return self.block[Block.STATE] == TaskState.GIVEN_UP
+
+    def lose(self, tick: int) -> None:
+        """Release it no more until its new process has rejoined."""
+        self.block[Block.STATE] = TaskState.ABSENT
+        self.block[_LOST] = tick + 1
+
+    def rejoin(self) -> None:
+        """Take its new process up; the next release on the grid is its first."""
+        block = self.block
+        block[_DONE] = block[_RELEASED]
+        block[_DEADLINE] = 0
+        self.unanswered, self.is_stopped = 0, False
+        block[_LOST] = 0
+
+
+def by_priority(layout: Layout) -> list[TaskSpec]:
+    """Return the tasks in the order in which the clock wakes them: executors by rate, then planners."""
+    return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.slot))

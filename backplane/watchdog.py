@@ -1,0 +1,48 @@
+"""The watchdog of the system controller: finds tasks that do not answer their releases.
+
+A release without an answer is a miss, and no more: on a busy machine any process may lose its core for a while. A
+task is called lost only when something proves it: a signal has stopped its process, or it has been silent for so long
+that nothing else explains it.
+"""
+
+from __future__ import annotations
+
+from backplane.alarms import Alarm, AlarmWriter
+from backplane.process import STOPPED, state_of
+from backplane.released_task import ReleasedTask
+from backplane.words import Block
+
+BEATS = 4
+"""Releases without an answer after which a task is looked at: three gave a false trip in 24,000 at 400 Hz."""
+LEAST_NS = 1_000_000_000
+"""Least time after which a task that could run is called hanging: hosts stop a core for tens of milliseconds."""
+
+
+class Watchdog:
+    """Looks at a task that was released before it has answered. `losses` counts the tasks found hanging."""
+
+    def __init__(self, alarms: AlarmWriter, period_ns: int) -> None:
+        self._alarms = alarms
+        self._period_ns = period_ns
+        self.losses = 0
+
+    def look(self, task: ReleasedTask, tick: int) -> None:
+        """Tell of a task whose newest release but one is unanswered at `tick`, and find out whether it hangs."""
+        missing, spec = task.unanswered, task.spec
+        if missing == 1:
+            late = Alarm.LATE if spec.role == "executor" else Alarm.PLAN_LATE
+            self._alarms.ring(tick, late, task.index, missing, task.block[Block.DONE])
+        if missing < BEATS:
+            return
+        if self._hangs(task):
+            self.losses += 1
+            task.lose(tick)
+            self._alarms.ring(tick, Alarm.HANG, task.index, missing, tick - missing * spec.every)
+        elif missing == BEATS:
+            self._alarms.ring(tick, Alarm.STARVED, task.index, missing, tick - missing * spec.every)
+
+    def _hangs(self, task: ReleasedTask) -> bool:
+        spec = task.spec
+        silent_ns = task.unanswered * spec.every * self._period_ns
+        slices_ns = BEATS * spec.every * spec.within_cycles * self._period_ns
+        return silent_ns > max(LEAST_NS, slices_ns) or state_of(task.block[Block.PID]) in STOPPED

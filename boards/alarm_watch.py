@@ -1,0 +1,44 @@
+"""The host's end of all alarm rings: what tasks and clock have rung, as events in order of time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from backplane.address_map import CLOCK
+from backplane.alarms import Alarm, alarm_ring
+from backplane.fault_table import FaultTable
+from backplane.segment import Segment
+from boards.alarm_text import event_of
+from boards.config.schema import RackConfig
+from boards.events import Event
+
+
+class Heard(NamedTuple):
+    """One alarm: its code, its subject (see `Alarm`), and the event that it makes."""
+
+    alarm: Alarm
+    subject: int
+    event: Event
+
+
+class AlarmWatch:
+    """Reads the alarm rings of one rack. `lost` counts alarms that were overwritten unread."""
+
+    def __init__(self, segment: Segment, config: RackConfig) -> None:
+        self._layout, self._faults = segment.layout, FaultTable(segment)
+        self._joints = config.robot.joints if config.robot is not None else ()
+        self._rings = {name: alarm_ring(segment, name) for name in (CLOCK, *(t.name for t in segment.layout.tasks))}
+        self.lost = 0
+
+    def drain(self) -> list[Heard]:
+        """Return what was rung since the last call."""
+        heard = []
+        for owner, ring in self._rings.items():
+            if not ring.waiting:
+                continue
+            rows, lost = ring.drain()
+            self.lost += lost
+            for row in rows:
+                event = event_of(row, owner, self._layout, self._faults, self._joints)
+                heard.append(Heard(Alarm(int(row["code"])), int(row["subject"]), event))
+        return sorted(heard, key=lambda one: one.event.time_ns)

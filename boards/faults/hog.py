@@ -1,0 +1,43 @@
+"""The hog: a process of its own that takes a board's core away from it, at a higher priority."""
+
+from __future__ import annotations
+
+import time
+
+from backplane.clock import SystemClock
+from backplane.fault_table import Entry, FaultEntry, FaultTable, Stage
+from backplane.process import pin
+from backplane.segment import Segment
+from backplane.words import Block
+from boards.processor import set_priority
+
+LOOK_S = 0.05
+"""Least often that a hog which waits for its tick looks whether it is still wanted."""
+
+
+def run_hog(segment: Segment, entry: FaultEntry) -> None:
+    """Wait until the clock begins the fault, then keep the core of its board busy until the fault is over.
+
+    To be called in a process of its own. Raises `PermissionError` where real-time priorities are refused: an ordinary
+    process takes no core from anybody.
+    """
+    task = segment.layout.tasks[entry[Entry.TASK]]
+    block, clock = segment.block(task.name), SystemClock(segment)
+    pin(block[Block.CORE])
+    if not set_priority(min(99, block[Block.PRIORITY] + 1)):
+        raise PermissionError(f"hog: SCHED_FIFO priority {block[Block.PRIORITY] + 1} is refused")
+    while entry.stage == Stage.WAITING and not clock.is_stopped:
+        wait_ns = clock.time_of(max(entry[Entry.FROM], clock.tick + 1)) - time.monotonic_ns()
+        # On the clock's grid: the first tick at which the fault can begin, or the next one.
+        time.sleep(min(max(wait_ns, 0) * 1e-9, LOOK_S))
+    end = clock.time_of(entry[Entry.UNTIL])
+    entry.acted(clock.now(), time.monotonic_ns())
+    while time.monotonic_ns() < end and not clock.is_stopped:
+        pass
+    set_priority(0)
+
+
+def hog(segment: Segment, index: int) -> int:
+    """Run the hog of an entry of the fault table, in a process that the crate has forked; return its exit status."""
+    run_hog(segment, FaultTable(segment).entries[index])
+    return 0

@@ -1,0 +1,74 @@
+"""A fault of the table in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from backplane.address_map import CLOCK
+from backplane.fault_table import NEVER, Entry, FaultEntry, Stage
+from backplane.layout import Layout
+from boards.faults.kinds import KINDS
+
+ALL_JOINTS = "all joints"
+
+
+def board_of(entry: FaultEntry, layout: Layout) -> str:
+    """Return the task that a fault strikes; "clock" for the clock."""
+    return CLOCK if entry[Entry.TASK] < 0 else layout.tasks[entry[Entry.TASK]].name
+
+
+def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
+    """Return the mailbox or the joint that a fault is about; empty when it is about its task alone."""
+    if entry[Entry.MAILBOX] >= 0:
+        return layout.mailboxes[entry[Entry.MAILBOX]].name
+    names = [parameter.name for parameter in KINDS[entry[Entry.KIND]].parameters]
+    return joint_name(int(entry.parameters[names.index("joint")]), joints) if "joint" in names else ""
+
+
+def joint_name(at: int, joints: Sequence[str]) -> str:
+    """Return the name of the joint at that place; -1 is all of them."""
+    if at < 0:
+        return ALL_JOINTS
+    return joints[at] if at < len(joints) else f"joint {at}"
+
+
+def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
+    """Return a fault of the table as plain data: ticks are -1, and `until` None, as long as they are not known."""
+    kind, stage = KINDS[entry[Entry.KIND]], entry.stage
+    has_begun = stage in (Stage.ACTIVE, Stage.OVER)
+    return {
+        "fault": entry.index,
+        "kind": kind.name,
+        "board": board_of(entry, layout),
+        "mailbox": layout.mailboxes[entry[Entry.MAILBOX]].name if entry[Entry.MAILBOX] >= 0 else "",
+        "parameters": {p.name: value for p, value in zip(kind.parameters, entry.parameters, strict=False)},
+        "text": describe(entry, layout, joints),
+        "stage": stage.name.lower(),
+        "begins": entry[Entry.FROM],
+        "until": entry[Entry.UNTIL] if has_begun and entry[Entry.UNTIL] != NEVER else None,
+        "ticks": entry[Entry.TICKS],
+        "struck_tick": entry[Entry.STRUCK_TICK],
+        "acted": entry[Entry.COUNT],
+    }
+
+
+def describe(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
+    """Return a fault as one line: its kind, target and parameters."""
+    return _text(entry, layout, joints, f" of {board_of(entry, layout)}")
+
+
+def what(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
+    """Return a fault as one line without its target: its kind and parameters."""
+    return _text(entry, layout, joints, "")
+
+
+def _text(entry: FaultEntry, layout: Layout, joints: Sequence[str], target: str) -> str:
+    kind = KINDS[entry[Entry.KIND]]
+    about = [subject_of(entry, layout, joints)]
+    for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
+        if parameter.name != "joint":
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            about.append(f"{parameter.name} {value:g}{unit}")
+    told = ", ".join(text for text in about if text)
+    return f"{kind.name}{target}{f' ({told})' if told else ''}"

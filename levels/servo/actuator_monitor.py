@@ -1,0 +1,87 @@
+"""Judges whether the motors do what they are told, from how the arm moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backplane.alarms import Alarm
+from levels.cell import Cell
+from levels.dynamics import FRICTION_SPEED, Terms
+from levels.level import Finding
+
+Array = NDArray[np.float64]
+
+NOISE = 0.005
+"""Part of a torque limit that the equation of motion leaves unexplained; ten times what faultless runs show."""
+LACKING = 0.02
+"""Part of its torque limit that a motor must lack to be at fault."""
+SURE_CYCLES = 2
+"""Cycles in a row that make a fault of it."""
+TURNING = 2.0 * FRICTION_SPEED
+"""Velocity, rad/s, around which dry friction may be anything up to its full value."""
+
+
+class ActuatorMonitor:
+    """Holds the torques that a motion took against the torques that were given for it.
+
+    What is left over is explained by motors that gave less than they were told, or it is not: then something outside
+    pushes. A motor can only lack torque, never more than it was told, and all that is left over must lie in motors.
+    An arm that strays from its set points by more than `following`, rad, has a motor too few as well.
+    """
+
+    def __init__(self, cell: Cell, following: float, period_s: float) -> None:
+        self._limits, self._dry = cell.bounds.torque, np.array(cell.model.dof_frictionloss[cell.dof])
+        self._following, self._period_s = following, period_s
+        self._noise = NOISE * self._limits
+        joints = len(self._dry)
+        self._inertia, self._bias, self._velocity = np.zeros((joints, joints)), np.zeros(joints), np.zeros(joints)
+        self._torque = np.zeros(joints)
+        self._begun = False
+        self._cycles = 0
+
+    def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
+        """Take the arm's state, rad/s, N m, at the beginning of a cycle, and the torques that it was given."""
+        np.copyto(self._velocity, velocity)
+        np.copyto(self._inertia, terms.inertia)
+        np.copyto(self._bias, terms.bias)
+        np.copyto(self._torque, torque)
+        self._begun = True
+
+    def drop(self) -> None:
+        """Forget the cycle that was begun: brakes, missed cycles or wrong samples came in between."""
+        self._begun, self._cycles = False, 0
+
+    def look(self, velocity: Array, terms: Terms, astray: Array) -> Finding | None:
+        """Judge the cycle that ends now, at `velocity`, rad/s, and `astray`, rad, from the set points."""
+        if not self._begun:
+            return None
+        far = np.abs(astray)
+        if far.max() > self._following:
+            joint = int(far.argmax())
+            return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
+        left = self._left_over(velocity, terms)
+        if (np.abs(left) <= self._noise).all():
+            self._cycles = 0
+            return None
+        return self._lacking(left)
+
+    def _left_over(self, velocity: Array, terms: Terms) -> Array:
+        """Return the torques, N m, that neither the motion nor any dry friction took."""
+        gain = (velocity - self._velocity) / (2.0 * self._period_s)
+        left = self._torque - 0.5 * (self._bias + terms.bias) - (self._inertia + terms.inertia) @ gain
+        slower, faster = np.minimum(velocity, self._velocity), np.maximum(velocity, self._velocity)
+        least = self._dry * np.tanh((slower - TURNING) / FRICTION_SPEED)
+        most = self._dry * np.tanh((faster + TURNING) / FRICTION_SPEED)
+        return np.asarray(left - np.minimum(np.maximum(left, least), most))
+
+    def _lacking(self, left: Array) -> Finding | None:
+        """Count cycles in which motors that lack torque explain all that is left over."""
+        lacks = left * np.sign(self._torque)
+        explained = (lacks >= -self._noise) & (lacks <= np.abs(self._torque) + self._noise)
+        share = lacks / self._limits
+        joint = int(share.argmax())
+        self._cycles = self._cycles + 1 if explained.all() and share[joint] > LACKING else 0
+        if self._cycles < SURE_CYCLES:
+            return None
+        return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))

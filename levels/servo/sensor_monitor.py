@@ -1,0 +1,187 @@
+"""Judges what the sensors say, and knows where the arm is while they lie."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backplane.alarms import Alarm
+from backplane.message import Message
+from levels.arm import Sensed
+from levels.cell import Bounds
+from levels.level import Finding
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+ROOM_RAD = 5e-5
+"""What positions may differ from what velocities lead to: 20 times what faultless runs show, contacts included."""
+BEYOND_RAD, BEYOND_SPEED = 0.05, 1.2
+"""How far beyond its range, and at what multiple of its velocity limit, no joint can be."""
+STILL_CYCLES = 10
+"""Cycles without the least change, under way, that no joint is capable of."""
+UNDER_WAY = 0.002
+"""Velocity of the set point, rad/s, from which on a joint is under way."""
+STUCK_RAD = 0.01
+"""How far a joint may have come until it is noticed that its sensor does not tell."""
+SILENT_CYCLES = 2
+"""Cycles without a new sample after which the sensors are silent."""
+
+
+class SensorMonitor:
+    """Holds every sample against the one before: a position must be where the velocities lead to.
+
+    `position`, `velocity` (joints,), rad, rad/s, are the sample's if it is good. Where it is not, they go on with the
+    sensed velocity or, without one, as the brakes stop the arm; `doubt` (joints,), rad, is how far off that may be.
+    A joint is good again where what it says fits to that. `fresh`: there is a sample of this cycle. `faulty`: not yet
+    `good_cycles` in a row were good. `drivable`: velocities are known, so the arm could still be driven.
+    """
+
+    def __init__(
+        self, bounds: Bounds, braking: Array, home: Array, tick_s: float, every: int, good_cycles: int
+    ) -> None:
+        """Judge joints that brake with `braking`, rad/s2, and start at `home`, rad, in cycles of `every` ticks."""
+        self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
+        self._fastest = BEYOND_SPEED * bounds.velocity
+        self._braking, self._tick_s, self._every, self._good_cycles = braking, tick_s, every, good_cycles
+        joints = len(home)
+        self.position, self.velocity, self.doubt = home.copy(), np.zeros(joints), np.zeros(joints)
+        self._raw = (home.copy(), np.zeros(joints))
+        self._still = np.zeros(joints, dtype=int)
+        self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
+        self._tick: int | None = None
+        self._streak = 0
+        self._rung: set[Alarm] = set()
+        self.findings: list[Finding] = []
+        self.fresh = self.drivable = True
+        self.faulty = False
+
+    def recall(self, state: Message) -> None:
+        """Go on from what an `ARM_STATE` says that the level knew."""
+        self.position[:], self.velocity[:], self.doubt[:] = state.position, state.velocity, state.doubt
+        self._tick = state.tick
+
+    def remember(self, state: Message) -> None:
+        """Fill in what `recall` wants to know."""
+        state.position, state.velocity, state.doubt = self.position, self.velocity, self.doubt
+
+    def look(self, sensed: Sensed, tick: int, wanted: Array | None) -> None:
+        """Judge a sample at `tick`; `wanted`: velocities, rad/s, that the arm was driven with, None: it was not.
+
+        What is wrong is added to `findings`, once an episode.
+        """
+        passed = tick - self._tick if self._tick is not None else self._every
+        self._tick, passed_s = tick, passed * self._tick_s
+        self.fresh = sensed.tick == tick
+        if not self.fresh:
+            self._go_on_blind(passed_s, tick - sensed.tick)
+            return
+        q, qd = sensed.position, sensed.velocity
+        change = qd - self.velocity
+        way = (0.5 * passed_s) * (qd + self.velocity)
+        room = self.doubt + ROOM_RAD + passed_s * np.abs(change)
+        if passed > self._every:
+            # Driven on for a while, then braked: faster in between than at both ends.
+            room += passed_s * 4.0 * self._every * self._tick_s * self._braking
+        fits = np.abs(q - self.position - way) <= room  # never true for what is no number
+        if self.faulty or not fits.all() or not self._stirs(q, qd, change, wanted):
+            self._doubtful(q, qd, way, fits, passed_s)
+            return
+        self._take(q, qd, change != 0.0)
+
+    def _take(self, q: Array, qd: Array, changed: Mask) -> None:
+        if self.doubt.any():
+            # What does not change proves nothing: it may be stuck.
+            self.doubt[changed] = 0.0
+        np.copyto(self.position, q)
+        np.copyto(self.velocity, qd)
+        np.copyto(self._raw[0], q)
+        np.copyto(self._raw[1], qd)
+
+    def _stirs(self, q: Array, qd: Array, change: Array, wanted: Array | None) -> bool:
+        """Say whether no joint has been still for too long while it was under way."""
+        if wanted is None or change.all():
+            if self._still.any():
+                self._still[:] = 0
+            return True
+        still = (change == 0.0) & (q == self._raw[0]) & (np.abs(wanted) > UNDER_WAY)
+        self._still += 1
+        self._still *= still
+        return bool((self._still < STILL_CYCLES).all())
+
+    def _doubtful(self, q: Array, qd: Array, way: Array, fits: Mask, passed_s: float) -> None:
+        """Name what is wrong with a sample, take what is right, and go on from what is known for the rest."""
+        finite, inside = np.isfinite(q) & np.isfinite(qd), (q >= self._low) & (q <= self._high)
+        inside &= np.abs(qd) <= self._fastest
+        frozen = (q == self._raw[0]) & (qd == self._raw[1]) & (np.abs(qd) * passed_s > ROOM_RAD)
+        still = self._still >= STILL_CYCLES
+        self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
+        self._name(Alarm.SENSOR_STUCK, frozen | still, self._still)
+        self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, q - self.position - way)
+        good = fits & inside & ~still & ~frozen
+        self.drivable = bool((np.isfinite(qd) & ~frozen & ~still).all())
+        self.doubt[still] += STUCK_RAD
+        self._still[still] = 0
+        self._suspect |= ~good
+        if self._settled(bool(good.all())):
+            self._take(q, qd, (q != self._raw[0]) | (qd != self._raw[1]))
+            return
+        np.copyto(self._raw[0], q)
+        np.copyto(self._raw[1], qd)
+        self._estimate(q, qd, way, np.isfinite(qd) & ~frozen, passed_s)
+
+    def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
+        """Let suspects go on, with their velocity where that is known; take the others as sensed.
+
+        A sample of a suspect that happens to fit is not taken: noise would lead the estimate away step by step.
+        """
+        coasting = self._suspect & known
+        self.doubt[coasting] += 0.5 * passed_s * np.abs(qd - self.velocity)[coasting]
+        self._brake(self._suspect & ~known, passed_s)
+        np.copyto(self.position, q, where=~self._suspect)
+        np.add(self.position, way, out=self.position, where=coasting)
+        np.copyto(self.velocity, qd, where=known)
+
+    def _go_on_blind(self, passed_s: float, age: int) -> None:
+        """Go on without a sample."""
+        if age >= SILENT_CYCLES * self._every:
+            self._ring(Finding(Alarm.SENSOR_SILENT, -1, age))
+            self.drivable = False
+            self._suspect[:] = True
+        self._streak = 0
+        self._brake(self._everyone, passed_s)
+
+    def _brake(self, joints: Mask, passed_s: float) -> None:
+        """Let joints go on as the brakes stop them."""
+        if not joints.any():
+            return
+        speed = np.abs(self.velocity)
+        time_s = np.minimum(passed_s, speed / self._braking)
+        way = (speed - 0.5 * self._braking * time_s) * time_s * joints
+        # Until the brakes close the last torque still acts.
+        acting = 2.0 * self._braking * passed_s * self._every * self._tick_s
+        self.position += np.copysign(way, self.velocity)
+        self.doubt += way + acting * joints * (speed > 0.0)
+        slower = np.copysign(np.maximum(speed - self._braking * time_s, 0.0), self.velocity)
+        np.copyto(self.velocity, slower, where=joints)
+
+    def _name(self, alarm: Alarm, wrong: Mask, values: Array | NDArray[np.int_]) -> None:
+        if wrong.any():
+            joint = int(wrong.argmax())
+            self._ring(Finding(alarm, joint, float(values[joint])))
+
+    def _ring(self, finding: Finding) -> None:
+        self.faulty, self._streak = True, 0
+        if finding.alarm not in self._rung:
+            self._rung.add(finding.alarm)
+            self.findings.append(finding)
+
+    def _settled(self, good: bool) -> bool:
+        """Count good samples in a row; say whether there are enough of them to end the episode."""
+        self._streak = self._streak + 1 if good else 0
+        if self._streak < self._good_cycles:
+            return False
+        self.faulty, self._streak = False, 0
+        self._suspect[:] = False
+        self._rung.clear()
+        return True

@@ -1,0 +1,36 @@
+"""The rack that faults are tried on: a wave with its planner, who watches it, and what is driven."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from boards.config.schema import RackConfig
+from tests.boards.conftest import PLANNED, MakeConfig
+
+DRIVEN = f"""{PLANNED}
+[board.driven]
+slot = 4
+rate_hz = 200
+executor = "fault_levels:Driven"
+"""
+LOCKED = "protocol.default=lock"
+TARGETS = {"overrun": "wave", "planner-slow": "wave.planner", "clock": "clock", "arm": "driven"}
+"""A task that can have a fault, by kind or by where the kind strikes; for any other it is the wave."""
+
+
+def rack(config: MakeConfig, *faults: Mapping[str, Any], settings: tuple[str, ...] = ()) -> RackConfig:
+    """Return the rack in real time with these faults in its config."""
+    tables = ", ".join(inline(fault) for fault in faults)
+    return config("clock.mode=realtime", f"fault=[{tables}]", *settings, text=DRIVEN)
+
+
+def inline(fault: Mapping[str, Any]) -> str:
+    """Return a fault as an inline table of TOML."""
+    return "{" + ", ".join(f"{key} = {_value(value)}" for key, value in fault.items()) + "}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"'{value}'" if isinstance(value, str) else str(value)

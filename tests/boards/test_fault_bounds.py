@@ -1,0 +1,82 @@
+"""Bounds of detection, in ticks of a rack with a fast writer, its planner and a slow reader."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from backplane.layout import Layout
+from boards.config import wire
+from boards.faults.bounds import BOUNDS, READ, bound_ticks, cycle_ticks
+from boards.faults.kinds import KINDS, NUMBERS
+from boards.faults.request import injections
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import rack
+
+# The wave: every tick, read by its planner (a slice of four ticks) and by the watch (eight ticks).
+CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
+    "death, at the Rack": ({"kind": "kill", "board": "wave"}, None, 2),
+    "death, at a neighbour": ({"kind": "kill", "board": "wave"}, "watch", 4 + 8),
+    "death of the clock": ({"kind": "kill", "board": "clock"}, None, 2),
+    "fast task": ({"kind": "hang", "board": "wave"}, None, 5),
+    "slow task": ({"kind": "hang", "board": "watch"}, None, 5 * 8),
+    "planner": ({"kind": "hang", "board": "wave.planner"}, None, 5 * 4),
+    "core taken": ({"kind": "hog", "board": "watch"}, None, 5 * 8),
+    "overrun": ({"kind": "overrun", "board": "watch"}, None, 8),
+    "slow planner, d cycles and one": ({"kind": "planner-slow", "board": "wave.planner"}, None, 4 + 1),
+    "mute, first reader": ({"kind": "mute", "board": "wave"}, None, 2 + 4),
+    "mute, one reader": ({"kind": "mute", "board": "wave"}, "watch", 2 + 8),
+    "mute, nobody reads": ({"kind": "mute", "board": "driven"}, None, None),
+    "mute planner": ({"kind": "mute", "board": "wave.planner"}, None, None),
+    "mute, not read by that task": ({"kind": "mute", "board": "wave"}, "driven", None),
+    "drop": ({"kind": "drop", "board": "wave"}, "watch", 1 + 1 + 8),
+    "reorder": ({"kind": "reorder", "board": "wave"}, "watch", 1 + 1 + 8),
+    "delay": ({"kind": "delay", "board": "wave", "by": 3}, "watch", 3 + 1 + 8),
+    "corrupt": ({"kind": "corrupt", "board": "wave"}, "watch", 1 + 8),
+    "corrupt plan, visible behind its slice": ({"kind": "corrupt", "board": "wave.planner"}, "wave", 4 + 1),
+    "babble": ({"kind": "babble", "board": "wave"}, None, 1 + 4),
+    "masquerade": ({"kind": "masquerade", "board": "wave"}, None, 1 + 4),
+    "clock stops": ({"kind": "clock-stop", "board": "clock"}, None, 3),
+    "clock skips": ({"kind": "clock-skip", "board": "clock", "ticks": 4}, None, 4),
+    "clock jitters": ({"kind": "clock-jitter", "board": "clock"}, None, 2),
+    # What is driven has a cycle of two ticks.
+    "sensor-nan": ({"kind": "sensor-nan", "board": "driven"}, None, 2),
+    "sensor-stuck": ({"kind": "sensor-stuck", "board": "driven"}, None, 40),
+    "sensor-dropout": ({"kind": "sensor-dropout", "board": "driven"}, None, 4),
+    "actuator-off": ({"kind": "actuator-off", "board": "driven"}, None, 10),
+    "actuator-saturated": ({"kind": "actuator-saturated", "board": "driven"}, None, 10),
+    "command-nan": ({"kind": "command-nan", "board": "driven"}, None, 0),
+    "command-limit": ({"kind": "command-limit", "board": "driven"}, None, 0),
+    "by its size": ({"kind": "sensor-bias", "board": "driven"}, None, None),
+    "at the start": ({"kind": "self-test", "board": "wave"}, None, None),
+}
+
+
+def bound(config: MakeConfig, fault: dict[str, Any], reader: str | None, *settings: str) -> int | None:
+    found = rack(config, fault, settings=settings)
+    layout: Layout = wire(found)
+    return bound_ticks(KINDS[NUMBERS[fault["kind"]]], injections(found, layout)[0], layout, reader)
+
+
+@pytest.mark.parametrize(("fault", "reader", "ticks"), CASES.values(), ids=CASES)
+def test_a_fault_must_be_found_within(
+    config: MakeConfig, fault: dict[str, Any], reader: str | None, ticks: int | None
+) -> None:
+    assert bound(config, fault, reader) == ticks
+
+
+def test_a_lock_that_is_held_is_found_by_the_bound_of_a_wait(config: MakeConfig) -> None:
+    # 2 ms of 2.5 ms ticks, and the cycle of the first reader.
+    assert bound(config, {"kind": "lock-held", "board": "wave"}, None, "protocol.default=lock") == 1 + 4
+
+
+def test_every_kind_has_a_bound_but_those_that_say_why_not() -> None:
+    without = {kind.name for kind in KINDS} - set(BOUNDS)
+    assert without == {"sensor-bias", "sensor-noise", "self-test"}
+    assert set(READ) == {kind.name for kind in KINDS if kind.takes_mailbox} | {"kill"}
+
+
+def test_the_clocks_cycle_is_a_tick_and_a_planners_is_its_slice(config: MakeConfig) -> None:
+    layout = wire(rack(config))
+    assert [cycle_ticks(layout, name) for name in ("clock", "wave", "wave.planner", "watch")] == [1, 1, 4, 8]

@@ -1,0 +1,104 @@
+"""Faults in a config and in a script: read, appended, given back as text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from boards.config import FAULTS, load, loads, names, wire
+from boards.errors import ConfigError
+from boards.faults.config import FaultConfig
+from boards.faults.kinds import KINDS
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import rack
+
+Write = Callable[[str, str], Path]
+SCRIPT = '[[fault]]\nkind = "kill"\nboard = "lower"\ntick = 8\n'
+
+
+def test_no_parameter_is_called_as_a_key_of_every_fault_is() -> None:
+    keys = {field.alias or name for name, field in FaultConfig.model_fields.items()}
+    assert not [(kind.name, p.name) for kind in KINDS for p in kind.parameters if p.name in keys]
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("0.5s", 0.5), ("20ms", 0.02), (" 1.5 s ", 1.5), (2, 2.0), (0.25, 0.25)])
+def test_a_duration_is_a_text_with_its_unit_or_a_number_of_seconds(text: object, seconds: float) -> None:
+    assert FaultConfig.model_validate({"kind": "mute", "board": "wave", "for": text}).lasts == pytest.approx(seconds)
+
+
+def test_the_resolved_text_of_a_config_with_faults_loads_again(config: MakeConfig) -> None:
+    found = rack(
+        config,
+        {"kind": "mute", "board": "wave", "for": "20ms", "when": "wave.status.state == executing", "seed": 3},
+        {"kind": "sensor-bias", "board": "driven", "tick": 40, "cycles": 5, "phase": 0.25, "size": 0.1, "joint": -1},
+    )
+    again = loads(found.text())
+    assert again == found
+    assert (again.fault[0].lasts, again.fault[1].parameters) == (0.02, {"size": 0.1, "joint": -1.0})
+
+
+def test_the_faults_of_a_script_come_behind_those_of_the_config(small: Path, write: Write) -> None:
+    own = 'fault=[{ kind = "hang", board = "upper" }]'
+    path = write("mine.toml", small.read_text() + '\n[[fault]]\nkind = "hang"\nboard = "upper"\n')
+    script = write("script.toml", SCRIPT + '\n[[fault]]\nkind = "mute"\nboard = "upper"\n')
+    assert [fault.kind for fault in load(path, faults=script).fault] == ["hang", "kill", "mute"]
+    assert [fault.kind for fault in load(small, [own]).fault] == ["hang"]
+    assert load(small, faults=str(script)).fault == load(small, faults=script).fault
+
+
+@pytest.mark.parametrize("name", names(FAULTS))
+def test_every_bundled_script_fits_the_nasrem_rack(name: str) -> None:
+    config = load("nasrem", ["clock.mode=realtime"], name)
+    wire(config)
+    assert config.fault
+    assert loads(config.text()) == config
+
+
+def test_an_unknown_script_lists_those_there_are(small: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(small, faults="noisy")
+    assert str(error.value) == f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'
+
+
+@pytest.mark.parametrize("text", ["[clock]\nspeed = 2\n", "fault = 3\n", 'name = "x"\n'])
+def test_a_script_holds_faults_and_nothing_else(small: Path, write: Write, text: str) -> None:
+    with pytest.raises(ConfigError, match=r"script.toml: \w+: a script of faults holds \[\[fault\]\] tables and"):
+        load(small, faults=write("script.toml", text))
+
+
+def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
+    plain = load(small)
+    assert (plain.supervision.restarts, plain.supervision.within_s, plain.supervision.lockstep_restart_s) == (
+        5,
+        10,
+        0.5,
+    )
+    assert (plain.board["lower"].restarts, plain.board["lower"].on_loss) == (None, "hold")
+    settings = ["supervision.restarts=2", "board.lower.restarts=0", "board.lower.on_loss=brake"]
+    config = load(small, settings)
+    assert (config.supervision.restarts, config.board["lower"].restarts, config.board["lower"].on_loss) == (
+        2,
+        0,
+        "brake",
+    )
+    assert loads(config.text()) == config
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("supervision.restarts=-1", "supervision.restarts = -1: should be greater than or equal to 0"),
+        ("supervision.within_s=0", "supervision.within_s = 0: should be greater than 0"),
+        ("supervision.lockstep_restart_s=inf", "should be a finite number"),
+        ("board.lower.on_loss=stay", "'hold', 'stop' or 'brake'"),
+        ("board.lower.restarts=1.5", "should be a valid integer"),
+        ("supervision.restart=1", "unknown key; did you mean 'restarts'?"),
+    ],
+)
+def test_load_tells_a_mistake_of_supervision(small: Path, setting: str, told: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(small, [setting])
+    assert told in str(error.value)
+    assert len(error.value.mistakes) == 1

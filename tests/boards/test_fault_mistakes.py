@@ -1,0 +1,234 @@
+"""Mistakes of faults: all of them at once, each with its place, its value and what is valid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from backplane.address_map import FAULT_ENTRIES
+from boards.config import load, wire
+from boards.errors import ConfigError, Mistake
+from boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
+from boards.faults.request import injections
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import LOCKED, TARGETS, inline, rack
+
+Fault = dict[str, Any]
+TASKS = "wave, wave.planner, watch, driven, clock"
+MISTAKES: Mapping[str, tuple[Fault, str]] = {
+    "no kind": ({"board": "wave"}, "fault[0].kind: missing; what goes wrong"),
+    "no board": ({"kind": "kill"}, "fault[0].board: missing; task concerned"),
+    "unknown kind": ({"kind": "kil", "board": "wave"}, f'.kind = "kil": no such kind; kinds: {", ".join(NUMBERS)}'),
+    "unknown board": ({"kind": "kill", "board": "wve"}, f'.board = "wve": no such task; tasks: {TASKS}'),
+    "no such planner": ({"kind": "kill", "board": "watch.planner"}, f"no such task; tasks: {TASKS}"),
+    "tick below 0": ({"kind": "kill", "board": "wave", "tick": -1}, ".tick = -1: should be greater than or equal to 0"),
+    "tick and a half": ({"kind": "kill", "board": "wave", "tick": 1.5}, ".tick = 1.5: should be a valid integer"),
+    "at below 0": ({"kind": "kill", "board": "wave", "at": -0.1}, ".at = -0.1: should be greater than or equal to 0"),
+    "at, endless": ({"kind": "kill", "board": "wave", "at": float("inf")}, ".at = inf: should be a finite number"),
+    "two beginnings": (
+        {"kind": "kill", "board": "wave", "tick": 1, "at": 1.0},
+        ".at = 1.0: tick is given as well; permitted: one of tick, at, when",
+    ),
+    "two ends": (
+        {"kind": "mute", "board": "wave", "for": "1s", "cycles": 4},
+        ".cycles = 4: for is given as well; permitted: one of for, cycles",
+    ),
+    "no time": ({"kind": "mute", "board": "wave", "for": "1 min"}, 'should be a time, as in "0.5s", "20ms" or 0.5'),
+    "for nothing": ({"kind": "mute", "board": "wave", "for": "0s"}, '.for = "0s": should be greater than 0'),
+    "no cycles": ({"kind": "mute", "board": "wave", "cycles": 0}, ".cycles = 0: should be greater than or equal to 1"),
+    "phase": ({"kind": "kill", "board": "wave", "phase": 1}, ".phase = 1: should be less than 1"),
+    "phase below 0": ({"kind": "kill", "board": "wave", "phase": -0.1}, "should be greater than or equal to 0"),
+    "seed": ({"kind": "drop", "board": "wave", "seed": -1}, ".seed = -1: should be greater than or equal to 0"),
+    "parameter, no number": (
+        {"kind": "drop", "board": "wave", "probability": "often"},
+        '.probability = "often": should be a valid number',
+    ),
+    "parameter, no finite one": ({"kind": "drop", "board": "wave", "probability": float("nan")}, "a finite number"),
+    "mailbox of another": (
+        {"kind": "mute", "board": "watch", "mailbox": "wave.status"},
+        ".mailbox = \"wave.status\": 'watch' does not write it; it writes: watch.status",
+    ),
+    "no mailbox": ({"kind": "mute", "board": "watch", "mailbox": "sea"}, "does not write it; it writes: watch.status"),
+    "overrun of a planner": (
+        {"kind": "overrun", "board": "wave.planner"},
+        "overrun is of executors; executors: wave, watch, driven",
+    ),
+    "slow executor": (
+        {"kind": "planner-slow", "board": "wave"},
+        '.board = "wave": planner-slow is of planners; planners: wave.planner',
+    ),
+    "nothing driven": (
+        {"kind": "sensor-nan", "board": "wave"},
+        "drives nothing that can have sensor-nan; boards: driven",
+    ),
+    "clock kind": ({"kind": "clock-skip", "board": "wave"}, 'clock-skip is of the clock; permitted: "clock"'),
+    "no kind of the clock": (
+        {"kind": "mute", "board": "clock"},
+        "the clock has no mute; its kinds: kill, clock-stop, clock-skip, clock-jitter",
+    ),
+    "clock that hangs": ({"kind": "hang", "board": "clock"}, "the clock has no hang; its kinds: kill, clock-stop"),
+    "no lock": ({"kind": "lock-held", "board": "wave"}, "needs protocol lock; mailboxes of 'wave' with it: none"),
+    "nobody reads": ({"kind": "masquerade", "board": "watch"}, "missing; nobody reads what 'watch' writes"),
+    "condition": (
+        {"kind": "kill", "board": "wave", "when": "wave.status.state > 1"},
+        'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"',
+    ),
+    "condition, mailbox": (
+        {"kind": "kill", "board": "wave", "when": "sea.status.state == done"},
+        "no mailbox is called 'sea.status'; mailboxes: wave.status, wave.plan, watch.status, driven.status",
+    ),
+    "condition, field": (
+        {"kind": "kill", "board": "wave", "when": "wave.status.height == 1"},
+        "'wave.status' has no integer field 'height'; integer fields: echo, state, error",
+    ),
+    "condition, no integer": (
+        {"kind": "kill", "board": "wave", "when": "driven.status.position == 1"},
+        "no integer field 'position'; integer fields: echo, state, error, mode",
+    ),
+    "condition, name": (
+        {"kind": "kill", "board": "wave", "when": "wave.status.state == gone"},
+        "'gone' is no value of 'state'; permitted: idle, executing, done, error",
+    ),
+    "condition, number": (
+        {"kind": "kill", "board": "wave", "when": "driven.status.mode == 40000"},
+        "'40000' is no value of 'mode'; permitted: a number from -32768 to 32767",
+    ),
+}
+PARAMETERS = [(kind, parameter) for kind in KINDS for parameter in kind.parameters]
+
+
+def fault_of(kind: Kind, **keys: Any) -> Fault:
+    """Return a fault of that kind with a target that can have it."""
+    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
+    return {"kind": kind.name, "board": board, **keys}
+
+
+def settings_for(kind: Kind) -> tuple[str, ...]:
+    return (LOCKED,) if kind.where == "lock" else ()
+
+
+def mistakes(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> list[Mistake]:
+    with pytest.raises(ConfigError) as error:
+        wire(rack(config, *faults, settings=settings))
+    return error.value.mistakes
+
+
+def told(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> str:
+    """Return the one mistake there is, as its line."""
+    (mistake,) = mistakes(config, *faults, settings=settings)
+    return str(mistake)
+
+
+@pytest.mark.parametrize(("fault", "line"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_told_with_what_is_valid(config: MakeConfig, fault: Fault, line: str) -> None:
+    found = told(config, fault)
+    assert line in found
+    assert found.startswith("fault[0]")
+    assert "\n" not in found
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_every_kind_can_be_asked_for_by_its_name_and_target_alone(config: MakeConfig, kind: Kind) -> None:
+    found = rack(config, fault_of(kind), settings=settings_for(kind))
+    (injection,) = injections(found, wire(found))
+    assert KINDS[injection.kind] is kind
+    assert injection.parameters == tuple(parameter.default for parameter in kind.parameters)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_a_parameter_that_a_kind_lacks_lists_those_it_has(config: MakeConfig, kind: Kind) -> None:
+    names = ", ".join(parameter.name for parameter in kind.parameters) or "none"
+    line = told(config, fault_of(kind, strength=2), settings=settings_for(kind))
+    assert line == f"fault[0].strength = 2: {kind.name} has no such parameter; parameters: {names}"
+
+
+@pytest.mark.parametrize(("kind", "parameter"), PARAMETERS, ids=lambda given: given.name)
+def test_a_parameter_out_of_range_is_told_with_its_range(config: MakeConfig, kind: Kind, parameter: Parameter) -> None:
+    for value in (parameter.least - 0.25, parameter.most + 0.25):
+        line = told(config, fault_of(kind, **{parameter.name: value}), settings=settings_for(kind))
+        assert line.startswith(f"fault[0].{parameter.name} = {value!r}: out of range")
+        assert f"{parameter.least:g} to {parameter.most:g}; {parameter.meaning}, {parameter.unit}" in line
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameter"), [(k, p) for k, p in PARAMETERS if p.is_whole], ids=lambda given: given.name
+)
+def test_half_of_something_that_is_counted_is_refused(config: MakeConfig, kind: Kind, parameter: Parameter) -> None:
+    fault = fault_of(kind, **{parameter.name: parameter.least + 0.5})
+    assert "permitted: whole numbers" in told(config, fault, settings=settings_for(kind))
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k.realtime], ids=lambda kind: kind.name)
+def test_a_kind_that_needs_real_time_says_so_in_lockstep(config: MakeConfig, kind: Kind) -> None:
+    line = told(config, fault_of(kind), settings=("clock.mode=lockstep", *settings_for(kind)))
+    assert line == (
+        f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for everybody; '
+        "run without --lockstep"
+    )
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k.once], ids=lambda kind: kind.name)
+@pytest.mark.parametrize("key", ["for", "cycles"])
+def test_a_kind_that_strikes_once_does_not_last(config: MakeConfig, kind: Kind, key: str) -> None:
+    line = told(config, fault_of(kind, **{key: 1}), settings=settings_for(kind))
+    assert f"fault[0].{key} = 1" in line
+    assert f"{kind.name} strikes once, it does not last; leave it out" in line
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_mailbox], ids=lambda kind: kind.name)
+def test_a_kind_that_is_of_no_mailbox_lists_those_that_are(config: MakeConfig, kind: Kind) -> None:
+    takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
+    line = told(config, fault_of(kind, mailbox="wave.status"))
+    assert line == f'fault[0].mailbox = "wave.status": {kind.name} is of no mailbox; kinds that are: {takers}'
+
+
+@pytest.mark.parametrize("begin", [{"tick": 4}, {"at": 1.0}, {"when": "wave.status.state == executing"}])
+def test_a_self_test_fails_at_the_start_and_at_no_other_time(config: MakeConfig, begin: Fault) -> None:
+    line = told(config, fault_of(KINDS[NUMBERS["self-test"]], **begin))
+    assert "self-test strikes as the board starts; leave it out" in line
+
+
+def test_a_lock_is_held_only_where_the_mailbox_has_one(config: MakeConfig) -> None:
+    fault = {"kind": "lock-held", "board": "wave", "mailbox": "wave.status"}
+    setting = 'protocol.mailbox={ "watch.status" = "lock" }'
+    assert "mailboxes of 'wave' with it: none" in told(config, fault, settings=(setting,))
+    wire(rack(config, fault, settings=(LOCKED,)))
+
+
+def test_a_joint_that_the_arm_lacks_is_refused() -> None:
+    settings = ['fault=[{ kind = "sensor-nan", board = "servo", joint = 6 }]']
+    with pytest.raises(ConfigError, match="joint = 6: out of range; permitted: whole numbers -1 to 5; joint concerned"):
+        wire(load("nasrem", settings))
+
+
+def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None:
+    faults = [{"kind": "kill", "board": "wave", "tick": tick} for tick in range(FAULT_ENTRIES + 1)]
+    assert told(config, *faults) == f"fault = {len(faults)}: more than one run can have; permitted: {FAULT_ENTRIES}"
+
+
+def test_all_mistakes_of_all_faults_are_told_at_once(config: MakeConfig) -> None:
+    faults = (
+        {"kind": "kil", "board": "wve", "tick": 1, "at": 1.0},
+        {"kind": "mute", "board": "wave", "mailbox": "sea", "when": "sea", "strength": 1, "for": 1, "cycles": 1},
+    )
+    places = [mistake.place for mistake in mistakes(config, *faults)]
+    assert sorted(places) == sorted(
+        [f"fault[0].{key}" for key in ("kind", "board", "at")]
+        + [f"fault[1].{key}" for key in ("mailbox", "when", "strength", "cycles")]
+    )
+
+
+def test_mistakes_of_faults_are_told_beside_those_of_the_rest(config: MakeConfig) -> None:
+    faults = [{"kind": "kil", "board": "wave"}, {"kind": "kill", "board": "watch", "tick": "soon"}]
+    tables = f"fault=[{', '.join(inline(fault) for fault in faults)}]"
+    with pytest.raises(ConfigError) as error:
+        config("clock.wake=sleep", "board.wave.core=-1", tables)
+    # The board with a mistake is known all the same.
+    assert {m.place for m in error.value.mistakes} == {
+        "clock.wake",
+        "board.wave.core",
+        "fault[0].kind",
+        "fault[1].tick",
+    }

@@ -1,0 +1,161 @@
+"""Random plans of a campaign: repeatable, fit for the rack, and so that each fault can be seen."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from boards.config import load, wire
+from boards.config.schema import RackConfig
+from boards.faults.config import FaultConfig
+from boards.faults.kinds import KINDS, NUMBERS
+from boards.faults.request import cycle_ticks, injections
+from tools.answer import Failure
+from tools.campaign.draw import MOST, Course, Deck, fault_plans, kill_plans, size_plans
+from tools.campaign.plan import EXTERNAL, Kill, Plan
+from tools.campaign.shape import SIZED, swept_sizes
+from tools.campaign.targets import Targets, kinds_for
+
+BOTH = (True, False)
+MODES = [BOTH[place % 2] for place in range(60)]
+TICKS, SECOND = 11_000, 400.0
+
+
+@pytest.fixture(scope="module")
+def config() -> RackConfig:
+    return load("nasrem")
+
+
+@pytest.fixture(scope="module")
+def course(config: RackConfig) -> Course:
+    return Course(Targets(config, wire(config)), TICKS, SECOND, 2.0)
+
+
+@pytest.fixture(scope="module")
+def kinds(course: Course) -> list[str]:
+    return kinds_for(None, course.targets, lockstep=True, realtime=True)
+
+
+def test_the_same_seed_draws_the_same_plans(course: Course, kinds: list[str]) -> None:
+    plans = list(fault_plans(course, kinds, 7, MODES))
+    assert plans == list(fault_plans(course, kinds, 7, MODES))
+    assert plans != list(fault_plans(course, kinds, 8, MODES))
+    # A longer campaign begins as the shorter one does.
+    assert plans[:10] == list(fault_plans(course, kinds, 7, MODES[:10]))
+
+
+def test_every_plan_fits_its_rack(course: Course, kinds: list[str], config: RackConfig) -> None:
+    for plan in [*fault_plans(course, kinds, 3, MODES), *size_plans(course, kinds, 10, 3, 61)]:
+        found = injections(plan.config(config, "other"), course.targets.layout)
+        assert len(found) == len(plan.faults)
+
+
+def test_every_kind_that_the_rack_can_have_is_drawn(course: Course, kinds: list[str]) -> None:
+    drawn = Counter(table["kind"] for plan in fault_plans(course, kinds, 1, MODES) for table in plan.faults)
+    assert set(drawn) | {EXTERNAL} == set(kinds)
+    # Nothing of the default rack has protocol lock.
+    assert set(NUMBERS) - set(kinds) == {"lock-held"}
+
+
+def test_what_needs_real_time_is_not_drawn_in_lockstep(course: Course, kinds: list[str]) -> None:
+    drawn = {t["kind"] for p in fault_plans(course, kinds, 1, MODES) if p.lockstep for t in p.faults}
+    assert not [kind for kind in drawn if KINDS[NUMBERS[kind]].realtime]
+
+
+def test_faults_of_a_trial_follow_each_other_with_time_to_recover(course: Course, kinds: list[str]) -> None:
+    for plan in fault_plans(course, kinds, 2, MODES):
+        assert 1 <= len(plan.faults) + len(plan.kills) <= MOST
+        ends = [(t.get("tick", 0), t.get("tick", 0) + round(t.get("for", 0.0) * SECOND)) for t in plan.faults]
+        ends += [(kill.tick, kill.tick) for kill in plan.kills]
+        ends.sort()
+        assert all(later[0] - earlier[1] > SECOND for earlier, later in pairwise(ends))
+        assert ends[-1][0] <= TICKS
+
+
+def test_a_board_that_fails_its_start_has_a_trial_of_its_own(course: Course, kinds: list[str]) -> None:
+    plans = [p for p in fault_plans(course, kinds, 2, MODES) if any(t["kind"] == "self-test" for t in p.faults)]
+    assert plans
+    assert all(len(plan.faults) == 1 and not plan.kills for plan in plans)
+
+
+def test_faults_strike_at_phases_of_the_tick_in_real_time_alone(course: Course, kinds: list[str]) -> None:
+    plans = list(fault_plans(course, kinds, 2, MODES))
+    phases = [table.get("phase", 0.0) for plan in plans if not plan.lockstep for table in plan.faults]
+    assert len(set(phases)) > 20
+    assert not [table for plan in plans if plan.lockstep for table in plan.faults if "phase" in table]
+
+
+def test_only_mailboxes_that_somebody_reads_are_struck(small: Path) -> None:
+    counting = load(small)
+    targets = Targets(counting, wire(counting))
+    struck = {target.mailbox for found in targets.by_kind.values() for target in found if target.mailbox}
+    # Nobody reads upper.status; lower.plan is of a planner, and no periodic message.
+    assert {target.mailbox for target in targets.by_kind["mute"]} == {"upper.command", "lower.status"}
+    assert struck == {"upper.command", "lower.status", "lower.plan"}
+
+
+def test_a_muted_mailbox_stays_mute_for_longer_than_its_bound(course: Course) -> None:
+    layout = course.targets.layout
+    for plan in fault_plans(course, ["mute"], 4, MODES):
+        for table in plan.faults:
+            readers = layout.mailbox(table["mailbox"]).readers
+            bound = 2 * cycle_ticks(layout, table["board"]) + min(cycle_ticks(layout, r) for r in readers)
+            assert table["for"] * SECOND >= 2 * bound - 1
+
+
+def test_a_deck_deals_each_kind_as_often_as_any_other() -> None:
+    deck = Deck(["kill", "hang", "mute"], Random(1))
+    dealt = Counter(kind for _ in range(9) for kind in deck.deal(4))
+    assert set(dealt.values()) == {12}
+
+
+def test_kills_from_outside_are_as_many_as_asked_for_and_apart(course: Course) -> None:
+    plans = list(kill_plans(course, 50, 5, BOTH, first=4))
+    assert sum(len(plan.kills) for plan in plans) == 50
+    assert [plan.number for plan in plans] == list(range(4, 4 + len(plans)))
+    assert {plan.lockstep for plan in plans} == {True, False}
+    assert {kill.board for plan in plans for kill in plan.kills} == {
+        *(task.name for task in course.targets.layout.tasks),
+        "clock",
+    }
+    for plan in plans:
+        ticks = [kill.tick for kill in plan.kills]
+        assert all(later - earlier >= 3.5 * SECOND for earlier, later in pairwise(ticks))
+
+
+def test_every_size_of_the_sweep_comes_once(course: Course, kinds: list[str]) -> None:
+    plans = list(size_plans(course, kinds, 10, 6, first=1))
+    found = Counter((table["kind"], table["size"]) for plan in plans for table in plan.faults)
+    assert found == Counter({(kind, size): 1 for kind in SIZED for size in swept_sizes(kind, 10)})
+
+
+def test_a_plan_is_a_file_that_repeats_it(config: RackConfig, tmp_path: Path) -> None:
+    fault = {"kind": "drop", "board": "servo", "tick": 7, "for": 0.05, "mailbox": "servo.status", "probability": 0.5}
+    plan = Plan(3, "faults", lockstep=True, faults=(fault,), kills=(Kill("task", 90, 0.25),))
+    text = plan.toml("nasrem")
+    assert "rack run nasrem --lockstep --faults" in text
+    assert "# external kill: task at tick 90 + 0.25" in text
+    tables = tomllib.loads(text)["fault"]
+    assert tuple(FaultConfig.model_validate(table) for table in tables) == plan.config(config, "other").fault
+
+
+@pytest.mark.parametrize(
+    ("wanted", "lockstep", "why"),
+    [
+        ("kill,murder", False, "--kinds murder: no such kind; kinds: kill, hang, "),
+        ("lock-held", False, "--kinds lock-held: nothing in this rack can have it; kinds: "),
+        ("hog", True, "--kinds hog: hog needs real time, and the campaign is in lockstep; kinds: "),
+        (" , ", False, "--kinds: names none; kinds: "),
+    ],
+)
+def test_a_kind_that_cannot_be_is_refused_in_one_line(course: Course, wanted: str, lockstep: bool, why: str) -> None:
+    with pytest.raises(Failure) as refused:
+        kinds_for(wanted, course.targets, lockstep=True, realtime=not lockstep)
+    assert refused.value.status == 2
+    assert str(refused.value).startswith(why)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,183 @@
+"""`rack inject` and `rack estop` on a rack that runs, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from backplane.fault_table import Entry, FaultTable, Stage
+from backplane.lines import UtilityLines
+from backplane.segment import Segment
+from backplane.words import Demand, System
+from boards.config import load
+from boards.errors import ConfigError
+from boards.faults.kinds import KINDS
+from boards.rack import Rack
+from tests.boards.fault_racks import DRIVEN
+from tests.processes import wait_until
+from tools.answer import Failure
+from tools.injecting import live
+from tools.injecting.live import LiveRack
+
+ROOT = Path(__file__).resolve().parents[2]
+BOUND_S = 50
+TASKS = "wave, wave.planner, watch, driven, clock"
+
+
+def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tools.cli", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The name of a rack in real time that runs until it is stopped."""
+    path, name = tmp_path_factory.mktemp("rack") / "waves.toml", f"test-inject-{os.getpid()}"
+    path.write_text(DRIVEN)
+    command = [sys.executable, "-m", "tools.cli", "run", str(path), "--no-record", "--set", "clock.mode=realtime"]
+    # A machine that is busy must not use the restarts up.
+    settings = ["--set", f"name={name}", "--set", "supervision.restarts=1000"]
+    process = subprocess.Popen([*command, *settings], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith(name) and "tick 0 " not in line:
+                break
+        yield name
+        assert rack("stop", name).returncode == 0
+        process.communicate(timeout=BOUND_S)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_fault_begins_at_the_next_tick_and_says_which(running: str) -> None:
+    segment = Segment.attach(running)
+    before = segment.words[System.TICK]
+    done = rack("inject", running, "wave", "kill", "--json")
+    answer = json.loads(done.stdout)
+    assert done.returncode == 0
+    assert before < answer["begins"] <= segment.words[System.TICK]
+    assert (answer["kind"], answer["board"]) == ("kill", "wave")
+    # It comes back, for the next test.
+    entry = FaultTable(segment).entries[answer["fault"]]
+    wait_until(lambda: entry[Entry.COUNT] and UtilityLines(segment).bad_inputs == [])
+
+
+def test_waiting_is_for_the_end_of_a_fault(running: str) -> None:
+    done = rack("inject", running, "watch", "mute", "--cycles", "5", "--mailbox", "watch.status", "--wait")
+    assert done.returncode == 0
+    assert done.stdout.startswith("mute of watch (watch.status): ticks ")
+    told = done.stdout.split()
+    assert int(told[told.index("to") + 1].rstrip(",")) - int(told[told.index("ticks") + 1]) == 5 * 8 - 1
+
+
+def test_a_fault_can_wait_for_a_tick_and_for_a_condition(running: str) -> None:
+    tick = Segment.attach(running).words[System.TICK] + 2000
+    drop = json.loads(rack("inject", running, "wave", "drop", "--tick", str(tick), "--for", "5ms", "--json").stdout)
+    # Later only by the ticks that a busy clock leaves out.
+    assert drop["begins"] >= tick
+    condition = "watch.status.state == executing"
+    assert rack("inject", running, "wave", "drop", "--when", condition, "--for", "5ms").returncode == 0
+
+
+def test_the_faults_of_a_rack_are_listed(running: str) -> None:
+    rack("inject", running, "wave", "babble", "--for", "20ms", "writes=5")
+    listed = json.loads(rack("inject", running, "--list", "--json").stdout)
+    assert listed[-1]["text"] == "babble of wave (writes 5)"
+    assert listed[-1]["stage"] in ("active", "over")
+    assert "babble of wave (writes 5)" in rack("inject", running, "--list").stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["wve", "kill"], f'board = "wve": no such task; tasks: {TASKS}'),
+        (["wave", "kil"], f'kind = "kil": no such kind; kinds: {", ".join(kind.name for kind in KINDS)}'),
+        (["wave", "drop", "size=1"], "size = 1: drop has no such parameter; parameters: probability"),
+        (["wave", "drop", "probability"], "'probability': a parameter must be key=value, as in size=0.05"),
+        (["wave"], "RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list"),
+    ],
+    ids=lambda given: " ".join(given) if isinstance(given, list) else "",
+)
+def test_what_cannot_be_is_one_line_that_says_what_can(running: str, words: list[str], line: str) -> None:
+    done = rack("inject", running, *words)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(line)
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys", "line"),
+    [
+        ("drop", {"probability": "2"}, "probability = 2: out of range; permitted: 0.001 to 1; "),
+        ("drop", {"probability": "often"}, 'probability = "often": should be a valid number, '),
+        ("mute", {"mailbox": "sea"}, "mailbox = \"sea\": 'wave' does not write it; it writes: wave.status"),
+        ("mute", {"for": "1h"}, 'for = "1h": should be a time, as in "0.5s", "20ms" or 0.5; '),
+        ("mute", {"for": "1s", "cycles": "1"}, "cycles = 1: for is given as well; permitted: one of for,"),
+        ("kill", {"tick": "0"}, "tick = 0: has passed; the rack is at tick "),
+        ("kill", {"phase": "1.5"}, 'phase = "1.5": should be less than 1; '),
+        ("kill", {"when": "sea"}, 'when = "sea": must be mailbox.field == value, as in "elemental_move.status.verb'),
+        ("self-test", {}, 'kind = "self-test": a rack that runs has passed its self-tests; give it in the config'),
+        ("hog", {}, "for: missing; a hog must have an end: --for or --cycles"),
+    ],
+)
+def test_a_fault_that_a_running_rack_cannot_have_is_not_added(
+    running: str, kind: str, keys: dict[str, str], line: str
+) -> None:
+    injected = Segment.attach(running).words[System.INJECTED]
+    with pytest.raises(ConfigError) as error:
+        LiveRack(running).inject({"board": "wave", "kind": kind, **keys}, wait=False)
+    assert str(error.value).startswith(line)
+    assert Segment.attach(running).words[System.INJECTED] == injected
+
+
+def test_the_emergency_stop_is_latched_until_it_is_reset(running: str) -> None:
+    words = Segment.attach(running).words
+    done = rack("estop", running)
+    assert (done.returncode, words[System.EMERGENCY_STOP], words[System.DEMAND]) == (0, 1, Demand.BRAKE)
+    assert "emergency stop latched at tick" in done.stdout
+    assert "EMERGENCY STOP  arm: brake" in rack("status", running).stdout.splitlines()[0]
+    words[System.ACFAIL] = 1
+    refused = rack("estop", running, "--reset")
+    assert (refused.returncode, refused.stderr) == (1, "the emergency stop stays latched: ACFAIL\n")
+    assert words[System.EMERGENCY_STOP] == 1
+    words[System.ACFAIL] = 0
+    reset = json.loads(rack("estop", running, "--reset", "--json").stdout)
+    assert (reset["emergency_stop"], words[System.EMERGENCY_STOP], words[System.DEMAND]) == (False, 0, Demand.NONE)
+
+
+@pytest.mark.parametrize("command", [["inject", "{}", "wave", "kill"], ["estop", "{}"]])
+def test_a_rack_that_is_not_there_is_named(rack_name: str, command: list[str]) -> None:
+    done = rack(*(word.format(rack_name) for word in command))
+    assert done.returncode == 1
+    assert f"rack '{rack_name}' is not there" in done.stderr
+
+
+def test_the_help_lists_every_kind_with_its_means_bound_and_parameters() -> None:
+    shown = rack("inject", "--help").stdout
+    for kind in KINDS:
+        line = next(line for line in shown.splitlines() if line.startswith(f"{kind.name} "))
+        assert kind.means in line
+        assert kind.bound in line
+        for parameter in kind.parameters:
+            assert any(line.split()[:2] == [kind.name, parameter.name] for line in shown.splitlines())
+    listed = json.loads(rack("inject", "--list", "--json").stdout)
+    assert [kind["name"] for kind in listed] == [kind.name for kind in KINDS]
+
+
+def test_a_clock_that_gives_out_no_tick_begins_no_fault(
+    small: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "BEGIN_S", 0.05)
+    with Rack(load(small, [f"name={rack_name}"])) as launched:
+        with pytest.raises(Failure, match=r"kill of lower: the clock has not begun it within 0.05 s"):
+            LiveRack(rack_name).inject({"board": "lower", "kind": "kill"}, wait=False)
+        (entry,) = FaultTable(launched.segment).staged((Stage.WAITING,))
+        assert entry[Entry.FROM] == -1

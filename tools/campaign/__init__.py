@@ -1,0 +1,1 @@
+"""`rack campaign`: faults of all kinds at random, and what came of each."""

@@ -1,0 +1,106 @@
+"""One trial: a run of the whole task with its faults, and everything that is needed to judge it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from backplane.errors import BackplaneError
+from backplane.layout import Layout
+from backplane.words import System
+from boards.config.schema import RackConfig
+from boards.errors import BoardError, ConfigError
+from boards.events import Event
+from boards.outcome import Outcome
+from boards.rack import Rack
+from tools.campaign.ending import Arm, Strike, arm_of, strikes
+from tools.campaign.external import Killer
+from tools.campaign.interrupt import Interrupt
+from tools.campaign.leftovers import children, left_behind
+from tools.campaign.plan import Plan
+
+LONGEST = 4
+"""A run with faults may take that many times as long as without, and"""
+GRACE_S = 60.0
+"""so much longer: behind that it is stopped. Nothing is ever waited for without end."""
+STUCK_S = 20.0
+"""Time in which a rack that is told to stop does so."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial that was made. `refused` is why the rack did not launch, else empty; `left` what it left behind.
+
+    `clock_ns` turns CLOCK_MONOTONIC into the events' CLOCK_REALTIME.
+    """
+
+    plan: Plan
+    layout: Layout | None
+    outcome: Outcome | None
+    refused: str
+    events: tuple[Event, ...]
+    strikes: tuple[Strike, ...]
+    arm: Arm
+    left: tuple[str, ...]
+    wall_s: float
+    clock_ns: int
+    is_interrupted: bool = False
+
+
+def run_trial(
+    config: RackConfig, plan: Plan, rack_name: str, ticks: int, seconds: float | None, interrupt: Interrupt
+) -> Trial:
+    """Run a plan and take down what came of it.
+
+    `ticks` is the length of a faultless run; `seconds` of simulated time, for a rack that no task ends. Raises
+    `ConfigError` for a plan that does not fit the config.
+    """
+    before, started = children(), time.monotonic()
+    rack = Rack(plan.config(config, rack_name))
+    refused, arm = "", Arm()
+    found: tuple[Strike, ...] = ()
+    try:
+        with rack:
+            killer = Killer(rack.segment, plan.kills)
+            _watch(rack, killer, ticks, seconds, interrupt)
+            joints = config.robot.joints if config.robot is not None else ()
+            found, arm = strikes(rack.segment, joints, killer.done), arm_of(rack.segment)
+    except ConfigError:
+        raise
+    except (BackplaneError, BoardError) as error:
+        refused = str(error)
+    return Trial(
+        plan=plan,
+        layout=rack.segment.layout if hasattr(rack, "segment") else None,
+        outcome=rack.outcome,
+        refused=refused,
+        events=tuple(rack.events),
+        strikes=found,
+        arm=arm,
+        left=tuple(left_behind(rack_name, before)),
+        wall_s=time.monotonic() - started,
+        clock_ns=time.time_ns() - time.monotonic_ns(),
+        is_interrupted=interrupt.is_set,
+    )
+
+
+def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None, interrupt: Interrupt) -> None:
+    """Watch a run to its end, and kill what is to be killed; no run lasts for ever."""
+    rack.start(seconds)
+    words = rack.segment.words
+    most_ticks = LONGEST * ticks + GRACE_S * 1e9 / rack.config.clock_ns
+    deadline = time.monotonic() + most_ticks * rack.config.clock_ns * 1e-9
+    stopped = False
+    while rack.watch(killer.due_in_s()):
+        killer.advance()
+        if not stopped and (why := _why_stop(interrupt, words[System.TICK] > most_ticks, deadline)):
+            rack.stop(why)
+            stopped, deadline = True, time.monotonic() + STUCK_S
+        elif stopped and time.monotonic() > deadline:
+            return
+
+
+def _why_stop(interrupt: Interrupt, too_long: bool, deadline: float) -> str:
+    if interrupt.is_set:
+        return "the campaign was interrupted"
+    return "it takes too long" if too_long or time.monotonic() > deadline else ""

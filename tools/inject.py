@@ -1,0 +1,77 @@
+"""`rack inject`: inject a fault into a rack that runs."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from tools.answer import Failure, Json, print_json
+
+Rack = Annotated[str | None, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it")]
+BoardName = Annotated[
+    str | None, typer.Argument(metavar="BOARD", help="task concerned: servo, servo.planner, ..., or clock")
+]
+KindName = Annotated[str | None, typer.Argument(metavar="KIND", help="what goes wrong; the kinds are listed below")]
+Parameters = Annotated[
+    list[str] | None, typer.Argument(metavar="KEY=VALUE", help="parameters of the kind, as in size=0.05")
+]
+For = Annotated[
+    str | None, typer.Option("--for", metavar="TIME", help="simulated time that it lasts, as in 0.5s or 20ms")
+]
+Cycles = Annotated[str | None, typer.Option(metavar="N", help="cycles of the task that it lasts")]
+Mailbox = Annotated[str | None, typer.Option(metavar="NAME", help="mailbox concerned; default: all the task writes")]
+Tick = Annotated[str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")]
+When = Annotated[
+    str | None, typer.Option(metavar="CONDITION", help='begin when it holds: "elemental_move.status.verb == grasp"')
+]
+Phase = Annotated[str | None, typer.Option(metavar="X", help="when in its first tick it strikes, 0 to below 1")]
+Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of what is random in it")]
+Wait = Annotated[bool, typer.Option("--wait", help="wait until it is over")]
+List = Annotated[bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")]
+
+
+def inject(
+    rack: Rack = None,
+    board: BoardName = None,
+    kind: KindName = None,
+    parameters: Parameters = None,
+    lasts: For = None,
+    cycles: Cycles = None,
+    mailbox: Mailbox = None,
+    tick: Tick = None,
+    when: When = None,
+    phase: Phase = None,
+    seed: Seed = None,
+    wait: Wait = False,
+    is_list: List = False,
+    as_json: Json = False,
+) -> None:
+    """Inject a fault into a running rack.
+
+    It begins at the next tick, and lasts until the end of the run where nothing else is said.
+    """
+    from tools.injecting.kinds import kinds_document, kinds_text
+    from tools.injecting.live import LiveRack
+
+    if is_list and rack is None:
+        print_json(kinds_document()) if as_json else print("\n".join(kinds_text()))
+        return
+    if rack is None or (not is_list and (board is None or kind is None)):
+        raise Failure("RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list", 2)
+    live = LiveRack(rack)
+    if is_list:
+        print_json(live.faults()) if as_json else print("\n".join(live.text()))
+        return
+    given: dict[str, Any] = {"board": board, "kind": kind, "for": lasts, "cycles": cycles, "mailbox": mailbox}
+    given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
+    answer = live.inject({**given, **_named(parameters or [])}, wait)
+    print_json(answer) if as_json else print(answer["told"])
+
+
+def _named(parameters: list[str]) -> dict[str, str]:
+    """Return parameters by name. Raises `Failure`."""
+    for text in parameters:
+        if not text.partition("=")[0] or not text.partition("=")[2]:
+            raise Failure(f"'{text}': a parameter must be key=value, as in size=0.05", 2)
+    return {key.strip(): value.strip() for key, _, value in (text.partition("=") for text in parameters)}

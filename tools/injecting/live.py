@@ -1,0 +1,125 @@
+"""A running rack that is to have a fault: asked for as in a config, put into its fault table, and followed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from backplane.segment import Segment
+from backplane.words import Run, System
+from boards.config import loads
+from boards.config.schema_mistakes import mistakes_of
+from boards.errors import ConfigError, Mistake
+from boards.faults.config import FaultConfig
+from boards.faults.hog import run_hog
+from boards.faults.request import injection
+from boards.faults.text import describe, document
+from boards.processor import set_priority
+from tools.answer import Failure
+from tools.text_table import table
+
+BEGIN_S = 5.0
+"""Bound of the wait for a fault that is to begin at once: a clock that gives out a tick begins it."""
+LOOK_S = 0.001
+SEEDS = 2**31
+
+
+class LiveRack:
+    """A rack by name, with its config and its fault table. Raises `SegmentError` when there is none."""
+
+    def __init__(self, rack: str) -> None:
+        self._segment = Segment.attach(rack)
+        self._config = loads(self._segment.config)
+        self._table = FaultTable(self._segment)
+        self._joints = self._config.robot.joints if self._config.robot is not None else ()
+
+    def inject(self, given: Mapping[str, Any], wait: bool) -> dict[str, Any]:
+        """Inject a fault and wait until it has begun, with `wait` until it is over; return it as plain data.
+
+        Raises `ConfigError` with every mistake, and `Failure` when it does not begin.
+        """
+        if self._is_over:
+            raise Failure(f"rack '{self._segment.rack}': its run is over")
+        fault = self._fault({key: value for key, value in given.items() if value is not None})
+        entry = self._table.add(injection(fault, self._config, self._segment.layout))
+        if fault.kind == "hog":
+            # This very process takes the core.
+            run_hog(self._segment, entry)
+        else:
+            self._await_begin(entry, at_once=fault.tick is None and fault.when is None)
+        while wait and entry.stage != Stage.OVER and not self._is_over:
+            time.sleep(LOOK_S)
+        return {**document(entry, self._segment.layout, self._joints), "told": self._told(entry)}
+
+    def faults(self) -> list[dict[str, Any]]:
+        """Return the faults that were injected so far, as plain data."""
+        injected = self._table.staged((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
+        return [document(entry, self._segment.layout, self._joints) for entry in injected]
+
+    def text(self) -> Iterator[str]:
+        """Yield the faults that were injected so far, as a table."""
+        rows = [
+            [str(f["fault"]), f["text"], f["stage"], *("-" if n is None or n < 0 else str(n) for n in _numbers(f))]
+            for f in self.faults()
+        ]
+        yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted"], rows)
+
+    def _fault(self, given: dict[str, Any]) -> FaultConfig:
+        """Return the fault asked for, and fit for a rack that runs. Raises `ConfigError`, `Failure`."""
+        words = self._segment.words
+        # Two faults of one run must not throw the same dice.
+        given.setdefault("seed", (self._config.seed + words[System.INJECTED]) % SEEDS)
+        try:
+            fault = FaultConfig.model_validate(given)
+        except ValidationError as error:
+            raise ConfigError(mistakes_of(error, FaultConfig, given)) from None
+        if fault.kind == "self-test":
+            why = "a rack that runs has passed its self-tests; give it in the config or with 'rack run --faults'"
+            raise ConfigError([Mistake("kind", fault.kind, why)])
+        if fault.tick is not None and fault.tick <= words[System.TICK]:
+            raise ConfigError([Mistake("tick", fault.tick, f"has passed; the rack is at tick {words[System.TICK]}")])
+        if fault.kind == "hog":
+            _check_hog(fault)
+        return fault
+
+    def _await_begin(self, entry: FaultEntry, at_once: bool) -> None:
+        deadline = time.monotonic() + BEGIN_S
+        while entry.stage == Stage.WAITING:
+            if self._is_over:
+                raise Failure(f"{self._described(entry)}: the run ended before it began")
+            if at_once and time.monotonic() > deadline:
+                raise Failure(f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s")
+            time.sleep(LOOK_S)
+
+    def _told(self, entry: FaultEntry) -> str:
+        begun, until = entry[Entry.FROM], entry[Entry.UNTIL]
+        if entry.stage == Stage.WAITING:
+            return f"{self._described(entry)}: the run ended before it began"
+        if entry.stage == Stage.OVER:
+            return f"{self._described(entry)}: ticks {begun} to {until - 1}, acted {entry[Entry.COUNT]} time(s)"
+        end = "to the end of the run" if until == NEVER else f"to tick {until - 1}"
+        return f"{self._described(entry)}: from tick {begun} {end}"
+
+    def _described(self, entry: FaultEntry) -> str:
+        return describe(entry, self._segment.layout, self._joints)
+
+    @property
+    def _is_over(self) -> bool:
+        return self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
+
+
+def _check_hog(fault: FaultConfig) -> None:
+    """Refuse a hog that would not end, or could take no core. Raises `ConfigError`, `Failure`."""
+    if fault.lasts is None and fault.cycles is None:
+        raise ConfigError([Mistake("for", None, "missing; a hog must have an end: --for or --cycles")])
+    if not set_priority(1):
+        raise Failure("hog: SCHED_FIFO is refused to this user, and an ordinary process takes no core from anybody")
+    set_priority(0)
+
+
+def _numbers(fault: Mapping[str, Any]) -> list[int | None]:
+    return [fault["begins"], fault["struck_tick"], fault["until"], fault["acted"]]
