@@ -50,7 +50,8 @@ class ClockDriver(ABC):
         return {task.spec.name: task for task in self.tasks}[name]
 
     def begin(self, tick: int) -> bool:
-        """Do what is due before the releases of `tick`; False when the tick is left out."""
+        """Publish `tick` and do what is due before its releases; False when it is left out."""
+        self.words[System.TICK] = tick
         if self.controller is not None:
             self.controller.begin(tick)
         if not self.leave_out:
@@ -60,9 +61,8 @@ class ClockDriver(ABC):
         return False
 
     def release(self, tick: int, last: int) -> None:
-        """Publish `tick`, then wake every task with a release in (last, tick]."""
+        """Wake every task with a release in (last, tick]."""
         self.words[System.TICK_NS] = time.monotonic_ns()
-        self.words[System.TICK] = tick
         for task in self.tasks:
             if task.is_due(tick, last):
                 task.release(tick)
@@ -94,9 +94,9 @@ class ClockDriver(ABC):
     def is_over(self, tick: int) -> bool:
         """Say whether the run ends before `tick`."""
         words = self.words
-        if words[System.STOP_REQUEST] and not words[System.STOP_TICK]:
-            words[System.STOP_TICK] = tick
         stop = words[System.STOP_TICK]
+        if words[System.STOP_REQUEST] and (not stop or stop > tick):
+            stop = words[System.STOP_TICK] = max(tick, 1)
         if not stop and (found := self._ended(tick)) is not None:
             stop = words[System.STOP_TICK] = max(found, 1)
         return bool(stop) and tick >= stop

@@ -21,11 +21,10 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, bytes]]:
         slots = Slots(segment, spec)
         serial = head = slots.box[Box.HEAD]
         oldest = max(0, head - slots.depth)
-        while serial > oldest and slots.visible_at(serial) >= until:
+        # A message that is lost, damaged or forged has no hash to show: the one before it has.
+        while serial > oldest and not (slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)):
             serial -= 1
-        # A message that is overwritten or damaged has no hash to show.
-        whole = serial > 0 and slots.fetch(serial)
-        found[spec.name] = (serial, slots.chain if whole else bytes(8))
+        found[spec.name] = (serial, slots.chain if serial > oldest else bytes(8))
     return found
 
 

@@ -11,10 +11,9 @@ from backplane.mailbox import Reader, Reading, Writer
 class DoubleBufferWriter(Writer):
     """A writer whose message is visible as soon as it is whole."""
 
-    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish `message`, visible at once; return False when the cycle's time has passed."""
-        self._slots.publish(tick, tick if now is None else now, tick if basis is None else basis)
-        return now is None or now < tick + self.spec.delay
+    def visible_at(self, tick: int, now: int | None) -> int:
+        """Return the tick at which the message is written: it is visible at once."""
+        return tick if now is None else now
 
 
 class DoubleBufferReader(Reader):

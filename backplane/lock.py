@@ -8,10 +8,15 @@ a hang.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
+
 import posix_ipc
 
 from backplane.byte_lock import ByteLock
-from backplane.mailbox import Reader, Reading, Writer
+from backplane.double_buffer import DoubleBufferWriter
+from backplane.mailbox import Reader, Reading
+from backplane.process import GONE, STOPPED, state_of
 from backplane.segment import Segment
 from backplane.semaphores import lock_semaphore
 from backplane.words import Box
@@ -20,26 +25,46 @@ WAIT_S = 0.002
 """Bound of one wait: an access is a microsecond or two, a holder that loses its core some hundred."""
 
 
+_OWNER = int(Box.OWNER)
+
+
 class MailboxLock:
-    """Mutual exclusion on one mailbox, with a bounded wait."""
+    """Mutual exclusion on one mailbox, with a bounded wait.
+
+    `held_up` counts the waits that ran out while a dead or stopped process had the lock: that is a fault, where a
+    holder that merely lost its core is none.
+    """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = WAIT_S) -> None:
+        address = segment.map.mailboxes[name]
         self._semaphore = lock_semaphore(segment.rack, name)
-        self._owner = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.OWNER)
+        self._owner = ByteLock(segment, address + 8 * Box.OWNER)
+        self._box = segment.words[address // 8 : address // 8 + len(Box)]
+        self._pid = os.getpid()
         self._wait_s = wait_s
+        self.held_up = 0
 
     def acquire(self) -> bool:
         """Take the lock within its bound; False when its holder lives and keeps it."""
         try:
             self._semaphore.acquire(self._wait_s)
         except posix_ipc.BusyError:
-            # Free when whoever took the semaphore is dead. Of several waiters one gets it.
-            return self._owner.take()
-        # Not free when a waiter whose bound had passed came between the two steps: it is the owner then.
-        return self._owner.take()
+            self._look_at_holder()
+        # After a wait that ran out: free when whoever took the semaphore is dead: of several waiters one gets it. Else
+        # not free when such a waiter came between the two steps: it is the owner then.
+        if not self._owner.take():
+            return False
+        self._box[_OWNER] = self._pid
+        return True
+
+    def _look_at_holder(self) -> None:
+        holder = self._box[_OWNER]
+        if holder and state_of(holder) in GONE + STOPPED:
+            self.held_up += 1
 
     def release(self) -> None:
         """Give the lock back. Only its owner may."""
+        self._box[_OWNER] = 0
         self._owner.give_back()
         self._semaphore.release()
 
@@ -48,27 +73,28 @@ class MailboxLock:
         self._owner.close()
 
 
-class LockWriter(Writer):
+class LockWriter(DoubleBufferWriter):
     """A writer that publishes inside the critical section."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
-        self._lock = MailboxLock(segment, name)
+        self.lock = MailboxLock(segment, name)
 
-    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish `message`; return False when its time has passed or the lock's bound cut it off."""
-        if not self._lock.acquire():
+    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+        """Publish `message`; return False when the lock's bound cut it off."""
+        obtained = self.lock.acquire()
+        self.held_up = self.lock.held_up
+        if not obtained:
             self.bus_errors += 1
             return False
         try:
-            self._slots.publish(tick, tick if now is None else now, tick if basis is None else basis)
+            return super().publish(tick, visible_at, basis, damage)
         finally:
-            self._lock.release()
-        return now is None or now < tick + self.spec.delay
+            self.lock.release()
 
     def close(self) -> None:
         """Give the claim back."""
-        self._lock.close()
+        self.lock.close()
         super().close()
 
 
@@ -77,14 +103,18 @@ class LockReader(Reader):
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
-        self._lock = MailboxLock(segment, name)
+        self.lock = MailboxLock(segment, name)
 
     def read(self, tick: int) -> Reading:
         """Return the newest message, or BUS_ERROR with the last good one when the bound cut the wait off."""
         self.accesses += 1
-        if not self._lock.acquire():
+        obtained = self.lock.acquire()
+        if self.held_up != self.lock.held_up:
+            self.held_up = self.lock.held_up
+            self.bad_reads += 1
+        if not obtained:
             return self._cut_off()
         try:
             return self._newest()
         finally:
-            self._lock.release()
+            self.lock.release()

@@ -55,7 +55,6 @@ class LockstepDriver(ClockDriver):
         if not self._one_at_a_time:
             self.release(tick, last)
             return self._wait(lambda: all(task.is_finished(tick + 1) for task in self.tasks))
-        self.words[System.TICK] = tick
         for task in self.tasks:
             if task.is_due(tick, last):
                 task.release(tick)

@@ -8,6 +8,7 @@ under time-slice what is read depends on ticks alone, never on how fast a proces
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -15,8 +16,13 @@ from backplane.byte_lock import ByteLock
 from backplane.errors import MailboxError
 from backplane.message import Message
 from backplane.segment import Segment
-from backplane.slots import Slots
+from backplane.slots import Slots, claim, pid_of
 from backplane.words import Box
+
+NOT_YET = 1 << 62
+"""Tick of the newest message before there is any: its age is below zero, so that nobody finds it too old."""
+STEPS = 4
+"""Messages that a read tries behind a bad one: its work stays bounded."""
 
 
 class Verdict(IntEnum):
@@ -61,6 +67,10 @@ class Writer:
         self._slots = Slots(segment, spec)
         self.message = self._slots.message
         self.bus_errors = 0
+        self.held_up = 0
+        """Accesses so far for which a dead or stopped process had the lock."""
+        self.intruder = 0
+        """Process that has published in the mailbox since the last message but one of this writer; 0: none."""
         self._claim = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.CLAIM)
         if not self._claim.take():
             pid = self._slots.box[Box.WRITER_PID]
@@ -69,7 +79,9 @@ class Writer:
         box = self._slots.box
         box[Box.WRITER_PID] = os.getpid()
         box[Box.EPOCH] += 1
-        self._slots.resume(box[Box.EPOCH])
+        # One store: no reader sees half a claim.
+        box[Box.CLAIMANT] = claim(box[Box.EPOCH], os.getpid())
+        self._slots.resume(box[Box.CLAIMANT])
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`, released at `tick`; return False when it comes too late.
@@ -77,13 +89,28 @@ class Writer:
         It becomes visible at `tick` + delay. When the clock, `now`, has passed that tick, it becomes
         visible from the next boundary of the writer's period.
         """
-        visible_at = tick + self.spec.delay
-        in_time = now is None or now < visible_at
-        if not in_time:
-            every = self.spec.every
-            visible_at = (now // every + 1) * every if now is not None else visible_at
-        self._slots.publish(tick, visible_at, tick if basis is None else basis)
-        return in_time
+        written = self.publish(tick, self.visible_at(tick, now), tick if basis is None else basis)
+        return written and (now is None or now < tick + self.spec.delay)
+
+    def visible_at(self, tick: int, now: int | None) -> int:
+        """Return the tick from which a message released at `tick` and written now is visible."""
+        in_time = tick + self.spec.delay
+        if now is None or now < in_time:
+            return in_time
+        every = self.spec.every
+        return (now // every + 1) * every
+
+    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+        """Publish `message`, visible at that tick; return False when a bound cut it off.
+
+        `damage`: see `Slots.publish`.
+        """
+        self.intruder = self._slots.publish(tick, visible_at, basis, damage)
+        return True
+
+    def lose(self) -> None:
+        """Take a serial whose message is lost."""
+        self._slots.lose()
 
     @property
     def serial(self) -> int:
@@ -107,19 +134,31 @@ class Reader:
         self.message = self._good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
         self._serial = 0
+        self._signature = 0
+        self.found = 0
+        """Serial of the message that the last read found to be the newest, good or not."""
+        self.newest = NOT_YET
+        """Release tick of the last good message."""
         self.accesses = 0
         self.transfers = 0
         self.corrupt = 0
+        self.forged = 0
+        """Reads so far that found a message of a process without the claim; the last such is the `forger`."""
+        self.forger = 0
+        self.held_up = 0
+        """Reads so far for which a dead or stopped process had the lock."""
         self.bus_errors = 0
+        self.bad_reads = 0
+        """Reads so far in which anything was wrong: one number to look at."""
 
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, with its verdict."""
         self.accesses += 1
         head = self._box[0]
-        serial = self._newest_visible(head, tick)
+        self.found = serial = self._newest_visible(head, tick)
         if serial == self._serial:
             return self._readings[Verdict.OLD if serial else Verdict.NONE]
-        return self._take(serial)
+        return self._take(serial, tick)
 
     def _newest_visible(self, head: int, tick: int) -> int:
         """Walk back from the newest message to the newest that is visible, or to the one already read."""
@@ -130,17 +169,43 @@ class Reader:
             serial -= 1
         return serial
 
-    def _take(self, serial: int) -> Reading:
-        self.transfers += 1
-        if self._fetched.fetch(serial):
-            self._good.record[:] = self._fetched.record
-            self._serial = serial
+    def _take(self, serial: int, tick: int) -> Reading:
+        if self._obtain(serial):
             return self._readings[Verdict.NEW]
-        # Overwritten meanwhile: the reader came later than the slots reach back. Else: damaged.
+        self.bad_reads += 1
+        # Overwritten meanwhile: the reader came later than the slots reach back.
         if self._box[0] - serial >= self._fetched.mask:
             return self._cut_off()
-        self.corrupt += 1
+        self._blame(serial)
+        # Lost, damaged or forged: what was published before it may not have been read yet.
+        for older in range(serial - 1, max(self._serial, serial - 1 - STEPS), -1):
+            if self._fetched.visible_at(older) <= tick:
+                if self._obtain(older):
+                    return self._readings[Verdict.NEW]
+                self._blame(older)
         return self._readings[Verdict.OLD if self._serial else Verdict.NONE]
+
+    def _obtain(self, serial: int) -> bool:
+        """Take a message over as the last good one; False when it is none."""
+        self.transfers += 1
+        fetched = self._fetched
+        if not fetched.fetch(serial) or not (
+            fetched.signature == self._signature or fetched.is_lawful(self._signature)
+        ):
+            return False
+        self._good.record[:] = fetched.record
+        self._serial, self._signature, self.newest = serial, fetched.signature, fetched.tick
+        return True
+
+    def _blame(self, serial: int) -> None:
+        """Count what is wrong with the message that was fetched last. Another one in its place: it was lost."""
+        fetched = self._fetched
+        if not fetched.is_sound:
+            # An empty slot, as at first.
+            self.corrupt += fetched.serial != 0
+        elif fetched.serial == serial:
+            self.forged += 1
+            self.forger = pid_of(fetched.signature)
 
     def _cut_off(self) -> Reading:
         self.bus_errors += 1
@@ -170,7 +235,7 @@ class Reader:
         return self._newest()
 
     def _newest(self) -> Reading:
-        head = self._box[0]
+        self.found = head = self._box[0]
         if head == self._serial:
             return self._readings[Verdict.OLD if head else Verdict.NONE]
-        return self._take(head)
+        return self._take(head, NOT_YET)

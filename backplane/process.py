@@ -7,6 +7,9 @@ from pathlib import Path
 
 GONE = "ZX"
 """States of a process that has ended."""
+WAITING = "SD"
+"""States of a process that waits for something."""
+_TICKS_A_SECOND = os.sysconf("SC_CLK_TCK")
 STOPPED = "Tt"
 """States of a process that a signal, or a debugger, has stopped."""
 
@@ -20,6 +23,12 @@ def start_time(pid: int) -> int:
 def state_of(pid: int) -> str:
     """Return the kernel's letter for what a process does: R, S, D, T (stopped), Z (dead, not reaped); X: no process."""
     return (_stat(pid) or "X")[0]
+
+
+def processor_ns(pid: int) -> int:
+    """Return the processor time that a process has used so far, in ns, to about 10 ms; 0 when there is none."""
+    fields = _stat(pid)
+    return (int(fields[11]) + int(fields[12])) * (1_000_000_000 // _TICKS_A_SECOND) if fields else 0
 
 
 def _stat(pid: int) -> list[str]:

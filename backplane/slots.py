@@ -7,6 +7,7 @@ message as it was. A reader checks serial and CRC of its copy, so it never gives
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from hashlib import blake2b
 from time import monotonic_ns
 from zlib import crc32
@@ -24,6 +25,23 @@ CHAIN_FROM = Slot.SERIAL * 8
 CHAIN_AT = Slot.CHAIN * 8
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
 _STAMP, _CRC, _EPOCH, _BASIS, _SERIAL, _TICK, _VISIBLE = range(7)
+_CLAIMANT = int(Box.CLAIMANT)
+EPOCH_BITS = 32
+
+
+def claim(epoch: int, pid: int) -> int:
+    """Return how a writer signs: the epoch of its claim, and above it its process, in one number."""
+    return epoch | pid << EPOCH_BITS
+
+
+def epoch_of(signature: int) -> int:
+    """Return the epoch in a writer's signature."""
+    return signature & ((1 << EPOCH_BITS) - 1)
+
+
+def pid_of(signature: int) -> int:
+    """Return the process in a writer's signature."""
+    return signature >> EPOCH_BITS
 
 
 def message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
@@ -70,18 +88,27 @@ class Slots:
         self._chain_part = self.record[CHAIN_FROM:]
         self._chain = self.record[CHAIN_AT:SLOT_HEAD_SIZE]
 
-    def resume(self, epoch: int) -> int:
+    def resume(self, signature: int) -> int:
         """Take the writer's place behind the newest published message; return its serial."""
-        head = self.box[Box.HEAD]
+        head = whole = self.box[Box.HEAD]
+        # A serial may have been lost: the chain goes on from the newest message that has its slot.
+        while whole > max(0, head - self.depth) and not self.holds(whole):
+            whole -= 1
         self._words[_SERIAL] = head
-        self._words[_EPOCH] = epoch
-        self._chain[:] = bytes(self._slots[head & self.mask][CHAIN_AT:SLOT_HEAD_SIZE]) if head else bytes(8)
+        self._words[_EPOCH] = signature
+        chain = self._slots[whole & self.mask][CHAIN_AT:SLOT_HEAD_SIZE]
+        self._chain[:] = bytes(chain) if whole and self.holds(whole) else bytes(8)
         return head
 
-    def publish(self, tick: int, visible_at: int, basis: int) -> None:
-        """Copy the local message into the next slot, then publish it."""
-        words = self._words
+    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
+        """Copy the local message into the next slot, then publish it; return the process of an intruder, 0: none.
+
+        An intruder has published since this writer's last message; its message is overwritten. `damage` are bits of
+        the message that are flipped in the slot.
+        """
+        words, box = self._words, self.box
         serial = words[_SERIAL] + 1
+        intruder = 0 if box[0] == serial - 1 else self._signature(serial) >> EPOCH_BITS
         words[_BASIS] = basis
         words[_SERIAL] = serial
         words[_TICK] = tick
@@ -91,7 +118,36 @@ class Slots:
         words[_CRC] = crc32(self._crc_part)
         words[_STAMP] = monotonic_ns()
         self._slots[serial & self.mask][:] = self.record
-        self.box[0] = serial
+        if damage:
+            self._flip(serial, damage)
+        box[0] = serial
+        return intruder
+
+    def lose(self) -> None:
+        """Take a serial whose message never gets into its slot."""
+        self._words[_SERIAL] += 1
+        self.box[0] = self._words[_SERIAL]
+
+    def _flip(self, serial: int, bits: Sequence[int]) -> None:
+        message = self._slots[serial & self.mask][SLOT_HEAD_SIZE:]
+        for bit in bits:
+            message[bit >> 3] ^= 1 << (bit & 7)
+
+    def _signature(self, serial: int) -> int:
+        return self._slot_words[serial & self.mask][_EPOCH]
+
+    def holds(self, serial: int) -> bool:
+        """Say whether that serial's slot holds its message, and not an older or a newer one."""
+        return self._slot_words[serial & self.mask][_SERIAL] == serial
+
+    def head_words(self, serial: int) -> memoryview:
+        """Return the head of that serial's slot: see `words.Slot`."""
+        return self._slot_words[serial & self.mask]
+
+    def is_whole(self, serial: int) -> bool:
+        """Say whether the message in that serial's slot passes its CRC, without copying it."""
+        slot = self._slots[serial & self.mask]
+        return self._slot_words[serial & self.mask][_CRC] == crc32(slot[CRC_FROM:])
 
     def visible_at(self, serial: int) -> int:
         """Return the tick from which the message in that serial's slot may be read."""
@@ -103,14 +159,32 @@ class Slots:
         return self._words[_SERIAL] == serial and self._words[_CRC] == crc32(self._crc_part)
 
     @property
+    def is_sound(self) -> bool:
+        """Whether the message in the local record passes its CRC."""
+        return self._words[_CRC] == crc32(self._crc_part)
+
+    @property
     def serial(self) -> int:
         """Serial of the message in the local record; 0: none."""
         return self._words[_SERIAL]
 
     @property
+    def signature(self) -> int:
+        """Who wrote that message: see `claim`."""
+        return self._words[_EPOCH]
+
+    @property
     def epoch(self) -> int:
         """Writer's epoch of that message."""
-        return self._words[_EPOCH]
+        return epoch_of(self._words[_EPOCH])
+
+    def is_lawful(self, known: int) -> bool:
+        """Say whether that message is of the writer that holds the claim, or of an earlier one.
+
+        `known` is the signature of the last lawful message, 0 before the first: epochs do not go back.
+        """
+        signature, holder = self._words[_EPOCH], self.box[_CLAIMANT]
+        return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(holder)
 
     @property
     def tick(self) -> int:

@@ -112,7 +112,7 @@ class NextCycle:
         stopped = state_of(self._words[System.CLOCK_PID]) in STOPPED + GONE
         if not self._clock_is_silent and (stopped or silent_s > CLOCK_SILENT_S):
             self._clock_is_silent = True
-            alarms.ring(now, Alarm.CLOCK_STOPPED, value=now - newest, since=newest + 1)
+            alarms.ring(now, Alarm.CLOCK_STOPPED, value=now - newest, since=newest)
 
     def _spin(self) -> bool:
         block, last = self._block, self._last

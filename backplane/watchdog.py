@@ -1,21 +1,21 @@
 """The watchdog of the system controller: finds tasks that do not answer their releases.
 
 A release without an answer is a miss, and no more: on a busy machine any process may lose its core for a while. A
-task is called lost only when something proves it: a signal has stopped its process, or it has been silent for so long
-that nothing else explains it.
+task is called lost only when something proves it: a signal has stopped its process, or it waits for something else than
+its release, or it has used so much processor time that it will not end. One that gets no processor time is starved.
 """
 
 from __future__ import annotations
 
 from backplane.alarms import Alarm, AlarmWriter
-from backplane.process import STOPPED, state_of
+from backplane.process import STOPPED, WAITING, processor_ns, state_of
 from backplane.released_task import ReleasedTask
 from backplane.words import Block
 
 BEATS = 4
 """Releases without an answer after which a task is looked at: three gave a false trip in 24,000 at 400 Hz."""
 LEAST_NS = 1_000_000_000
-"""Least time after which a task that could run is called hanging: hosts stop a core for tens of milliseconds."""
+"""Least processor time, or time of waiting, after which a silent task is called hanging."""
 
 
 class Watchdog:
@@ -25,6 +25,7 @@ class Watchdog:
         self._alarms = alarms
         self._period_ns = period_ns
         self.losses = 0
+        self._used_ns: dict[int, int] = {}  # task -> processor time when it was looked at first
 
     def look(self, task: ReleasedTask, tick: int) -> None:
         """Tell of a task whose newest release but one is unanswered at `tick`, and find out whether it hangs."""
@@ -34,6 +35,8 @@ class Watchdog:
             self._alarms.ring(tick, late, task.index, missing, task.block[Block.DONE])
         if missing < BEATS:
             return
+        if missing == BEATS:
+            self._used_ns[task.index] = processor_ns(task.block[Block.PID])
         if self._hangs(task):
             self.losses += 1
             task.lose(tick)
@@ -42,7 +45,11 @@ class Watchdog:
             self._alarms.ring(tick, Alarm.STARVED, task.index, missing, tick - missing * spec.every)
 
     def _hangs(self, task: ReleasedTask) -> bool:
-        spec = task.spec
-        silent_ns = task.unanswered * spec.every * self._period_ns
-        slices_ns = BEATS * spec.every * spec.within_cycles * self._period_ns
-        return silent_ns > max(LEAST_NS, slices_ns) or state_of(task.block[Block.PID]) in STOPPED
+        spec, pid = task.spec, task.block[Block.PID]
+        state = state_of(pid)
+        if state in STOPPED:
+            return True
+        bound_ns = max(LEAST_NS, BEATS * spec.every * spec.within_cycles * self._period_ns)
+        if task.unanswered * spec.every * self._period_ns <= bound_ns:
+            return False
+        return state in WAITING or processor_ns(pid) - self._used_ns.get(task.index, 0) > bound_ns

@@ -109,7 +109,8 @@ class Box(IntEnum):
     EPOCH = 1  # counts the writers that have claimed the mailbox
     WRITER_PID = 2
     CLAIM = 3  # no number: the writer holds the kernel's lock on this address
-    OWNER = 4  # likewise whoever is in the critical section, protocol lock
+    OWNER = 4  # likewise whoever is in the critical section, protocol lock; the number is its process, 0: nobody
+    CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
 
 
 class Slot(IntEnum):

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from backplane import semaphores
+from backplane.lines import UtilityLines
 from backplane.segment import Segment
 from backplane.words import Block, Run, System, TaskState
 from boards.board import enter, run_clock_board, run_task_board
@@ -123,6 +124,7 @@ class Crate:
             if block[Block.STATE] != TaskState.FAILED:
                 block[Block.STATE] = TaskState.ABSENT
             block[Block.LOST] = block[Block.LOST] or tick + 1
+            UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
             words[System.LOSSES] += 1
             # In lockstep the clock waits to know.
             semaphores.clock_semaphore(self._segment.rack).release()

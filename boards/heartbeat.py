@@ -1,6 +1,6 @@
 """Signs of life, as the host sees them: a task that has finished nothing for much longer than it may hangs.
 
-In real time the clock's watchdog finds out sooner; this finds a clock that has no tick, and what hangs in lockstep.
+In real time the clock's watchdog looks after the tasks; here it is the clock alone. In lockstep, all of them.
 """
 
 from __future__ import annotations
@@ -24,16 +24,12 @@ class Heartbeat:
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
-        self._blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
-        self._bounds = {t.name: self._bound_of(t.every * (t.within_cycles + BEATS)) for t in segment.layout.tasks}
-        self._bounds[CLOCK] = self._bound_of(BEATS)
+        watched = segment.layout.tasks if self._words[System.LOCKSTEP] else ()
+        self._blocks = {task.name: segment.block(task.name) for task in watched}
+        bound_s = max(LEAST_S, BEATS * self._words[System.PERIOD_NS] * 1e-9)
+        self._bounds = {**dict.fromkeys(self._blocks, LOCKSTEP_S), CLOCK: LOCKSTEP_S if watched else bound_s}
         self._seen = {name: (-1, time.monotonic()) for name in self._bounds}
         self._reported: set[str] = set()
-
-    def _bound_of(self, ticks: int) -> float:
-        if self._words[System.LOCKSTEP]:
-            return LOCKSTEP_S
-        return max(LEAST_S, ticks * self._words[System.PERIOD_NS] * 1e-9)
 
     def hanging(self) -> list[str]:
         """Return the tasks that have come to hang since the last call; "clock" is the system clock."""

@@ -4,24 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from backplane.alarms import AlarmWriter
-from backplane.fault_table import FaultEntry
+from backplane.alarms import Alarm, AlarmWriter
+from backplane.episodes import Episodes
+from backplane.fault_table import Entry, FaultEntry
+from backplane.mailbox import Writer
 from backplane.message import Message
-from backplane.protocols import open_reader, open_writer
+from backplane.protocols import open_writer
 from backplane.segment import Segment
+from backplane.silence_watch import Witness
+from backplane.watched_reader import WatchedReader
+from boards.faults.writers import FaultyWriter
 from levels.level import Ports, Reading, Verdict
 
 
 class InputPorts:
-    """The mailboxes that a task reads; `values` holds what the last `read` gave, by port."""
+    """The mailboxes that a task reads, watched; `values` holds what the last `read` gave, by port."""
 
     def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter) -> None:
-        self.readers = {port: open_reader(segment, name) for port, name in mailboxes.items()}
+        self._witness = Witness()
+        watched = {port: WatchedReader(segment, name, alarms, self._witness) for port, name in mailboxes.items()}
+        self.readers = {port: found.reader for port, found in watched.items()}
         self.values = Ports(**{port: Reading(r.message, Verdict.NONE) for port, r in self.readers.items()})
-        self._slots = [(self.values.__dict__, port, reader.read) for port, reader in self.readers.items()]
+        self._slots = [(self.values.__dict__, port, found.read) for port, found in watched.items()]
+        self._counted = self._traffic
 
     def read(self, tick: int) -> None:
         """Sample every mailbox as of `tick`: commands, statuses, plan, world model."""
+        self._witness.reads(tick)
         for values, port, read in self._slots:
             values[port] = read(tick)
 
@@ -40,6 +49,16 @@ class InputPorts:
         reader = self.readers.get(port)
         return reader.basis if reader is not None and reader.serial else tick
 
+    def take_traffic(self) -> tuple[int, int]:
+        """Return the accesses, and the bytes read, since the last call."""
+        before, self._counted = self._counted, self._traffic
+        return self._counted[0] - before[0], self._counted[1] - before[1]
+
+    @property
+    def _traffic(self) -> tuple[int, int]:
+        readers = self.readers.values()
+        return sum(r.accesses for r in readers), sum(r.transfers * r.spec.size for r in readers)
+
 
 class OutputPorts:
     """The mailboxes that a task writes; `messages` holds the outgoing message of each port."""
@@ -47,9 +66,25 @@ class OutputPorts:
     def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter) -> None:
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
         self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
+        self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
+        self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
+        self._faulty: dict[str, FaultyWriter] = {}
+        self._held_up = dict.fromkeys(self.writers, 0)
+        self._counted = self._traffic
+        self._route()
 
     def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Write with these faults from now on."""
+        """Write with these faults, by kind, from now on; what an earlier one holds back comes with the next write."""
+        for port, writer in self.writers.items():
+            index = self._indices[writer.spec.name]
+            chosen = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
+            if chosen or port in self._faulty:
+                self._faulty.setdefault(port, FaultyWriter(writer, index)).apply(chosen)
+        self._route()
+
+    def _route(self) -> None:
+        """Lead each port to its writer, or to the faulty one around it."""
+        self._lines = [(port, w, getattr(self._faulty.get(port), "write", w.write)) for port, w in self.writers.items()]
 
     def message(self, port: str) -> Message | None:
         """Return the outgoing message of a port, if there is such a port."""
@@ -68,6 +103,44 @@ class OutputPorts:
         follows, a status that of the status below it. So the response of the whole system is measured.
         """
         in_time = True
-        for port, writer in self.writers.items():
-            in_time = writer.write(tick, now, inputs.basis(port, tick)) and in_time
+        for port, writer, write in self._lines:
+            in_time = write(tick, now, inputs.basis(port, tick)) and in_time
+            if writer.intruder or writer.held_up:
+                self._tell(port, writer, tick)
+        if self._faulty:
+            self._leave_faults()
         return in_time
+
+    def flush(self, tick: int, now: int) -> None:
+        """Publish what a fault has held back and what is due: for a cycle in which nothing is written."""
+        if self._faulty:
+            for faulty in self._faulty.values():
+                faulty.flush(tick, now)
+            self._leave_faults()
+
+    def _leave_faults(self) -> None:
+        """Write plainly again where no fault is left, and nothing held back."""
+        over = [port for port, faulty in self._faulty.items() if faulty.is_over]
+        for port in over:
+            del self._faulty[port]
+        if over:
+            self._route()
+
+    def _tell(self, port: str, writer: Writer, tick: int) -> None:
+        """Ring for what a writer has found in its own mailbox."""
+        if writer.intruder:
+            self._episodes[port].find(Alarm.MASQUERADE, writer.serial, tick, writer.intruder)
+            writer.intruder = 0
+        if writer.held_up != self._held_up[port]:
+            self._held_up[port] = writer.held_up
+            self._episodes[port].find(Alarm.LOCKED, writer.serial, tick)
+
+    def take_traffic(self) -> tuple[int, int]:
+        """Return the messages, and the bytes, written since the last call."""
+        before, self._counted = self._counted, self._traffic
+        return self._counted[0] - before[0], self._counted[1] - before[1]
+
+    @property
+    def _traffic(self) -> tuple[int, int]:
+        writers = self.writers.values()
+        return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)

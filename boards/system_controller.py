@@ -62,7 +62,8 @@ class SystemController:
         elif task.is_given_up and not self._words[_EMERGENCY]:
             self._words[_EMERGENCY] = 1
             # The arm comes to rest before the run ends.
-            self._words[System.STOP_TICK] = self._words[System.STOP_TICK] or tick + self._wiring.linger
+            ends = tick + self._wiring.linger
+            self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
 
     def _ask_of_the_arm(self, lost: list[ReleasedTask], tick: int) -> None:
         asked = [(self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost]

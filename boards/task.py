@@ -29,7 +29,9 @@ _MISS, _SKIP, _BUS_ERROR, _DAMAGED = (int(f) for f in (Flag.MISSED, Flag.SKIPPED
 class Task(ABC):
     """One task on its board, behind a level's executor or planner."""
 
-    def __init__(self, segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int | None = None) -> None:
+    def __init__(
+        self, segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int | None = None
+    ) -> None:
         self.spec = spec = segment.layout.task(wiring.task)
         self.block = segment.block(wiring.task)
         self.words = segment.words

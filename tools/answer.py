@@ -15,6 +15,10 @@ Settings = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")
 ]
 
+Faults = Annotated[
+    str | None, typer.Option(metavar="FILE", help="script of faults by name, or a path; behind the config's own")
+]
+
 
 class Failure(Exception):
     """A command that did not work, for a reason that is one line for the user; `status` is the exit status."""

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from tools.answer import ConfigName, Json, Settings, print_json
+from tools.answer import ConfigName, Faults, Json, Settings, print_json
 
 
-def check(config: ConfigName, settings: Settings = [], as_json: Json = False) -> None:  # noqa: B006  typer copies it
+def check(
+    config: ConfigName,
+    settings: Settings = [],  # noqa: B006  typer copies it
+    faults: Faults = None,
+    as_json: Json = False,
+) -> None:
     """Validate a config and show what it makes.
 
     Slots, cores, rates, mailboxes with their bus addresses, and the timing that follows; or every mistake, one a line.
@@ -13,6 +18,6 @@ def check(config: ConfigName, settings: Settings = [], as_json: Json = False) ->
     from boards.config import load, shared_out, wire
     from tools.inventory import Inventory
 
-    found = load(config, settings)
+    found = load(config, settings, faults)
     inventory = Inventory.of(found, wire(found), shared_out(found))
     print_json(inventory.document()) if as_json else print(inventory.text())

@@ -15,6 +15,8 @@ from tools.snapshot import Snapshot
 
 QUIET = ("launch", "start", "end", "miss")
 """Events that the view itself shows: the table counts the misses."""
+BRIEF_TICKS = 10
+"""Ticks for which brakes that closed by themselves, after missed cycles, are counted and not told."""
 STYLES = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
 OTHERS = "yellow"
 """Colour of events that are no part of a fault's course."""
@@ -46,7 +48,7 @@ class LiveDisplay:
 
     def tell(self, event: Event) -> None:
         """Print the event above the table."""
-        if event.kind not in QUIET:
+        if _is_told(event):
             style = STYLES.get(event.kind, OTHERS)
             self._live.console.print(_line(event), style=style, highlight=False, markup=False)
 
@@ -68,7 +70,7 @@ class PlainDisplay:
 
     def tell(self, event: Event) -> None:
         """Print the event."""
-        if event.kind not in QUIET:
+        if _is_told(event):
             print(_line(event), flush=True)
 
 
@@ -82,6 +84,12 @@ class SilentDisplay:
 
     def tell(self, event: Event) -> None:
         """Show nothing; the event is in the log."""
+
+
+def _is_told(event: Event) -> bool:
+    """Say whether an event is worth a line of its own."""
+    is_brief = event.code == "brakes_closed" and 0 < event.value < BRIEF_TICKS
+    return event.kind not in QUIET and not is_brief
 
 
 def _line(event: Event) -> str:

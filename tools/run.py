@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import ConfigName, Failure, Json, Settings, print_json
+from tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
 
 Lockstep = Annotated[bool, typer.Option("--lockstep", help="a tick begins when every task due has finished: exact")]
 Seconds = Annotated[
@@ -16,9 +16,6 @@ Seconds = Annotated[
 ]
 Speed = Annotated[
     float | None, typer.Option(metavar="X", help="run this many times faster than real time, or slower: 0.5")
-]
-Faults = Annotated[
-    str | None, typer.Option(metavar="FILE", help="script of faults by name, or a path; behind the config's own")
 ]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]

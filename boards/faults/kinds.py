@@ -182,7 +182,7 @@ KINDS: tuple[Kind, ...] = (
         "ticks are moved",
         (Alarm.CLOCK_LATE,),
         "2 ticks",
-        (Parameter("late", "ticks", "largest lateness", 0.8, 0.5, 0.95),),
+        (Parameter("late", "ticks", "largest lateness; the least is 0.6", 0.9, 0.65, 0.95),),
         realtime=True,
     ),
     Kind("sensor-nan", "arm", "a position is no number", (Alarm.SENSOR_RANGE,), "1 cycle", (_joint(),)),

@@ -18,6 +18,8 @@ from backplane.words import Block
 from boards.faults.kinds import KINDS
 from boards.faults.masquerade import masquerade
 
+LEAST_LATE = 0.6
+"""Least lateness of a tick that is moved, in ticks: a board calls a tick late from half a tick on."""
 Strike = Callable[[FaultEntry, int], None]
 
 
@@ -120,7 +122,7 @@ class Strikes:
 
     def _delay(self, entry: FaultEntry, tick: int) -> None:
         self._acts(entry, tick)
-        part = random.Random(entry[Entry.SEED] + tick).uniform(0.0, entry.parameters[0])
+        part = random.Random(entry[Entry.SEED] + tick).uniform(LEAST_LATE, entry.parameters[0])
         until = self._clock.time_of(tick) + int(part * self._clock.period_ns)
         # Ticks are moved by less than a tick: the grid itself stays.
         time.sleep(max(0, until - time.monotonic_ns()) * 1e-9)

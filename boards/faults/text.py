@@ -68,7 +68,7 @@ def _text(entry: FaultEntry, layout: Layout, joints: Sequence[str], target: str)
     about = [subject_of(entry, layout, joints)]
     for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
         if parameter.name != "joint":
-            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"
             about.append(f"{parameter.name} {value:g}{unit}")
     told = ", ".join(text for text in about if text)
     return f"{kind.name}{target}{f' ({told})' if told else ''}"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from levels.arm.arm import Arm, Sensed
+from levels.cell import Cell
 from levels.level import Fault, Finding
 
 Array = NDArray[np.float64]
@@ -20,8 +21,8 @@ KINDS = SENSOR_KINDS + MOTOR_KINDS + COMMAND_KINDS
 
 APART = np.array([1e-4, 1e-2])
 """Distance from the truth, rad and rad/s, from which on a sensor that is stuck is counted as wrong."""
-SLIGHT = 0.05
-"""Part of a joint's torque limit that a motor must lack to count: dry friction hides less."""
+SLIGHT = 0.02
+"""Part of its torque limit that a motor must lack to count, beside what dry friction may hide."""
 
 
 class _Active(NamedTuple):
@@ -52,9 +53,12 @@ class FaultyLink:
     `acted` collects the places of the faults that act, as `Executor.acted` wants them.
     """
 
-    def __init__(self, arm: Arm, limits: Array, every: int, acted: list[int]) -> None:
-        """Lie between the servo level, which cycles `every` ticks, and `arm` with torque limits `limits`, N m."""
-        self._arm, self._limits, self._every, self._acted = arm, limits, every, acted
+    def __init__(self, arm: Arm, cell: Cell, every: int, acted: list[int]) -> None:
+        """Lie between the servo level, which cycles `every` ticks, and the `arm` of a cell."""
+        self._arm, self._every, self._acted = arm, every, acted
+        self._limits = limits = cell.bounds.torque
+        # Friction that helped may now resist: it hides twice its value.
+        self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
         self._sensors: list[_Active] = []
         self._motors: list[_Active] = []
         self._commands: list[_Active] = []
@@ -128,7 +132,7 @@ class FaultyLink:
             asked = np.abs(self._arm.torque)
             for active in self._motors:
                 lacking = asked - active.part * self._limits
-                if (lacking[active.joints] > SLIGHT * self._limits[active.joints]).any():
+                if (lacking > self._hidden)[active.joints].any():
                     self._acted.append(active.place)
         return found
 

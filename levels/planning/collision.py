@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 TOUCH_DEPTH_M = 0.003
 """How deep a contact that is meant may go: simulated bodies are soft and sensed poses are not exact."""
+HELD_DEPTH_M = 0.01
+"""The same between what is held and its supports: it slides by some millimetres in the gripper when it is moved fast,
+and its support pushes it back as it is put down."""
 
 NO_MATTER = -np.inf
 
@@ -171,9 +174,9 @@ class CollisionChecker:
             self._require(held, gripper, NO_MATTER)
             self._require(held, held, NO_MATTER)
         if self._touched is not None:
-            touched = self._row_geoms[self._touched]
-            self._require(touched, gripper, NO_MATTER if self._touched == self.held else -TOUCH_DEPTH_M)
-            self._require(touched, supports, -TOUCH_DEPTH_M)
+            touched, is_held = self._row_geoms[self._touched], self._touched == self.held
+            self._require(touched, gripper, NO_MATTER if is_held else -TOUCH_DEPTH_M)
+            self._require(touched, supports, -HELD_DEPTH_M if is_held else -TOUCH_DEPTH_M)
             self._require(gripper, supports, 0.0)
 
     def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:

@@ -75,7 +75,8 @@ class PathMotion:
         near = np.flatnonzero((away <= before) & (away <= behind) & (away <= away.min() + NEAREST_STEP_RAD))
         last = max(len(points) - 1, 1)
         nearest = near[np.argmin(np.abs(near / last - progress))]
-        return self._rest(self.path.length * nearest / last, position)
+        # Rounding must not put it beyond the end, where no trajectory begins.
+        return self._rest(min(self.path.length * nearest / last, self.path.length), position)
 
     def follow(self, trajectory: Trajectory) -> None:
         """Set out along `trajectory`, which begins at rest where the motion rests."""

@@ -16,8 +16,12 @@ NOISE = 0.005
 """Part of a torque limit that the equation of motion leaves unexplained; ten times what faultless runs show."""
 LACKING = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
-SURE_CYCLES = 2
-"""Cycles in a row that make a fault of it."""
+SURE_CYCLES = 4
+"""Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
+FOLLOWS = 0.3
+"""Part of a rise in torque that a sound motor gives at least."""
+TOO_FAST = 0.99
+"""Part of a velocity limit; a joint that may come to it while motors lack torque leaves no time to be sure."""
 TURNING = 2.0 * FRICTION_SPEED
 """Velocity, rad/s, around which dry friction may be anything up to its full value."""
 
@@ -26,19 +30,21 @@ class ActuatorMonitor:
     """Holds the torques that a motion took against the torques that were given for it.
 
     What is left over is explained by motors that gave less than they were told, or it is not: then something outside
-    pushes. A motor can only lack torque, never more than it was told, and all that is left over must lie in motors.
+    pushes. A load that pulls looks like that for a cycle or two; but with a load a motor that is told more gives more.
     An arm that strays from its set points by more than `following`, rad, has a motor too few as well.
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
         self._limits, self._dry = cell.bounds.torque, np.array(cell.model.dof_frictionloss[cell.dof])
         self._following, self._period_s = following, period_s
+        self._fastest = TOO_FAST * cell.bounds.velocity
         self._noise = NOISE * self._limits
         joints = len(self._dry)
         self._inertia, self._bias, self._velocity = np.zeros((joints, joints)), np.zeros(joints), np.zeros(joints)
         self._torque = np.zeros(joints)
         self._begun = False
-        self._cycles = 0
+        self._cycles, self._joint = 0, -1
+        self._told = self._gave = self._most = 0.0
 
     def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
         """Take the arm's state, rad/s, N m, at the beginning of a cycle, and the torques that it was given."""
@@ -64,7 +70,7 @@ class ActuatorMonitor:
         if (np.abs(left) <= self._noise).all():
             self._cycles = 0
             return None
-        return self._lacking(left)
+        return self._lacking(left, velocity)
 
     def _left_over(self, velocity: Array, terms: Terms) -> Array:
         """Return the torques, N m, that neither the motion nor any dry friction took."""
@@ -75,13 +81,30 @@ class ActuatorMonitor:
         most = self._dry * np.tanh((faster + TURNING) / FRICTION_SPEED)
         return np.asarray(left - np.minimum(np.maximum(left, least), most))
 
-    def _lacking(self, left: Array) -> Finding | None:
-        """Count cycles in which motors that lack torque explain all that is left over."""
+    def _lacking(self, left: Array, velocity: Array) -> Finding | None:
+        """Follow cycles in which motors that lack torque explain all that is left over, until it is sure."""
+        told = np.abs(self._torque)
         lacks = left * np.sign(self._torque)
-        explained = (lacks >= -self._noise) & (lacks <= np.abs(self._torque) + self._noise)
+        explained = (lacks >= -self._noise) & (lacks <= told + self._noise)
         share = lacks / self._limits
-        joint = int(share.argmax())
-        self._cycles = self._cycles + 1 if explained.all() and share[joint] > LACKING else 0
-        if self._cycles < SURE_CYCLES:
+        joint = self._joint if self._cycles and share[self._joint] > LACKING else int(share.argmax())
+        if not explained.all() or share[joint] <= LACKING:
+            self._cycles = 0
             return None
-        return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
+        if self._cycles == 0 or joint != self._joint:
+            self._joint, self._cycles = joint, 0
+            self._told, self._gave, self._most = told[joint], told[joint] - lacks[joint], 0.0
+        self._cycles += 1
+        self._most = max(self._most, abs(told[joint] - lacks[joint]))
+        ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
+        if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
+            return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
+        return None
+
+    def _sure(self, joint: int, told: float, lacks: float) -> bool:
+        """Say whether the motor gives nothing, or no more though it is told more."""
+        if self._cycles < SURE_CYCLES:
+            return False
+        more, rise = told - self._told, told - lacks - self._gave
+        certain = 2.0 * self._noise[joint]
+        return bool(self._most <= certain or (more > certain and rise < FOLLOWS * more))

@@ -49,7 +49,7 @@ class ServoExecutor(Executor):
         params, every = read_params(ServoParams, context.params), context.every
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self.arm: Arm = SimulatedArm(cell, context.scene, context.clock_ns, every)
-        self._faulty = FaultyLink(self.arm, cell.bounds.torque, every, self.acted)
+        self._faulty = FaultyLink(self.arm, cell, every, self.acted)
         self._link: Link = self.arm
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._loop = ComputedTorque(cell, params)

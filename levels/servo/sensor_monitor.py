@@ -24,6 +24,8 @@ UNDER_WAY = 0.002
 """Velocity of the set point, rad/s, from which on a joint is under way."""
 STUCK_RAD = 0.01
 """How far a joint may have come until it is noticed that its sensor does not tell."""
+BRAKE_TAIL_S2 = 1e-3
+"""What a joint needs beyond v^2 / 2 a until the brake has stopped it, for every rad/s2 of its braking."""
 SILENT_CYCLES = 2
 """Cycles without a new sample after which the sensors are silent."""
 
@@ -161,6 +163,7 @@ class SensorMonitor:
         # Until the brakes close the last torque still acts.
         acting = 2.0 * self._braking * passed_s * self._every * self._tick_s
         self.position += np.copysign(way, self.velocity)
+        np.maximum(self.doubt, BRAKE_TAIL_S2 * self._braking, out=self.doubt, where=joints)
         self.doubt += way + acting * joints * (speed > 0.0)
         slower = np.copysign(np.maximum(speed - self._braking * time_s, 0.0), self.velocity)
         np.copyto(self.velocity, slower, where=joints)

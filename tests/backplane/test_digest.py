@@ -78,8 +78,14 @@ def test_the_chain_holds_what_is_overwritten(bus: Segment) -> None:
     assert found[NAME][1] != found[OTHER][1]
 
 
-@pytest.mark.parametrize("until", [3, 5000])
-def test_where_no_whole_message_is_left_there_is_no_chain(bus: Segment, until: int) -> None:
+def test_where_no_message_is_left_there_is_no_chain(bus: Segment) -> None:
     write(bus, NAME, list(range(500)))
+    assert chains(bus, 3)[NAME][1] == bytes(8)
+
+
+def test_a_damaged_message_has_no_hash_and_the_one_before_it_has(bus: Segment) -> None:
+    write(bus, NAME, list(range(500)))
+    before = chains(bus, 2 * 499)[NAME]
     bus.bytes[message_address(bus, 500)] ^= 1
-    assert chains(bus, until)[NAME][1] == bytes(8)
+    assert chains(bus, 5000)[NAME] == before == (499, before[1])
+    assert before[1] != bytes(8)

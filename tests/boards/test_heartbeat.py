@@ -10,7 +10,7 @@ from backplane.address_map import CLOCK
 from backplane.segment import Segment, unlink
 from backplane.words import Block, Run, System
 from boards import heartbeat
-from boards.heartbeat import Heartbeat
+from boards.heartbeat import LOCKSTEP_S, Heartbeat
 from tests.backplane.bus import layout, task
 
 PERIOD_NS = 2_500_000
@@ -34,6 +34,7 @@ def bus(rack_name: str) -> Iterator[Segment]:
     segment = Segment.create(layout(rack_name, (), [task(FAST), slow]), "")
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.STATE] = Run.RUNNING
+    segment.words[System.LOCKSTEP] = 1
     yield segment
     unlink(rack_name)
     segment.close()
@@ -67,19 +68,31 @@ def test_who_goes_on_does_not_hang(bus: Segment, clock: Clock) -> None:
 def test_a_task_that_finishes_nothing_hangs_once(bus: Segment, clock: Clock) -> None:
     beat, told = Heartbeat(bus), []
     for _ in range(10):
-        run_on(bus, clock, 0.25, FAST)
+        run_on(bus, clock, LOCKSTEP_S / 8, FAST)
         told += beat.hanging()
     assert told == [FAST]
 
 
-def test_a_slow_task_has_its_cycles_and_those_of_its_plan(bus: Segment, clock: Clock) -> None:
+def test_a_task_that_went_on_and_hangs_again_is_told_again(bus: Segment, clock: Clock) -> None:
+    beat, told = Heartbeat(bus), []
+    for hanging in ((FAST,), (), (FAST,)):
+        run_on(bus, clock, 2 * LOCKSTEP_S, *hanging)
+        told += beat.hanging()
+    assert told == [FAST, FAST]
+
+
+def test_a_lost_task_is_known_to_be(bus: Segment, clock: Clock) -> None:
     beat = Heartbeat(bus)
-    # Four beats and two cycles for a plan, of a second each.
-    for _ in range(6):
-        run_on(bus, clock, 1.0, SLOW)
-        assert beat.hanging() == []
-    run_on(bus, clock, 1.0, SLOW)
-    assert beat.hanging() == [SLOW]
+    bus.block(FAST)[Block.LOST] = 1
+    run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
+    assert beat.hanging() == []
+
+
+def test_in_real_time_the_tasks_are_the_clocks_to_watch(bus: Segment, clock: Clock) -> None:
+    bus.words[System.LOCKSTEP] = 0
+    beat = Heartbeat(bus)
+    run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
+    assert beat.hanging() == []
 
 
 def test_who_has_nothing_to_do_does_not_hang(bus: Segment, clock: Clock) -> None:
@@ -93,6 +106,7 @@ def test_who_has_nothing_to_do_does_not_hang(bus: Segment, clock: Clock) -> None
 
 
 def test_a_clock_that_gives_out_no_tick_hangs(bus: Segment, clock: Clock) -> None:
+    bus.words[System.LOCKSTEP] = 0
     beat = Heartbeat(bus)
     run_on(bus, clock, 0.5)
     assert beat.hanging() == []
@@ -110,7 +124,7 @@ def test_nobody_hangs_before_and_after_the_run(bus: Segment, clock: Clock, state
 
 
 def test_bounds_stretch_with_the_wall_clock(bus: Segment, clock: Clock) -> None:
-    bus.words[System.PERIOD_NS] = 1000 * PERIOD_NS
+    bus.words[System.PERIOD_NS], bus.words[System.LOCKSTEP] = 1000 * PERIOD_NS, 0
     beat = Heartbeat(bus)
     assert beat.hanging() == []
     clock.now_s += 9.0

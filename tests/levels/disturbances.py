@@ -1,4 +1,4 @@
-"""What faulty writers make of their messages: see `Disturbance` in `tests.levels.lockstep`."""
+"""What faulty writers make of their messages: see `tests.levels.box.Disturbance`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tests.levels.lockstep import Disturbance
+from tests.levels.box import Disturbance
 
 Shown = Sequence[tuple[int, bytes | None]]
 

@@ -7,7 +7,6 @@ Tasks can be lost and come back, mailboxes can be disturbed, as in a rack whose 
 
 from __future__ import annotations
 
-from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,12 +17,9 @@ from levels.cell import build_cell, sizes
 from levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
+from tests.levels.box import Box, Disturbance
 
 CLOCK_NS = 2_500_000
-SILENT_CYCLES = 4
-"""Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the one it waits."""
-Disturbance = Callable[[int, bytes], "Sequence[tuple[int, bytes | None]]"]
-"""What a faulty writer makes of a message, visible at a tick: what becomes visible, and when; None: a damaged one."""
 
 
 @dataclass(frozen=True)
@@ -38,55 +34,6 @@ class BoardSpec:
     above: str = ""
     below: str = ""
     params: Mapping[str, Any] = field(default_factory=dict)
-
-
-class Box:
-    """A mailbox under time-slice: messages wait until they are visible.
-
-    `every` is the cycle of a writer that writes in every one of them; None: planners and tests do not. `lost`: the
-    writer is known to be dead or to hang.
-    """
-
-    def __init__(self, kind: MessageType, sizes_: Mapping[str, int], every: int | None = None) -> None:
-        self.kind, self.dtype = kind, kind.dtype(sizes_)
-        self.lost = False
-        self.disturbance: Disturbance | None = None
-        self._every = every
-        self._waiting: list[tuple[int, bytes | None]] = []
-        self._now: bytes | None = bytes(self.dtype.itemsize)
-        self._good = bytes(self.dtype.itemsize)
-        self._serial = 0
-        self._good_since = 0
-
-    def publish(self, message: Message, visible_at: int) -> None:
-        """Let `message` be seen from tick `visible_at` on, if nothing disturbs that."""
-        data = bytes(message.raw)
-        for one in ((visible_at, data),) if self.disturbance is None else self.disturbance(visible_at, data):
-            insort(self._waiting, one, key=lambda waiting: waiting[0])
-
-    def withdraw(self, tick: int) -> None:
-        """Undo what is not yet visible at `tick`: its writer died before it was finished."""
-        self._waiting = [one for one in self._waiting if one[0] <= tick]
-
-    def at(self, tick: int) -> tuple[int, bytes | None]:
-        """Return serial and bytes of the newest message visible at `tick`, None if damaged; serial 0: none yet."""
-        while self._waiting and self._waiting[0][0] <= tick:
-            since, self._now = self._waiting.pop(0)
-            self._serial += 1
-            if self._now is not None:
-                self._good, self._good_since = self._now, since
-        return self._serial, self._now
-
-    def good_at(self, tick: int) -> bytes:
-        """Return the newest whole message visible at `tick`."""
-        self.at(tick)
-        return self._good
-
-    def is_lost(self, tick: int) -> bool:
-        """Say whether readers are told that the writer is lost or silent."""
-        if self._every is None or not self._serial:
-            return False
-        return self.lost or tick - (self._good_since - self._every) >= SILENT_CYCLES * self._every
 
 
 class Task:

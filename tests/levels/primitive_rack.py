@@ -37,7 +37,7 @@ class PrimitiveRack(Lockstep):
         ]
         scene = scene.model_copy(update={"motion": tuple(motion)})
         super().__init__(boards, robot, scene, outside={"em.command": MOVE_COMMAND})
-        self.home = np.array(robot.home)
+        self.home, self.fastest = np.array(robot.home), np.array(robot.velocity)
         self.seen: list[dict[str, Any]] = []
         self.set_points: list[dict[str, Any]] = []
 

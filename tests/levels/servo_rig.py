@@ -8,7 +8,9 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from backplane.alarms import Alarm
 from backplane.message import Message
+from levels.level import Demand, Fault, Finding
 from levels.messages import JOINT_SET_POINT
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
@@ -35,6 +37,13 @@ class Course(NamedTuple):
         return self.start + way * u**3 * (10 - 15 * u + 6 * u * u), way * 30 * u * u * (1 - u) ** 2 / self.duration_s
 
 
+class Found(NamedTuple):
+    """A finding and the tick of the cycle that found it."""
+
+    tick: int
+    finding: Finding
+
+
 class ServoRig:
     """Runs executor and planner of the servo level tick by tick; the set points come from a function of time."""
 
@@ -45,6 +54,10 @@ class ServoRig:
         self.command.opening, self.command.force, self.command.held = 0.04, 20.0, -1
         self.targets: list[Array] = []
         self.positions: list[Array] = []
+        self.found: list[Found] = []
+        self.acted: list[int] = []
+        self.demand = Demand.NONE
+        self._faults: list[Fault] = []
 
     @property
     def servo(self) -> ServoExecutor:
@@ -73,9 +86,39 @@ class ServoRig:
             if motion is not None and self.rack.tick % PERIOD == 0:
                 due = self.rack.tick + PERIOD
                 self.set_point(*motion(due * TICK_S), due)
-            self.rack.step()
+            self.step()
             self.targets.append(self.status.target.copy())
             self.positions.append(self.status.position.copy())
+
+    def step(self) -> None:
+        """Run one tick as a board does: hand in the demand, take out what was found and which faults acted."""
+        servo = self.servo
+        servo.demand = self.demand
+        self.rack.step()
+        self.found += [Found(self.rack.tick - 1, finding) for finding in servo.findings]
+        self.acted += [self.rack.tick - 1] * bool(servo.acted)
+        servo.findings.clear()
+        servo.acted.clear()
+
+    def inject(self, kind: str, seed: int = 5, **parameters: float) -> int:
+        """Let a fault begin in the next tick, which is returned, beside those that are active."""
+        self._faults.append(Fault(kind, parameters, seed, self.rack.tick))
+        self.servo.inject(self._faults)
+        return self.rack.tick
+
+    def heal(self) -> None:
+        """Let all faults be over from the next tick on."""
+        self._faults = []
+        self.servo.inject([])
+
+    def restart(self) -> None:
+        """Replace the executor by a fresh one, under the same faults."""
+        self.rack.restart("servo")
+        self.servo.inject(self._faults)
+
+    def alarms(self, *but: Alarm) -> list[Alarm]:
+        """Return what was found, in order, without `but`."""
+        return [finding.alarm for _, finding in self.found if finding.alarm not in but]
 
     def miss(self, ticks: int) -> None:
         """Let the executor miss its next `ticks` cycles."""

@@ -263,3 +263,53 @@ def test_restarted_executor_goes_on_with_its_own_last_messages() -> None:
     bench.plan(4)
     bench.cycle(2, done=2)
     assert bench.segments() == [(3, 3), (4, 4)]
+
+
+def test_arm_is_held_while_the_board_above_is_lost() -> None:
+    bench = planned_bench()
+    bench.boxes["task.command"].lost = True
+    bench.cycle(2)
+    assert bench.command.hold == 1
+    assert bench.segments() == [(1, 1), (2, 2)]
+    bench.boxes["task.command"].lost = False
+    bench.cycle(2)
+    assert (bench.command.hold, bench.status.error) == (0, 0)
+
+
+def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() -> None:
+    # The path of move 1 was lost on its way, that of move 2 was not; another path for move 1 may end elsewhere.
+    bench = Bench()
+    bench.order()
+    bench.plan(2, bench.home + 0.3)
+    bench.plan(1)
+    bench.cycle(2)
+    assert bench.status.planned == 1
+    bench.plan(2)
+    bench.cycle(2)
+    assert bench.status.planned == 3
+
+
+def test_path_made_again_with_another_end_withdraws_what_was_planned_from_the_old_one() -> None:
+    bench = planned_bench()
+    assert bench.status.planned == 5
+    again = bench.message("elemental_move.plan")
+    again.move, again.kind, again.count = 4, SegmentKind.PATH, 2
+    again.waypoints[:2] = bench.ends[2], bench.ends[2] + 0.3
+    bench.write("elemental_move.plan", again)
+    bench.cycle(2)
+    assert bench.status.planned == 4
+    assert bench.status.end == pytest.approx(bench.ends[2] + 0.3)
+
+
+def test_answer_for_a_place_where_the_arm_is_no_more_is_asked_for_again() -> None:
+    bench = planned_bench()
+    bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
+    asked = bench.status.replan
+    bench.cycle(position=bench.home + 0.09)
+    bench.plan(1, bench.home + 0.05, replan=asked)
+    bench.cycle(1)
+    assert bench.segments() == [(1, 1), (2, 2)]
+    assert bench.status.replan > asked
+    bench.plan(1, bench.home + 0.09, replan=bench.status.replan)
+    bench.cycle(1)
+    assert bench.segments()[0] == (3, 1)

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from levels.level import Demand
 from levels.messages import Error
+from levels.primitive.path import BlendedPath
+from levels.primitive.path_motion import PathMotion
+from levels.primitive.speed import BrakingLimits
+from tests.levels.disturbances import mute
+from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive_rack import PrimitiveRack, gripper, path
 
 TURN = np.array([0.6, -0.1, 0.2, 0.0, 0.1, 0.3])
@@ -83,3 +89,134 @@ def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
     servo.due = rack.tick
     assert rack.run_until_done(2)
     assert rack.status.error == 0
+
+
+def seconds(time_s: float) -> int:
+    """Return that time in ticks."""
+    return round(time_s * 1e9 / CLOCK_NS)
+
+
+def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_goes_on_when_it_is_back() -> None:
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    rack.run(0.4)
+    rack.boxes["em.command"].lost = True
+    rack.run(0.5)
+    assert rack.status.resting
+    held_at = rack.status.progress
+    assert 0.0 < held_at < 1.0
+    rack.run(3.0)
+    assert (rack.status.progress, rack.status.error) == (held_at, 0)
+    rack.boxes["em.command"].lost = False
+    assert rack.run_until_done(2)
+    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
+
+
+def test_gripper_does_not_begin_while_the_board_above_is_lost() -> None:
+    rack = PrimitiveRack()
+    rack.run(0.1)
+    rack.command(gripper(1, opening=0.0, held=0))
+    rack.boxes["em.command"].lost = True
+    rack.run(1.0)
+    assert (rack.status.done, rack.servo.opening) == (0, pytest.approx(0.04, abs=1e-3))
+    rack.boxes["em.command"].lost = False
+    assert rack.run_until_done(1)
+
+
+@pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
+def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) -> None:
+    # The stop lasts longer than every time that may run out; brakes take the arm some way off its path.
+    rack = PrimitiveRack(params={"silent": 0.5, "settling": 0.5, "straying": 0.02, "astray": 0.05})
+    rack.command(*two_paths(rack))
+    rack.run(0.4)
+    rack.stop(demand, seconds(2.0))
+    rack.run(1.9)
+    assert rack.status.error == 0
+    assert rack.set_points[-1]["due"] == 0
+    assert rack.run_until_done(2)
+    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
+    assert {int(seen["error"]) for seen in rack.seen} == {0}
+
+
+def test_gripper_that_the_servo_left_alone_is_waited_for_anew() -> None:
+    rack = PrimitiveRack()
+    rack.command(gripper(1, opening=0.0, held=0))
+    rack.run(0.08)
+    rack.stop(Demand.BRAKE, seconds(0.5))
+    rack.run(0.45)
+    assert rack.status.done == 0
+    assert rack.run_until_done(1)
+    assert rack.servo.opening < 0.03
+
+
+def test_segment_that_is_withdrawn_and_wanted_again_goes_on_where_it_was() -> None:
+    rack = PrimitiveRack()
+    first, second = two_paths(rack)
+    rack.command(first)
+    rack.run(0.4)
+    rack.command()
+    rack.run(0.5)
+    assert rack.status.resting
+    assert np.abs(rack.servo.position - rack.home).max() > 0.05
+    rack.command(first, second)
+    assert rack.run_until_done(2)
+    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
+
+
+def test_path_that_comes_back_to_itself_is_gone_on_with_on_the_way_back() -> None:
+    rack = PrimitiveRack()
+    rack.command(path(1, [rack.home, rack.home + TURN, rack.home]))
+    rack.run(6.0, until=lambda rack: rack.read("primitive.status").progress > 0.8)
+    rack.lose("primitive", seconds(0.3))
+    rack.run(0.5)
+    assert rack.status.progress > 0.75
+    assert rack.run_until_done(1)
+
+
+def test_arm_that_was_moved_while_nobody_drove_it_is_no_error_of_the_next_segment() -> None:
+    rack = PrimitiveRack()
+    rack.command(path(1, [rack.home, rack.home + TURN]))
+    assert rack.run_until_done(1)
+    rack.lose("servo", seconds(0.3))
+    rack.run(0.5)
+    rack.command(path(2, [rack.home + TURN + 0.03, rack.home]))
+    rack.run(1.0)
+    assert (rack.status.error, rack.status.current, rack.status.blocked) == (0, 2, 1)
+
+
+def test_arm_is_held_when_the_world_model_is_not_told_of_the_scene() -> None:
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    rack.run(0.4)
+    rack.disturb("servo.scene", mute, seconds(1.0))
+    rack.run(0.9)
+    assert rack.status.resting
+    assert not rack.status.blocked
+    assert rack.run_until_done(2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_set_points_never_jump_however_often_boards_are_lost(seed: int) -> None:
+    chance = np.random.default_rng(seed)
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    for _ in range(6):
+        name = chance.choice(["primitive", "primitive", "primitive.planner", "servo", "world"])
+        rack.after(int(chance.integers(seconds(2.5))), lambda name=name: rack.lose(name, int(chance.integers(1, 100))))
+    assert rack.run_until_done(2)
+    last = None
+    for new in rack.set_points:
+        assert all(np.isfinite(new[field]).all() for field in ("position", "velocity", "acceleration"))
+        if last is not None and last["due"] and new["due"]:
+            most = (new["due"] - last["due"]) * CLOCK_NS * 1e-9 * rack.fastest
+            assert (np.abs(new["position"] - last["position"]) <= 1.01 * most).all()
+        last = new
+    assert (rack.servo.clipped, rack.servo.touches) == (0, 0)
+
+
+def test_motion_that_is_found_at_the_end_of_its_path_is_finished() -> None:
+    for length in np.random.default_rng(4).uniform(0.1, 9.0, 200):
+        line = BlendedPath([[0.0], [length]], [0.0, 0.0])
+        motion = PathMotion(line, BrakingLimits(*np.ones((3, 1))), bridging_s=0.5)
+        motion.rest_near(np.array([length]), progress=1.0)
+        assert motion.finished

@@ -20,6 +20,7 @@ from levels.task.finish import Cycles, Rehearsed, finish_times
 from levels.task.params import TaskParams
 from levels.task.rehearsal import Rehearsal
 from tests.levels.arms import cell, config
+from tests.levels.disturbances import lose_some
 from tests.levels.lockstep import BoardSpec, Lockstep
 from tests.levels.whole_rack import WholeRack
 
@@ -261,3 +262,22 @@ def test_level_without_a_program_is_idle() -> None:
     bench = Bench()
     bench.cycle()
     assert bench.status.state == State.IDLE
+
+
+@pytest.mark.parametrize(
+    ("finished", "away_ticks", "published"),
+    [(True, 40, 1), (True, 900, 1), (False, 40, 1)],
+    ids=["plan on its way", "plan followed", "plan never made"],
+)
+def test_planner_that_is_lost_plans_again_only_what_was_lost(finished: bool, away_ticks: int, published: int) -> None:
+    rack = WholeRack(actions=[HOME])
+    rack.after(500, lambda: rack.lose("task.planner", away_ticks, finished))
+    assert rack.run_to_end(20.0).state == State.DONE
+    assert rack.boxes["task.plan"].at(rack.tick)[0] == published
+
+
+def test_plan_that_is_lost_on_its_way_is_published_again() -> None:
+    rack = WholeRack(actions=[HOME])
+    rack.disturb("task.plan", lose_some(1.0, seed=1), 1000)
+    assert rack.run_to_end(20.0).state == State.DONE
+    assert rack.boxes["task.plan"].at(rack.tick)[0] == 2

@@ -13,6 +13,7 @@ from backplane.message import Message
 from levels.messages import SCENE
 from levels.world import WorldModel
 from tests.levels.arms import config
+from tests.levels.disturbances import lose_some
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
 Array = NDArray[np.float64]
@@ -128,3 +129,16 @@ def test_the_revision_rises_across_a_restart() -> None:
     rig.rack.restart("world")
     rig.run(0.2, resting)
     assert rig.model.revision > before
+
+
+def test_restarted_board_shows_what_it_knew_and_since_when_until_it_sees_again() -> None:
+    rig = WorldRig()
+    rig.run(1.0, resting)
+    rig.rack.disturb("servo.scene", lose_some(1.0, seed=1), round(0.2 / TICK_S))
+    rig.rack.lose("world", round(0.1 / TICK_S))
+    rig.run(0.2, resting)
+    assert rig.model.position == pytest.approx(START)
+    assert rig.model.revision > 0
+    assert 0 < rig.model.sensed <= round(1.0 / TICK_S)
+    rig.run(0.1, resting)
+    assert rig.rack.tick - rig.model.sensed <= PERIOD

@@ -16,7 +16,7 @@ END = event(10_000, "end", "")
 
 
 def verdict(strikes: list[Strike], *events: Event) -> Verdict:
-    return judge(strikes, [*events, END], LAYOUT, clock_offset_ns=0)
+    return judge(strikes, [*events, END], LAYOUT, offset_ns=0)
 
 
 def judged(one: Strike, *events: Event) -> Judgement:
@@ -174,3 +174,10 @@ def test_a_detection_without_a_fault_is_unexplained_and_a_miss_is_not() -> None:
 def test_a_consequence_of_a_fault_is_no_false_trip() -> None:
     consequence = found(110, "stale", "lower", "upper.command")
     assert verdict([strike("kill", "lower", 100)], consequence).unexplained == ()
+
+
+def test_in_lockstep_a_death_is_bounded_in_ticks_for_the_wall_clock_means_nothing() -> None:
+    died = Event(900 * TICK_NS, 99, "died", "lower", "died", "died")
+    (fault,) = judge([strike("kill", "lower", 100)], [died, END], LAYOUT, 0, lockstep=True).faults
+    # It strikes before its tick is given out: the Rack may see the tick before.
+    assert (fault.seen, fault.delay, fault.bound, fault.delay_ms, fault.is_within) == ("detected", 0, 2, None, True)

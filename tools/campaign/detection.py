@@ -24,26 +24,27 @@ class Detection:
     """An event that tells of a fault: how long after it struck, and what was permitted (None: no bound).
 
     `delay` and `bound` are ticks; ticks that the clock itself left out did not happen and are not counted.
-    `late_ms` is time of the wall clock, for a death: its bound at the Rack is one of time.
+    `delay_ms` is time of the wall clock, None where that means nothing: in lockstep. `bound_ms` is the bound of a death
+    at the Rack, which hears of it as time goes, whatever the clock does.
     """
 
     event: Event
     delay: int
     bound: int | None
-    delay_ms: float
+    delay_ms: float | None = None
     bound_ms: float | None = None
 
     @property
     def is_within(self) -> bool:
         """Whether the fault was found as soon as it must be."""
-        if self.bound_ms is not None:
+        if self.bound_ms is not None and self.delay_ms is not None:
             return self.delay_ms <= self.bound_ms
         return self.bound is None or self.delay <= self.bound
 
     @property
     def order(self) -> tuple[bool, int, float]:
         """What tells the best of several detections: one within its bound, then the first."""
-        return not self.is_within, self.delay, self.delay_ms
+        return not self.is_within, self.delay, self.delay_ms or 0.0
 
 
 def codes_of(kind: str) -> set[str]:

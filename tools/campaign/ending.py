@@ -10,9 +10,9 @@ import numpy as np
 from backplane.address_map import CLOCK
 from backplane.fault_table import Entry, FaultTable, Injection, Stage
 from backplane.layout import MailboxSpec
+from backplane.message import State
 from backplane.protocols import open_observer
 from backplane.segment import Segment
-from backplane.words import Block
 from boards.faults.kinds import KINDS
 from tools.campaign.external import Killed
 from tools.campaign.plan import EXTERNAL
@@ -70,10 +70,16 @@ def arm_of(segment: Segment) -> Arm:
     )
 
 
-def plans_made(segment: Segment) -> dict[str, int]:
-    """Return how many plans each planner has made."""
-    planners = (task.name for task in segment.layout.tasks if task.role == "planner")
-    return {name: segment.block(name)[Block.PLANS] for name in planners}
+def levels_of(segment: Segment) -> str:
+    """Return the state that each level was left in, with its reason, as one readable text."""
+    told = []
+    for box in segment.layout.mailboxes:
+        if not {"state", "reason"} <= {field.name for field in box.fields}:
+            continue
+        if (status := open_observer(segment, box.name).peek()).is_there:
+            state, reason = State(status.value.state).name.lower(), status.value.reason
+            told.append(f"{box.writer} {state}{f' ({reason})' if reason else ''}")
+    return ", ".join(told)
 
 
 def _strike(segment: Segment, index: int, joints: Sequence[str], table: FaultTable) -> Strike:

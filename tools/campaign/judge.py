@@ -69,22 +69,23 @@ class Verdict:
 
 
 def judge(
-    strikes: Sequence[Strike], events: Sequence[Event], layout: Layout, clock_offset_ns: int, bound: Bound | None = None
+    strikes: Sequence[Strike], events: Sequence[Event], layout: Layout, offset_ns: int, lockstep: bool = False
 ) -> Verdict:
     """Judge the faults of a run by what happened in it.
 
-    `clock_offset_ns` turns CLOCK_MONOTONIC into the events' time. One event is the detection of one fault: of two
+    `offset_ns` turns CLOCK_MONOTONIC into the events' time. One event is the detection of one fault: of two
     that it fits, of the one that struck first and is not found yet.
     """
-    return _Judge(strikes, events, layout, clock_offset_ns, bound or _bound_in(layout)).verdict()
+    return _Judge(strikes, events, layout, offset_ns, lockstep).verdict()
 
 
 class _Judge:
     def __init__(
-        self, strikes: Sequence[Strike], events: Sequence[Event], layout: Layout, offset_ns: int, bound: Bound
+        self, strikes: Sequence[Strike], events: Sequence[Event], layout: Layout, offset_ns: int, lockstep: bool
     ) -> None:
         self._strikes = sorted(strikes, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
-        self._events, self._layout, self._bound, self._offset_ns = events, layout, bound, offset_ns
+        self._events, self._layout, self._offset_ns, self._lockstep = events, layout, offset_ns, lockstep
+        self._bound = _bound_in(layout)
         self._left_out = LeftOut(events)
         self._last = max((event.tick for event in events), default=0)
         self._settle = round(AFTERMATH_S * 1e9 / layout.clock_ns)
@@ -109,15 +110,21 @@ class _Judge:
         return [self._detection(event, strike) for event in fresh]
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
-        # A fault of the arm is counted behind the cycle that has already found it.
-        delay_ms = max(0, event.time_ns - self._offset_ns - strike.time_ns) * 1e-6
-        delay = max(0, event.tick - strike.tick)
+        delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
         if event.kind == "died":
-            return Detection(event, delay, self._bound(strike, None), delay_ms, RACK_NS * 1e-6)
+            bound_ms = None if delay_ms is None else RACK_NS * 1e-6
+            return Detection(event, delay, self._bound(strike, None), delay_ms, bound_ms)
         if event.code != "clock_skipped":
             delay -= self._left_out.between(strike.tick, event.tick)
         reader = event.board if event.code in MAILBOX_ALARMS else None
         return Detection(event, delay, self._bound(strike, reader), delay_ms)
+
+    def _delay_ms(self, event: Event, strike: Strike) -> float | None:
+        # Lockstep waits for the end of a process that its clock has killed, and goes on meanwhile after any other.
+        if self._lockstep and strike.kind != EXTERNAL:
+            return None
+        # A fault of the arm is counted behind the cycle that has already found it.
+        return max(0, event.time_ns - self._offset_ns - strike.time_ns) * 1e-6
 
     def _horizon(self, place: int) -> int:
         """Return the tick up to which reactions and recoveries are of this fault: the next one strikes then."""
@@ -141,7 +148,7 @@ class _Judge:
             found_by=best.event.board if best and best.event.kind != "died" else "the Rack" if best else "",
             found_as=(best.event.code or best.event.kind) if best else "",
             delay=best.delay if best else None,
-            delay_ms=round(best.delay_ms, 3) if best else None,
+            delay_ms=None if best is None or best.delay_ms is None else round(best.delay_ms, 3),
             bound=best.bound if best else self._bound(strike, None),
             bound_ms=best.bound_ms if best else None,
             is_within=best is not None and best.is_within,

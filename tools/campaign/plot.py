@@ -1,9 +1,10 @@
-"""A campaign as a picture: campaign.png. matplotlib is loaded here alone."""
+"""A campaign as a picture: campaign.png. matplotlib is loaded for this module alone."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
@@ -16,21 +17,21 @@ if TYPE_CHECKING:
 
 Report = dict[str, Any]
 SIZE_IN = (13.0, 8.0)
-DOT, MEDIAN, BOUND = "#4477aa", "#222222", "#cc3311"
+DOT, MIDDLE, BOUND = "#4477aa", "#222222", "#cc3311"
 """Colours that people with any sight tell apart (Paul Tol's)."""
-LOWEST = 0.005
-"""Least part of a bound that the axis shows: a detection in the same cycle stands there."""
+WIDEST = 1.5
+"""Part of a bound up to which delays are drawn; later ones stand at the edge, as arrows."""
 
 
 def plot(report: Report, path: Path) -> None:
     """Draw a campaign's document into a PNG file: delays against bounds, curves of size, recovery times."""
     figure = Figure(figsize=SIZE_IN, layout="constrained")
-    left, upper, lower = (figure.add_subplot(place) for place in _places(figure))
-    _delays(left, report)
-    _sizes(upper, report)
-    _recoveries(lower, report)
-    seconds = f"seed {report['seed']}, {report['summary']['trials']} trials"
-    figure.suptitle(f"{report['config']}: faults, {seconds}", fontsize=11)
+    delays, sizes, recoveries = (figure.add_subplot(place) for place in _places(figure))
+    _delays(delays, report)
+    _sizes(sizes, report)
+    _recoveries(recoveries, report)
+    trials = f"{report['summary']['trials']} trials, {' and '.join(dict.fromkeys(report['modes']))}"
+    figure.suptitle(f"Faults injected into {report['config']}: {trials}, seed {report['seed']}", fontsize=11)
     figure.savefig(path, dpi=120)
 
 
@@ -41,65 +42,70 @@ def _places(figure: Figure) -> Iterator[SubplotSpec]:
 
 
 def _delays(axes: Axes, report: Report) -> None:
-    """Each fault's time to detection as a part of its own bound; median, max and bound in numbers beside."""
+    """Draw each fault's time to detection as a part of its own bound, with median and longest in cycles beside."""
     kinds = list(report["by_kind"])[::-1]
     for row, kind in enumerate(kinds):
-        parts = [_part(f) for f in report["faults"] if f["kind"] == kind and f["seen"] == "detected"]
-        known = [max(part, LOWEST) for part in parts if part is not None]
-        axes.scatter(known, [row] * len(known), s=22, color=DOT, alpha=0.5, linewidths=0)
-        if known:
-            axes.scatter([sorted(known)[len(known) // 2]], [row], marker="|", s=180, color=MEDIAN)
-        place, frame = (1.01, row), ("axes fraction", "data")
-        axes.annotate(_numbers(report["by_kind"][kind]), place, xycoords=frame, fontsize=7, va="center")
+        found = [f for f in report["faults"] if f["kind"] == kind and f["seen"] == "detected"]
+        parts = [part for fault in found if (part := _part(fault)) is not None]
+        _row(axes, row, [part for part in parts if part <= WIDEST])
+        late = [part for part in parts if part > WIDEST]
+        axes.scatter([WIDEST] * len(late), [row] * len(late), marker=">", s=40, color=BOUND, clip_on=False)
+        if parts:
+            axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
+        place, frame = (1.02, row), ("axes fraction", "data")
+        axes.annotate(_numbers(report["by_kind"][kind]), place, xycoords=frame, fontsize=8, va="center")
     axes.axvline(1.0, color=BOUND, linewidth=1.2)
-    axes.set_xscale("log")
-    axes.set_xlim(LOWEST * 0.8, max(2.0, axes.get_xlim()[1]))
+    axes.set_xlim(-0.03, WIDEST)
     axes.set_yticks(range(len(kinds)), kinds, fontsize=8)
-    axes.set_xlabel("time to detection, as a part of its bound (red)")
-    axes.set_title("found after: median / max of bound, ticks", fontsize=9, loc="right")
+    axes.set_xlabel("time to detection as a part of its bound (red); the mark is the median")
+    axes.set_title("found of injected; median, longest, cycles", fontsize=9, loc="right")
+
+
+def _row(axes: Axes, row: int, values: list[float]) -> None:
+    axes.scatter(values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False)
 
 
 def _part(fault: Report) -> float | None:
     """Return a fault's delay as a part of its bound; a bound of the same cycle is kept exactly or not at all."""
     if fault["bound"] == 0 and fault["bound_ms"] is None:
-        return LOWEST if fault["delay"] == 0 else 2.0
+        return 0.0 if fault["delay"] == 0 else 2 * WIDEST
     return part_of_bound(fault["delay"], fault["bound"], fault["delay_ms"], fault["bound_ms"])
 
 
 def _numbers(figures: Report) -> str:
-    ticks, bound = figures["ticks"], figures["bound_ticks"]
-    if ticks is None:
-        return f"0 of {figures['injected']} found"
-    most = "-" if bound is None else bound["most"]
-    return f"{ticks['median']:g} / {ticks['max']:g} of {most}"
+    counts, cycles = f"{figures['detected']} of {figures['injected']}", figures["cycles"]
+    return counts if cycles is None else f"{counts}; {cycles['median']:.3g}, {cycles['max']:.3g}"
 
 
 def _sizes(axes: Axes, report: Report) -> None:
+    """Draw the size of a sensor's error against the time to its detection."""
+    edge = axes.get_xaxis_transform()
     for (kind, found), marker in zip(report["sizes"].items(), "os", strict=False):
-        seen = [(p["size"], p["delay_ms"]) for p in found["curve"] if p["delay_ms"] is not None]
-        unseen = [p["size"] for p in found["curve"] if p["delay_ms"] is None]
-        drawn = axes.scatter([s for s, _ in seen], [d for _, d in seen], marker=marker, s=22, alpha=0.7, label=kind)
-        colour, edge = drawn.get_facecolor(), axes.get_xaxis_transform()
-        # A size that was not found stands at the upper edge.
-        axes.scatter(unseen, [1.0] * len(unseen), marker="x", s=24, color=colour, transform=edge, clip_on=False)
-        axes.axvline(found["judged_from"], color=colour[0], linewidth=0.8, linestyle=":")
-    axes.set_xscale("log")
-    axes.set_yscale("symlog", linthresh=2.5)
-    axes.set_xlabel("size, rad (dotted: must be seen from there; x: not seen)")
-    axes.set_ylabel("time to detection, ms")
+        seen = [point for point in found["curve"] if point["delay_ms"] is not None]
+        unseen = [point["size"] for point in found["curve"] if point["delay_ms"] is None]
+        sizes, delays = [point["size"] for point in seen], [point["delay_ms"] for point in seen]
+        (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
+        axes.plot(unseen, [1.0] * len(unseen), "x", color=line.get_color(), transform=edge, clip_on=False)
+        axes.axvline(found["judged_from"], color=line.get_color(), linewidth=0.9, linestyle=":")
     if report["sizes"]:
+        axes.set_xscale("log")
+        axes.set_yscale("symlog", linthresh=report["clock_ms"])
+        axes.set_ylim(bottom=-0.5 * report["clock_ms"])
         axes.legend(fontsize=8)
-    axes.set_title("size of a sensor's error against the time to its detection", fontsize=9)
+    axes.set_xlabel("size of the error, rad; from the dotted line on it must be seen; x: it was not", fontsize=9)
+    axes.set_ylabel("time to detection, ms")
 
 
 def _recoveries(axes: Axes, report: Report) -> None:
-    clock_ms = report["clock_ms"]
-    rows: dict[str, list[float]] = {}
-    for fault in report["faults"]:
-        if fault["recovery"] is not None:
-            rows.setdefault(fault["kind"], []).append(fault["recovery"] * clock_ms * 1e-3)
-    for row, times in enumerate(rows.values()):
-        axes.scatter(times, [row] * len(times), s=22, color=DOT, alpha=0.5, linewidths=0)
+    """Draw the time from each strike until everything that was done about it was undone."""
+    times = {kind: [f for f in report["faults"] if f["kind"] == kind] for kind in reversed(report["by_kind"])}
+    seconds = {
+        kind: [fault["recovery"] * report["clock_ms"] * 1e-3 for fault in faults if fault["recovery"] is not None]
+        for kind, faults in times.items()
+    }
+    rows = {kind: found for kind, found in seconds.items() if found}
+    for row, found in enumerate(rows.values()):
+        _row(axes, row, found)
     axes.set_yticks(range(len(rows)), list(rows), fontsize=8)
-    axes.set_xlabel("from the strike until everything is undone, s of simulated time")
-    axes.set_title("recovery", fontsize=9)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("from the strike until every reaction is undone, s of simulated time", fontsize=9)

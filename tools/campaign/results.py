@@ -26,7 +26,7 @@ class Judged:
         """Judge a trial."""
         if trial.refused or trial.layout is None:
             return cls(trial, Verdict(_refused(trial), ()))
-        return cls(trial, judge(trial.strikes, trial.events, trial.layout, trial.clock_ns))
+        return cls(trial, judge(trial.strikes, trial.events, trial.layout, trial.offset_ns, trial.plan.lockstep))
 
     @property
     def ended(self) -> Ended:
@@ -54,9 +54,14 @@ class Judged:
         lines += [f"limits violated at {trial.arm.violations} substeps"] if trial.arm.violations else []
         lines += [f"left behind: {thing}" for thing in trial.left]
         if self.ended == "neither":
-            why = trial.refused or (trial.outcome and f"{trial.outcome.cause} {trial.outcome.reason}") or "no end"
-            lines.append(f"the task is neither done nor safely stopped: {why.strip()}")
+            lines.append(f"the task is neither done nor safely stopped: {self._why_neither()}")
         return lines
+
+    def _why_neither(self) -> str:
+        trial, outcome = self.trial, self.trial.outcome
+        if trial.refused or outcome is None:
+            return trial.refused or f"it does not end; {trial.levels}"
+        return "; ".join(filter(None, [outcome.cause, *outcome.faults, trial.levels]))
 
     def document(self) -> dict[str, Any]:
         """Return the trial as plain data: a line of trials.jsonl."""
@@ -66,6 +71,7 @@ class Judged:
             "ended": self.ended,
             "outcome": asdict(outcome) if outcome else None,
             "refused": trial.refused,
+            "levels": trial.levels,
             "violations": trial.arm.violations,
             "touches": trial.arm.touches,
             "left": list(trial.left),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import NamedTuple
 
-from boards.faults.kinds import KINDS, NUMBERS
+from boards.faults.kinds import KINDS, NUMBERS, Parameter
 from tools.campaign.plan import EXTERNAL
 from tools.campaign.targets import Target
 
@@ -16,8 +16,6 @@ SIZED = ("sensor-bias", "sensor-noise")
 """Kinds that are seen from a certain size on: the default of their `size` in `boards.faults.kinds`."""
 LARGEST = 20.0
 """Sizes are drawn up to that many times the size from which the kind must be seen."""
-SMALLEST = 0.02
-"""The sweep of sizes begins at that part of it."""
 
 
 class Shape(NamedTuple):
@@ -59,12 +57,16 @@ class Drawing:
 
 def judged_size(kind: str) -> float:
     """Return the size from which a kind of `SIZED` must be seen."""
-    return next(p.default or 0.0 for p in KINDS[NUMBERS[kind]].parameters if p.name == "size")
+    return _size(kind).default or 0.0
+
+
+def _size(kind: str) -> Parameter:
+    return next(parameter for parameter in KINDS[NUMBERS[kind]].parameters if parameter.name == "size")
 
 
 def swept_sizes(kind: str, count: int) -> list[float]:
-    """Return sizes for the curve of size against delay, smallest first."""
-    low, high = judged_size(kind) * SMALLEST, judged_size(kind) * LARGEST
+    """Return sizes for the curve of size against delay, from the smallest that there is."""
+    low, high = _size(kind).least, judged_size(kind) * LARGEST
     return [_short(low * (high / low) ** (place / max(1, count - 1))) for place in range(count)]
 
 

@@ -13,7 +13,7 @@ from boards.errors import BoardError, ConfigError
 from boards.events import Event
 from boards.outcome import Outcome
 from boards.rack import Rack
-from tools.campaign.ending import Arm, Strike, arm_of, strikes
+from tools.campaign.ending import Arm, Strike, arm_of, levels_of, strikes
 from tools.campaign.external import Killer
 from tools.campaign.interrupt import Interrupt
 from tools.campaign.leftovers import children, left_behind
@@ -31,7 +31,7 @@ STUCK_S = 20.0
 class Trial:
     """A trial that was made. `refused` is why the rack did not launch, else empty; `left` what it left behind.
 
-    `clock_ns` turns CLOCK_MONOTONIC into the events' CLOCK_REALTIME.
+    `levels` tells what state each level was left in. `offset_ns` turns CLOCK_MONOTONIC into the events' CLOCK_REALTIME.
     """
 
     plan: Plan
@@ -43,7 +43,8 @@ class Trial:
     arm: Arm
     left: tuple[str, ...]
     wall_s: float
-    clock_ns: int
+    offset_ns: int
+    levels: str = ""
     is_interrupted: bool = False
 
 
@@ -57,7 +58,7 @@ def run_trial(
     """
     before, started = children(), time.monotonic()
     rack = Rack(plan.config(config, rack_name))
-    refused, arm = "", Arm()
+    refused, levels, arm = "", "", Arm()
     found: tuple[Strike, ...] = ()
     try:
         with rack:
@@ -65,6 +66,7 @@ def run_trial(
             _watch(rack, killer, ticks, seconds, interrupt)
             joints = config.robot.joints if config.robot is not None else ()
             found, arm = strikes(rack.segment, joints, killer.done), arm_of(rack.segment)
+            levels = levels_of(rack.segment)
     except ConfigError:
         raise
     except (BackplaneError, BoardError) as error:
@@ -79,7 +81,8 @@ def run_trial(
         arm=arm,
         left=tuple(left_behind(rack_name, before)),
         wall_s=time.monotonic() - started,
-        clock_ns=time.time_ns() - time.monotonic_ns(),
+        offset_ns=time.time_ns() - time.monotonic_ns(),
+        levels=levels,
         is_interrupted=interrupt.is_set,
     )
 

@@ -1,0 +1,47 @@
+"""What a task's trace proves about its messages: which release it has finished last, and when a cycle ended.
+
+A task traces a cycle behind its last write, so a message that is not there by then was not written, and one that
+comes later was held back. Age alone proves nothing: the machine may have taken the core away.
+"""
+
+from __future__ import annotations
+
+from backplane.address_map import TRACE_RECORD_SIZE
+from backplane.segment import Segment
+from backplane.trace import FIELDS, Flag
+from backplane.words import Block
+
+# Plain integers for the hot path.
+_TICK, _END, _FLAGS = (FIELDS.index(name) for name in ("tick", "end_ns", "flags"))
+_RECORD = TRACE_RECORD_SIZE // 8
+_TRACE_HEAD, _BUS_ERROR = int(Block.TRACE_HEAD), int(Flag.BUS_ERROR)
+
+
+class CycleRecord:
+    """The trace of one task, as the readers of its mailboxes consult it."""
+
+    def __init__(self, segment: Segment, task: str) -> None:
+        self._block = segment.block(task)
+        self._words = segment.words
+        self._first = segment.map.traces[task] // 8
+        self._depth = segment.layout.task(task).depth
+
+    @property
+    def finished(self) -> int:
+        """Newest release whose cycle has ended with every access done; -1: none, or one was cut off."""
+        count = self._block[_TRACE_HEAD]
+        at = self._at(count)
+        return -1 if not count or self._words[at + _FLAGS] & _BUS_ERROR else self._words[at + _TICK]
+
+    def ended_ns(self, tick: int) -> int | None:
+        """Return when the cycle released at `tick` ended, CLOCK_MONOTONIC; None when there is no record of it."""
+        count = self._block[_TRACE_HEAD]
+        # The oldest records may be overwritten while one looks at them.
+        for number in range(count, max(0, count - self._depth // 2), -1):
+            at = self._at(number)
+            if self._words[at + _TICK] <= tick:
+                return self._words[at + _END] if self._words[at + _TICK] == tick else None
+        return None
+
+    def _at(self, number: int) -> int:
+        return self._first + number % self._depth * _RECORD

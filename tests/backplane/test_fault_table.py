@@ -1,0 +1,71 @@
+"""The fault table: entries are filled whole, by whoever comes, and found by the task that they concern."""
+
+from __future__ import annotations
+
+import pytest
+
+from backplane.address_map import FAULT_ENTRIES
+from backplane.errors import FaultTableError
+from backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
+from backplane.words import System
+from tests.backplane.bus import mailbox
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, exit_status, fork
+
+WHOLE = Injection(
+    kind=3, task=1, mailbox=0, tick=40, ticks=8, phase=250, seed=77, when=(0, 1, 2), parameters=(0.5, -1.0, 3.25)
+)
+
+
+def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    entry = FaultTable(segment).add(WHOLE)
+    read = FaultTable(segment).entries[entry.index]
+    words = (Entry.KIND, Entry.TASK, Entry.MAILBOX, Entry.FROM, Entry.TICKS, Entry.PHASE, Entry.SEED)
+    assert [read[word] for word in words] == [3, 1, 0, 40, 8, 250, 77]
+    assert [read[word] for word in (Entry.WHEN_BOX, Entry.WHEN_FIELD, Entry.WHEN_VALUE)] == [0, 1, 2]
+    assert read.parameters[:3].tolist() == [0.5, -1.0, 3.25]
+    assert (read.stage, read[Entry.UNTIL], read[Entry.STRUCK_TICK]) == (Stage.WAITING, NEVER, -1)
+    assert segment.words[System.INJECTED] == 1
+
+
+def test_a_task_finds_its_own_active_faults(make_bus: MakeBus) -> None:
+    table = FaultTable(make_bus())
+    entries = [table.add(Injection(0, task)) for task in (0, 1, 1, -1)]
+    assert table.active("reader") == []
+    for entry in entries[1:]:
+        entry.words[Entry.STAGE] = Stage.ACTIVE
+    found = {name: [entry.index for entry in table.active(name)] for name in ("writer", "reader", "clock")}
+    assert found == {"writer": [], "reader": [1, 2], "clock": [3]}
+    assert [entry.index for entry in table.staged((Stage.WAITING,))] == [0]
+
+
+def test_the_first_time_that_a_fault_acts_is_kept(make_bus: MakeBus) -> None:
+    entry = FaultTable(make_bus()).add(Injection(0, 0))
+    entry.acted(9, 100)
+    entry.acted(10, 200)
+    assert [entry[word] for word in (Entry.STRUCK_TICK, Entry.STRUCK_NS, Entry.COUNT)] == [9, 100, 2]
+
+
+def test_a_full_table_refuses(make_bus: MakeBus) -> None:
+    table = FaultTable(make_bus())
+    for _ in range(FAULT_ENTRIES):
+        table.add(Injection(0, 0))
+    with pytest.raises(FaultTableError, match="the fault table is full: 64 faults"):
+        table.add(Injection(0, 0))
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_two_who_inject_at_once_take_two_entries(make_bus: MakeBus) -> None:
+    segment, each = make_bus(), 15
+
+    def inject(seed: int) -> None:
+        table = FaultTable(segment)
+        for _ in range(each):
+            table.add(Injection(0, 0, seed=seed))
+
+    children = [fork(lambda seed=seed: inject(seed)) for seed in (1, 2, 3)]  # type: ignore[misc]
+    assert [exit_status(child) for child in children] == [0, 0, 0]
+    entries = FaultTable(segment).staged((Stage.WAITING,))
+    assert sorted(entry[Entry.SEED] for entry in entries) == sorted([1, 2, 3] * each)
+    assert segment.words[System.INJECTED] == 3 * each

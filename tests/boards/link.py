@@ -1,0 +1,124 @@
+"""A writing task and a reading task at the two ends of one mailbox, cycled by a test, tick by tick."""
+
+from __future__ import annotations
+
+from time import monotonic_ns
+from typing import NamedTuple
+
+import numpy as np
+
+from backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
+from backplane.ring import mailbox_ring
+from backplane.segment import Segment
+from backplane.trace import TraceWriter
+from backplane.words import Block
+from boards.faults.kinds import KINDS, NUMBERS
+from boards.ports import InputPorts, OutputPorts
+from levels.level import Reading
+from tests.backplane.bus import NAME
+
+
+class Seen(NamedTuple):
+    """What a read gave: its tick, the release tick that the message holds, -1 for none, and what was said of it."""
+
+    tick: int
+    released: int
+    verdict: str
+    is_lost: bool
+
+
+class WritingTask:
+    """The task `writer`: each of its messages holds its release tick in every place."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.every = segment.layout.task("writer").every
+        self.ports = OutputPorts(segment, {"point": NAME}, AlarmWriter(segment, "writer"))
+        self._inputs = InputPorts(segment, {}, AlarmWriter(segment, "writer"))
+        self._block, self._trace = segment.block("writer"), TraceWriter(segment, "writer")
+
+    def cycle(self, tick: int, now: int | None = None) -> bool:
+        """Write, trace the cycle, say that it is done; the clock stands at `now`, or at `tick`."""
+        message = self.ports.messages.point
+        message.id, message.row = tick, tick
+        in_time = self.ports.write(tick, tick if now is None else now, self._inputs)
+        self.end(tick)
+        return in_time
+
+    def end(self, tick: int, flags: int = 0) -> None:
+        """Trace a cycle and say that it is done."""
+        self._trace.record[0], self._trace.record[5], self._trace.record[6] = tick, monotonic_ns(), flags
+        self._trace.write()
+        self._block[Block.DONE] = tick
+
+    def close(self) -> None:
+        """Give the mailbox back, as the end of its process does."""
+        for writer in self.ports.writers.values():
+            writer.close()
+
+
+class ReadingTask:
+    """The task `reader`; `seen` is what its reads gave."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.every = segment.layout.task("reader").every
+        self.ports = InputPorts(segment, {"point": NAME}, AlarmWriter(segment, "reader"))
+        self.seen: list[Seen] = []
+
+    def cycle(self, tick: int) -> Reading:
+        """Read once."""
+        self.ports.read(tick)
+        reading: Reading = self.ports.values.point
+        row = reading.value.row
+        assert (row == reading.value.id).all(), "half a message, or a forged one"
+        released = reading.value.id if reading.is_there else -1
+        self.seen.append(Seen(tick, released, reading.verdict.name, reading.is_lost))
+        return reading
+
+
+class Link:
+    """Both tasks. When both are due the reader comes first, or the writer, as their processors have it."""
+
+    def __init__(self, segment: Segment, reader_first: bool = False) -> None:
+        self.segment = segment
+        self.writer, self.reader = WritingTask(segment), ReadingTask(segment)
+        self.active: list[tuple[str, FaultEntry]] = []
+        self._reader_first = reader_first
+        self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
+
+    def run(self, first: int, last: int) -> None:
+        """Do the ticks from `first` up to and without `last`."""
+        for tick in range(first, last):
+            due = [task for task in (self.writer, self.reader) if tick % task.every == 0]
+            for task in reversed(due) if self._reader_first else due:
+                task.cycle(tick)
+
+    def fault(self, kind: str, *parameters: float, seed: int = 7, mailbox: int = -1) -> FaultEntry:
+        """Write with one more fault from now on."""
+        defaults = [p.default or 0.0 for p in KINDS[NUMBERS[kind]].parameters]
+        given = (*parameters, *defaults[len(parameters) :])
+        entry = FaultTable(self.segment).add(Injection(NUMBERS[kind], 0, mailbox, seed=seed, parameters=given))
+        self.active.append((kind, entry))
+        self.writer.ports.apply(self.active)
+        return entry
+
+    def heal(self) -> None:
+        """Write without faults from now on."""
+        self.active.clear()
+        self.writer.ports.apply([])
+
+    def written(self) -> list[tuple[int, int, int]]:
+        """Return release tick, serial and first visible tick of every message in a slot, oldest first."""
+        rows = mailbox_ring(self.segment, NAME).drain().rows
+        there = np.cumsum(np.ones(len(rows), dtype=int)) == rows["serial"]
+        return [(int(r["tick"]), int(r["serial"]), int(r["visible_at"])) for r in rows[there]]
+
+    def alarms(self, task: str = "reader") -> list[tuple[int, Alarm]]:
+        """Return tick and code of what a task has rung since the last call."""
+        rows = self._rings[task].drain().rows
+        return [(int(row["tick"]), Alarm(row["code"])) for row in rows]
+
+
+def struck(entry: FaultEntry) -> int:
+    """Return the tick at which a fault has first acted."""
+    return entry[Entry.STRUCK_TICK]

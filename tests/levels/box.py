@@ -1,0 +1,62 @@
+"""A mailbox of a rack in one process, with what a faulty writer makes of its messages."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Callable, Mapping, Sequence
+
+from backplane.message import Message, MessageType
+
+SILENT_CYCLES = 4
+"""Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the one it waits."""
+Disturbance = Callable[[int, bytes], "Sequence[tuple[int, bytes | None]]"]
+"""What a faulty writer makes of a message, visible at a tick: what becomes visible, and when; None: a damaged one."""
+
+
+class Box:
+    """A mailbox under time-slice: messages wait until they are visible.
+
+    `every` is the cycle of a writer that writes in every one of them; None: planners and tests do not. `lost`: the
+    writer is known to be dead or to hang.
+    """
+
+    def __init__(self, kind: MessageType, sizes_: Mapping[str, int], every: int | None = None) -> None:
+        self.kind, self.dtype = kind, kind.dtype(sizes_)
+        self.lost = False
+        self.disturbance: Disturbance | None = None
+        self._every = every
+        self._waiting: list[tuple[int, bytes | None]] = []
+        self._now: bytes | None = bytes(self.dtype.itemsize)
+        self._good = bytes(self.dtype.itemsize)
+        self._serial = 0
+        self._good_since = 0
+
+    def publish(self, message: Message, visible_at: int) -> None:
+        """Let `message` be seen from tick `visible_at` on, if nothing disturbs that."""
+        data = bytes(message.raw)
+        for one in ((visible_at, data),) if self.disturbance is None else self.disturbance(visible_at, data):
+            insort(self._waiting, one, key=lambda waiting: waiting[0])
+
+    def withdraw(self, tick: int) -> None:
+        """Undo what is not yet visible at `tick`: its writer died before it was finished."""
+        self._waiting = [one for one in self._waiting if one[0] <= tick]
+
+    def at(self, tick: int) -> tuple[int, bytes | None]:
+        """Return serial and bytes of the newest message visible at `tick`, None if damaged; serial 0: none yet."""
+        while self._waiting and self._waiting[0][0] <= tick:
+            since, self._now = self._waiting.pop(0)
+            self._serial += 1
+            if self._now is not None:
+                self._good, self._good_since = self._now, since
+        return self._serial, self._now
+
+    def good_at(self, tick: int) -> bytes:
+        """Return the newest whole message visible at `tick`."""
+        self.at(tick)
+        return self._good
+
+    def is_lost(self, tick: int) -> bool:
+        """Say whether readers are told that the writer is lost or silent."""
+        if self.lost or self._every is None or not self._serial:
+            return self.lost and self._serial > 0
+        return tick - (self._good_since - self._every) >= SILENT_CYCLES * self._every

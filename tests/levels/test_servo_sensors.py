@@ -1,0 +1,172 @@
+"""The servo level when its sensors lie: found in bounded cycles, braked, and taken over again where the arm stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from backplane.alarms import Alarm
+from tests.levels.arms import config
+from tests.levels.servo_rig import Course, ServoRig
+
+Array = NDArray[np.float64]
+
+BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
+GOAL = np.array([0.6, 1.0, -2.6, 0.4, -1.2, 0.5])
+KINDS = [
+    ("sensor-nan", {"joint": 0}, Alarm.SENSOR_RANGE, 0),
+    ("sensor-nan", {"joint": -1}, Alarm.SENSOR_RANGE, 0),
+    ("sensor-stuck", {"joint": 1}, Alarm.SENSOR_STUCK, 1),
+    ("sensor-stuck", {"joint": -1}, Alarm.SENSOR_STUCK, 1),
+    ("sensor-dropout", {}, Alarm.SENSOR_SILENT, 1),
+    ("sensor-bias", {"size": 0.02, "joint": 2}, Alarm.SENSOR_MODEL, 0),
+    ("sensor-bias", {"size": -0.003, "joint": 5}, Alarm.SENSOR_MODEL, 0),
+    ("sensor-bias", {"size": 3.0, "joint": 1}, Alarm.SENSOR_MODEL, 0),
+    ("sensor-noise", {"size": 0.005, "joint": 0}, Alarm.SENSOR_MODEL, 1),
+]
+
+
+def move() -> Course:
+    return Course(np.array(config("puma560")[0].home), GOAL, 2.0)
+
+
+def rig_under_way(**params: float | str) -> ServoRig:
+    rig = ServoRig(*config("puma560"), **params)
+    rig.run(400, move().at)
+    return rig
+
+
+@pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
+def test_sensor_fault_is_found_in_time_and_the_arm_is_braked_and_taken_over_again(
+    kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
+) -> None:
+    rig = rig_under_way()
+    begun = rig.inject(kind, **parameters)
+    rig.run(200, move().at)
+    first = rig.found[0]
+    assert alarm in rig.alarms()
+    assert first.tick - begun <= bound
+    assert (rig.status.stopped, rig.status.braked, rig.status.holding) == (1, 1, 1)
+    assert rig.status.reason == "the sensors of the arm are not to be trusted"
+    assert rig.alarms().count(alarm) == 1  # once, however long it lasts
+    rig.heal()
+    rig.run(40, move().at)
+    assert (rig.status.stopped, rig.status.braked, rig.status.reason) == (0, 0, "")
+    rig.run(800, lambda _: (GOAL, np.zeros(6)))
+    assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
+    assert (rig.status.violations, rig.status.touches) == (0, 0)
+    assert rig.alarms().count(alarm) == 1
+
+
+@pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
+def test_what_the_status_says_meanwhile_is_near_the_truth(
+    kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
+) -> None:
+    rig = rig_under_way()
+    rig.inject(kind, **parameters)
+    for _ in range(300):
+        rig.run(1, move().at)
+        true = rig.servo.arm.sense()
+        assert rig.status.position == pytest.approx(true.position, abs=0.01)
+        assert np.isfinite(rig.status.velocity).all()
+    assert rig.status.target == pytest.approx(rig.status.position)
+
+
+def test_a_biased_sensor_is_not_trusted_until_the_bias_is_gone() -> None:
+    rig = rig_under_way()
+    rig.inject("sensor-bias", size=0.01, joint=1)
+    rig.run(2000, move().at)
+    assert rig.status.stopped == 1
+    rig.heal()
+    rig.run(21, move().at)
+    assert rig.status.stopped == 0
+
+
+def test_a_bias_is_seen_by_a_restarted_servo_as_well() -> None:
+    rig = rig_under_way()
+    rig.inject("sensor-bias", size=0.02, joint=1)
+    rig.run(5, move().at)
+    for _ in range(3):
+        rig.restart()
+        rig.run(100, move().at)
+        assert rig.status.stopped == 1
+    rig.heal()
+    rig.run(30, move().at)
+    assert rig.status.stopped == 0
+
+
+def test_a_bias_that_begins_while_the_servo_is_dead_is_found_when_it_is_back() -> None:
+    rig = rig_under_way()
+    rig.miss(10_000)
+    for _ in range(20):
+        rig.step()
+    rig.inject("sensor-bias", size=0.05, joint=1)
+    rig.restart()
+    rig.run(1, move().at)
+    assert Alarm.SENSOR_MODEL in rig.alarms()
+
+
+def test_a_sensor_stuck_at_rest_is_found_once_its_joint_is_to_move() -> None:
+    rig = ServoRig(*config("puma560"))
+    home = move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    rig.inject("sensor-stuck", joint=0)
+    rig.run(300, lambda _: (home, np.zeros(6)))
+    assert rig.alarms() == []
+    begun = rig.rack.tick
+    later = Course(home, GOAL, 2.0)
+    rig.run(100, lambda t: later.at(t - begun * 0.0025))
+    found = next(f for f in rig.found if f.finding.alarm not in BRAKES)
+    assert found.finding.alarm in (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL)
+    assert found.finding.subject == 0
+    assert found.tick - rig.acted[0] <= 20
+    rig.heal()
+    rig.run(60, lambda _: (home, np.zeros(6)))
+    rig.run(800, lambda _: (home, np.zeros(6)))
+    assert rig.status.position == pytest.approx(home, abs=1e-3)
+
+
+def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:
+    rig = rig_under_way()
+    torque = rig.status.torque.copy()
+    rig.inject("sensor-dropout")
+    rig.run(1, move().at)
+    rig.heal()
+    assert (rig.status.stopped, rig.status.braked) == (0, 0)
+    assert rig.status.torque == pytest.approx(torque, rel=0.1)
+    rig.run(500, move().at)
+    assert rig.alarms() == []
+    assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
+
+
+@pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
+def test_with_known_velocities_the_arm_may_ramp_to_rest_instead(reaction: str, braked: int) -> None:
+    rig = rig_under_way(on_sensor_fault=reaction)
+    rig.inject("sensor-nan", joint=0)
+    rig.run(1, move().at)
+    assert (rig.status.stopped, rig.status.braked) == (1, 0)
+    rig.run(300, move().at)
+    assert (rig.status.stopped, rig.status.braked) == (1, braked)
+    assert np.abs(rig.servo.arm.sense().velocity).max() < 1e-3
+    rig.heal()
+    rig.run(800, lambda _: (GOAL, np.zeros(6)))
+    assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
+
+
+def delay(kind: str, size: float, cycles: int = 200) -> int | None:
+    """Return the cycles from a fault of this size until it is found; None: it is not in `cycles`."""
+    rig = rig_under_way()
+    begun = rig.inject(kind, size=size, joint=1)
+    rig.run(cycles, move().at)
+    found = [f.tick - begun for f in rig.found if f.finding.alarm is Alarm.SENSOR_MODEL]
+    return found[0] if found else None
+
+
+def test_the_greater_a_fault_the_sooner_it_is_found() -> None:
+    assert [delay("sensor-bias", size) for size in (1e-5, 2e-4, 3e-2)] == [None, 0, 0]
+    noise = [delay("sensor-noise", size) for size in (1e-6, 3e-5, 1e-3)]
+    assert noise[0] is None
+    assert noise[2] is not None
+    assert noise[2] <= 1
+    assert noise[1] is None or noise[1] >= noise[2]

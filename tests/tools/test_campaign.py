@@ -1,0 +1,153 @@
+"""Campaigns on real racks: small ones, few faults; and what they must notice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from backplane.segment import SHM_FOLDER
+from boards.processor import name_process
+from tests.processes import FORKS, forked, runs, wait_until
+from tools.campaign.leftovers import children, left_behind
+from tools.campaign.load import cpu_load
+
+ROOT = Path(__file__).resolve().parents[2]
+BOUND_S = 50
+COMMAND = [sys.executable, "-m", "tools.cli", "campaign"]
+
+
+def campaign(config: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [*COMMAND, str(config), *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+
+
+def trials_in(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()]
+
+
+def test_every_death_and_hang_of_a_lockstep_campaign_is_found_and_survived(small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "campaign"
+    options = ["--lockstep", "--runs", "3", "--seed", "4", "--seconds", "9", "--kinds", "kill,hang,self-test"]
+    done = campaign(small, *options, "--out", out, "--json")
+    report = json.loads(done.stdout)
+    assert (done.returncode, done.stderr, report["shortfalls"]) == (0, "", [])
+    summary = report["summary"]
+    assert summary["injected"] == summary["detected"] == summary["within_bound"] == summary["recovered"] > 2
+    assert (summary["limits_violated"], summary["left_behind"], summary["unexplained"]) == (0, 0, 0)
+    assert summary["tasks_done"] + summary["not_armed"] == summary["trials"] == 3
+    assert json.loads((out / "campaign.json").read_text()) == report
+    assert (out / "campaign.md").read_text().startswith(f"# Campaign on {small}, seed 4: as it must be")
+    assert (out / "campaign.png").read_bytes().startswith(b"\x89PNG")
+    assert [trial["number"] for trial in trials_in(out)] == [1, 2, 3]
+    assert not list(out.glob("*.toml"))
+
+
+def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "campaign"
+    done = campaign(small, "--lockstep", "--kills", "3", "--seconds", "12", "--out", out, "--json")
+    summary = json.loads(done.stdout)["summary"]
+    # How fast the Rack hears of a death depends on how busy this machine is.
+    assert summary["injected"] == summary["detected"] == summary["recovered"] == 3
+    assert (summary["left_behind"], summary["unexplained"]) == (0, 0)
+    assert summary["tasks_done"] == summary["trials"]
+
+
+def test_a_trial_that_falls_short_is_kept_as_a_file_that_repeats_it(small: Path, tmp_path: Path) -> None:
+    out, options = tmp_path / "campaign", ["--lockstep", "--runs", "1", "--seconds", "9", "--kinds", "kill"]
+    # In a rack without restarts its first loss is the end: the faults behind it do not strike.
+    done = campaign(small, *options, "--set", "supervision.restarts=0", "--out", out)
+    (trial,) = trials_in(out)
+    assert trial["ended"] == "safely stopped"
+    assert [fault["seen"] for fault in trial["judgements"]].count("detected") == 1
+    assert (done.returncode == 1) == bool(trial["shortfalls"])
+    for path in out.glob("trial-*.toml"):
+        assert tomllib.loads(path.read_text())["fault"] == trial["faults"]
+
+
+def test_ctrl_c_ends_a_campaign_with_a_report_of_what_was_done(small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "campaign"
+    options = ["--realtime", "--runs", "9", "--seconds", "9", "--kinds", "kill", "--faultless", "0", "--out", str(out)]
+    process = subprocess.Popen([*COMMAND, str(small), *options], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert any(line.startswith("trial 1 of 9") for line in process.stdout)
+        process.send_signal(signal.SIGINT)
+        printed, _ = process.communicate(timeout=BOUND_S)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 1
+    assert "Interrupted: this is what was done until then." in printed
+    report = json.loads((out / "campaign.json").read_text())
+    assert (report["interrupted"], report["summary"]["left_behind"]) == (True, 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--seconds", "9", "--kinds", "murder"], "--kinds murder: no such kind; kinds: kill, "),
+        (["--lockstep", "--realtime"], "--lockstep and --realtime: each excludes the other"),
+        (
+            ["--kills", "3", "--kinds", "kill"],
+            "--kills 3 and --kinds kill: kills from outside are a kind by themselves",
+        ),
+        (["--set", "board.upper.ends_run=false"], "no board ends the run: give --seconds"),
+        (["--set", "clock.wake=no"], 'clock.wake = "no": '),
+    ],
+)
+def test_bad_input_is_one_line_that_lists_what_is_valid(small: Path, options: list[str], line: str) -> None:
+    done = campaign(small, *options)
+    assert (done.returncode, done.stdout) == (2, "")
+    (told,) = done.stderr.splitlines()
+    assert line in told
+
+
+def test_a_file_left_in_shared_memory_is_noticed(rack_name: str) -> None:
+    path = SHM_FOLDER / f"sem.nasrem-rack.{rack_name}.lower"
+    path.touch()
+    try:
+        assert left_behind(rack_name, children()) == [str(path)]
+    finally:
+        path.unlink()
+    assert left_behind(rack_name, children()) == []
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_a_process_left_behind_is_noticed_whoever_its_parent_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tools.campaign.leftovers.BOUND_S", 0.05)
+    rack = f"p{os.getpid()}x"
+
+    def board() -> None:
+        name_process(f"{rack}:lower")
+        signal.pause()
+
+    before = children()
+    with forked(board) as pid:
+        wait_until(lambda: Path(f"/proc/{pid}/comm").read_text().startswith(rack))
+        assert left_behind(rack, before) == [f"process {pid} ({rack}:lower)"]
+        # One that was there before is left out only as a descendant, not under the rack's name.
+        assert left_behind(rack, children()) == [f"process {pid} ({rack}:lower)"]
+        assert left_behind("other", before) == [f"process {pid} ({rack}:lower)"]
+        assert left_behind("other", children()) == []
+
+
+def test_cpu_load_is_a_busy_process_a_core_and_ends_with_its_use() -> None:
+    before = children()
+    with cpu_load() as cores:
+        busy = children() - before
+        assert len(busy) == cores == len(os.sched_getaffinity(0))
+        # Pinned, each to another core; `sched_getaffinity` shows it once the program runs.
+        wait_until(lambda: {tuple(os.sched_getaffinity(pid)) for pid in busy} == _each_core())
+    wait_until(lambda: not any(runs(pid) for pid in busy))
+
+
+def _each_core() -> set[tuple[int, ...]]:
+    return {(core,) for core in os.sched_getaffinity(0)}

@@ -1,0 +1,63 @@
+"""`rack run --faults`: scripts by name and by path, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from backplane.segment import racks
+from boards.config import FAULTS, loads, names
+
+ROOT = Path(__file__).resolve().parents[2]
+BOUND_S = 50
+HANG = '[[fault]]\nkind = "hang"\nboard = "upper"\nat = 0.5\n'
+
+
+def run(config: Path | str, name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tools.cli", "run", str(config), "--set", f"name={name}", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+
+
+def test_a_run_with_a_script_repeats_with_its_faults(small: Path, rack_name: str, tmp_path: Path) -> None:
+    script = tmp_path / "hang.toml"
+    script.write_text(HANG)
+    reports = []
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        done = run(small, rack_name, "--faults", script, "--seconds", "2", "--out", folder, "--json")
+        assert done.returncode == 0, done.stderr
+        reports.append(json.loads(done.stdout))
+    assert reports[0]["digest"] == reports[1]["digest"]
+    assert [fault["struck"] for fault in reports[0]["faults"]] == [200]
+    # The resolved config holds the script: it needs no file to run again.
+    again = loads((tmp_path / "one" / "config.toml").read_text())
+    assert [(fault.kind, fault.at) for fault in again.fault] == [("hang", 0.5)]
+
+
+@pytest.mark.parametrize(
+    ("script", "line"),
+    [
+        ("noisy", f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'),
+        ("[[fault]]\nkind = 'kill'", "fault[0].board: missing; task concerned"),
+        ("[[fault]]\nkind = 'kill'\nboard = 'servo'", 'fault[0].board = "servo": no such task; tasks: upper, lower'),
+        ("[[fault]]\nkind = 'hog'\nboard = 'lower'", 'fault[0].kind = "hog": hog needs real time: in lockstep time'),
+        ("[[fault]\n", "script.toml: not TOML: "),
+        ("[run]\n", "script.toml: run: a script of faults holds [[fault]] tables and nothing else"),
+    ],
+)
+def test_a_script_that_does_not_fit_is_refused_before_anything_starts(
+    small: Path, rack_name: str, tmp_path: Path, script: str, line: str
+) -> None:
+    given = script
+    if "\n" in script or " " in script:
+        given = str(tmp_path / "script.toml")
+        Path(given).write_text(script)
+    done = run(small, rack_name, "--faults", given, "--out", tmp_path / "run")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(line)
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+    assert rack_name not in racks()
