@@ -22,7 +22,7 @@ from backplane.words import Box
 NOT_YET = 1 << 62
 """Tick of the newest message before there is any: its age is below zero, so that nobody finds it too old."""
 STEPS = 4
-"""Messages that a read tries behind a bad one: its work stays bounded."""
+"""Messages that a read tries before a bad one: its work stays bounded."""
 
 
 class Verdict(IntEnum):
@@ -127,7 +127,7 @@ class Reader:
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
-        self._fetched = Slots(segment, self.spec)
+        self.slots = self._fetched = Slots(segment, self.spec)
         self._box = self._fetched.box
         # The last good message has a buffer of its own: a corrupt copy never reaches it.
         self._good = Slots(segment, self.spec)
@@ -177,12 +177,19 @@ class Reader:
         if self._box[0] - serial >= self._fetched.mask:
             return self._cut_off()
         self._blame(serial)
-        # Lost, damaged or forged: what was published before it may not have been read yet.
-        for older in range(serial - 1, max(self._serial, serial - 1 - STEPS), -1):
-            if self._fetched.visible_at(older) <= tick:
+        return self._step_back(serial, tick)
+
+    def _step_back(self, serial: int, tick: int) -> Reading:
+        """Take the newest good message before one that was lost, damaged or forged, if it has not been read yet."""
+        fetched, tries = self._fetched, STEPS
+        for older in range(serial - 1, max(self._serial, serial - fetched.depth), -1):
+            if fetched.holds(older) and fetched.visible_at(older) <= tick:
                 if self._obtain(older):
                     return self._readings[Verdict.NEW]
                 self._blame(older)
+                tries -= 1
+                if not tries:
+                    break
         return self._readings[Verdict.OLD if self._serial else Verdict.NONE]
 
     def _obtain(self, serial: int) -> bool:

@@ -6,18 +6,21 @@ of an earlier tick, two messages for one release, a message stamped behind the e
 
 from __future__ import annotations
 
+from zlib import crc32
+
 from backplane.alarms import Alarm
 from backplane.cycle_record import CycleRecord
 from backplane.episodes import Episodes
 from backplane.mailbox import Reader
 from backplane.segment import Segment
-from backplane.slots import Slots
 from backplane.words import Slot
 
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
 # Plain integers for the hot path.
-_STAMP, _SERIAL, _TICK, _VISIBLE = (int(Slot[name]) for name in ("STAMP_NS", "SERIAL", "TICK", "VISIBLE_AT"))
+_STAMP, _CRC, _SERIAL, _TICK, _VISIBLE = (
+    int(Slot[name]) for name in ("STAMP_NS", "CRC", "SERIAL", "TICK", "VISIBLE_AT")
+)
 
 
 class MessageWatch:
@@ -29,7 +32,8 @@ class MessageWatch:
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         self.seen = -1
         self._reader, self._spec, self._episodes = reader, reader.spec, episodes
-        self._slots = Slots(segment, reader.spec)
+        self._slots = reader.slots
+        self._heads_and_bodies = reader.slots.heads_and_bodies()
         self._cycles = CycleRecord(segment, reader.spec.writer)
         self._newest = LONG_AGO
         self._is_sliced = reader.spec.protocol == "time-slice"
@@ -72,38 +76,50 @@ class MessageWatch:
 
     def _walk(self, found: int, tick: int) -> None:
         """Judge one message after the other, up to the newest found."""
-        slots, spec = self._slots, self._spec
+        heads_and_bodies, mask, taken, late = (
+            self._heads_and_bodies,
+            self._slots.mask,
+            self._reader.serial,
+            self._late_from,
+        )
         # What a late reader finds overwritten cannot be judged.
-        serial, newest, missing = max(self.seen, slots.box[0] - slots.mask), self._newest, 0
-        while serial < found:
-            words = slots.head_words(serial + 1)
-            if words[_SERIAL] == serial + 1:
-                newest = self._judge_one(serial + 1, words, newest, tick)
-            elif self._is_lost(serial + 1):
-                # In its slot it would be visible from here on at the earliest: until then it may not be missed.
-                if self._is_sliced and newest + spec.every + spec.delay > tick:
-                    break
-                newest, missing = newest + spec.every, missing + 1
-            serial += 1
-        self.seen, self._newest = serial, newest
-        if missing:
-            self._find(Alarm.GAP, tick, missing)
+        for serial in range(max(self.seen, self._slots.box[0] - mask) + 1, found + 1):
+            head, body = heads_and_bodies[serial & mask]
+            released = head[_TICK]
+            # The reader has checked the message that it took, and only that.
+            if (
+                head[_SERIAL] == serial
+                and self._newest < released > head[_VISIBLE] - late
+                and (serial == taken or crc32(body) == head[_CRC])
+            ):
+                self._newest = released
+            elif not self._judge_odd(serial, head, tick):
+                break
+            self.seen = serial
+
+    def _judge_odd(self, serial: int, head: memoryview, tick: int) -> bool:
+        """Judge a message that is not as most are; False when it is too early to."""
+        newest, released = self._newest, head[_TICK]
+        if head[_SERIAL] == serial:
+            if released < newest:
+                self._find(Alarm.DISORDER, tick, newest - released, since=released)
+            elif head[_VISIBLE] - released >= self._late_from:
+                self._judge_late(released, head[_VISIBLE], head[_STAMP], tick)
+            self._newest = max(released, newest)
+        elif self._is_lost(serial):
+            # In its slot it would be visible from here on at the earliest: until then it may not be missed.
+            if self._is_sliced and newest + self._spec.every + self._spec.delay > tick:
+                return False
+            self._newest = newest + self._spec.every
+            self._find(Alarm.GAP, tick, 1)
+            return True
+        if self._is_damaged(serial):
+            self._find(Alarm.DAMAGED, tick)
+        return True
 
     def _is_lost(self, serial: int) -> bool:
         """Say whether a slot was never filled with its message: it is empty, or holds another one, whole."""
         return self._slots.head_words(serial)[_SERIAL] == 0 or self._slots.is_whole(serial)
-
-    def _judge_one(self, serial: int, words: memoryview, newest: int, tick: int) -> int:
-        """Judge a message in its slot; return the newest release tick so far."""
-        released, visible = words[_TICK], words[_VISIBLE]
-        if released < newest:
-            self._find(Alarm.DISORDER, tick, newest - released, since=released)
-        elif visible - released >= self._late_from:
-            self._judge_late(released, visible, words[_STAMP], tick)
-        # The reader has checked the message that it took, and only that.
-        if serial != self._reader.serial and self._is_damaged(serial):
-            self._find(Alarm.DAMAGED, tick)
-        return max(released, newest)
 
     def _judge_late(self, released: int, visible: int, stamp_ns: int, tick: int) -> None:
         """Tell a message that was held back from one that was finished late: its cycle had ended before."""

@@ -13,7 +13,7 @@ from backplane.episodes import Episodes
 from backplane.mailbox import NOT_YET, Reader
 from backplane.process import GONE, STOPPED, state_of
 from backplane.segment import Segment
-from backplane.slots import Slots, pid_of
+from backplane.slots import pid_of
 from backplane.words import Block, Box, Slot
 
 MUTE_CYCLES = 3
@@ -66,7 +66,7 @@ class SilenceWatch:
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
         self._reader, self._episodes, self._witness = reader, episodes, witness
-        self._slots = Slots(segment, spec)
+        self._slots = reader.slots
         self._cycles = CycleRecord(segment, spec.writer)
         self._block = segment.block(spec.writer)
         self._told: dict[Alarm, int] = {}

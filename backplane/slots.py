@@ -146,8 +146,11 @@ class Slots:
 
     def is_whole(self, serial: int) -> bool:
         """Say whether the message in that serial's slot passes its CRC, without copying it."""
-        slot = self._slots[serial & self.mask]
-        return self._slot_words[serial & self.mask][_CRC] == crc32(slot[CRC_FROM:])
+        return self._slot_words[serial & self.mask][_CRC] == crc32(self._slots[serial & self.mask][CRC_FROM:])
+
+    def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
+        """Return each slot's head, as words, and the part of the slot that its CRC covers."""
+        return [(head, slot[CRC_FROM:]) for head, slot in zip(self._slot_words, self._slots, strict=True)]
 
     def visible_at(self, serial: int) -> int:
         """Return the tick from which the message in that serial's slot may be read."""

@@ -22,7 +22,7 @@ COMMANDS = [
     for block in SHELL.findall(README.read_text())
     for line in block.splitlines()
     # What needs a run, or a running rack, of another line has tests of its own in tests/tools.
-    if line.startswith("rack ") and not re.search(r"<|\.toml|RUN|rack (status|stop|record|replay)|--view", line)
+    if line.startswith("rack ") and not re.search(r"<|\.toml|RUN|rack (status|stop|record|replay|inject|estop)|kill-each-board|--view", line)
 ]
 
 

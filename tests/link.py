@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from time import monotonic_ns
 from typing import NamedTuple
 
 import numpy as np
 
+from backplane import semaphores
 from backplane.alarms import Alarm, AlarmWriter, alarm_ring
 from backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
+from backplane.layout import Protocol
 from backplane.ring import mailbox_ring
-from backplane.segment import Segment
-from backplane.trace import TraceWriter
+from backplane.segment import SHM_FOLDER, Segment, unlink
+from backplane.trace import Flag, TraceWriter
 from backplane.words import Block
 from boards.faults.kinds import KINDS, NUMBERS
 from boards.ports import InputPorts, OutputPorts
 from levels.level import Reading
-from tests.backplane.bus import NAME
+from tests.backplane.bus import NAME, layout, mailbox, task
 
 
 class Seen(NamedTuple):
@@ -41,8 +45,9 @@ class WritingTask:
         """Write, trace the cycle, say that it is done; the clock stands at `now`, or at `tick`."""
         message = self.ports.messages.point
         message.id, message.row = tick, tick
+        cut_off = self.ports.bus_errors
         in_time = self.ports.write(tick, tick if now is None else now, self._inputs)
-        self.end(tick)
+        self.end(tick, int(Flag.BUS_ERROR) if self.ports.bus_errors > cut_off else 0)
         return in_time
 
     def end(self, tick: int, flags: int = 0) -> None:
@@ -89,9 +94,9 @@ class Link:
     def run(self, first: int, last: int) -> None:
         """Do the ticks from `first` up to and without `last`."""
         for tick in range(first, last):
-            due = [task for task in (self.writer, self.reader) if tick % task.every == 0]
-            for task in reversed(due) if self._reader_first else due:
-                task.cycle(tick)
+            due = [end for end in (self.writer, self.reader) if tick % end.every == 0]
+            for end in reversed(due) if self._reader_first else due:
+                end.cycle(tick)
 
     def fault(self, kind: str, *parameters: float, seed: int = 7, mailbox: int = -1) -> FaultEntry:
         """Write with one more fault from now on."""
@@ -122,3 +127,31 @@ class Link:
 def struck(entry: FaultEntry) -> int:
     """Return the tick at which a fault has first acted."""
     return entry[Entry.STRUCK_TICK]
+
+
+MakeLink = Callable[..., Link]
+
+
+@contextmanager
+def links(rack: str) -> Iterator[MakeLink]:
+    """Make the links of a test: protocol, periods of writer and reader, who comes first, slots; then remove them."""
+    made: list[Link] = []
+
+    def make(
+        protocol: Protocol = "time-slice",
+        rates: tuple[int, int] = (1, 1),
+        reader_first: bool = False,
+        depth: int = 1024,
+    ) -> Link:
+        box = mailbox(protocol, every=rates[0], delay=rates[0], depth=depth)
+        tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
+        segment = Segment.create(layout(f"{rack}-{len(made)}", [box], tasks), "")
+        semaphores.create(segment.layout)
+        made.append(Link(segment, reader_first))
+        return made[-1]
+
+    yield make
+    for found in made:
+        semaphores.unlink_all(found.segment.rack)
+        unlink(found.segment.rack)
+    assert not [path.name for path in SHM_FOLDER.iterdir() if rack in path.name]
