@@ -84,7 +84,8 @@ class SilenceWatch:
 
     def _look_into(self, tick: int, age: int) -> None:
         pid = pid_of(self._slots.box[_CLAIMANT])
-        if age >= self._stale_after and self._witness.is_gone(pid, tick):
+        # Whoever finds a loss marks it, and a new process may be there before it cycles.
+        if age >= self._stale_after and (self._block[_LOST] or self._witness.is_gone(pid, tick)):
             self._tell(Alarm.STALE, tick, age)
         elif self._is_mute(tick):
             self._tell(Alarm.MUTE, tick, age)

@@ -47,6 +47,7 @@ class PlannerTask(Task):
 
     def _pass(self, tick: int, start: int, read: int) -> None:
         """Let a release go by without a plan; trace it when it came too late, or others were skipped."""
+        self.outputs.flush(tick, self.clock.now())
         in_time = self.clock.now() < tick + self.slice
         if not in_time or self.next_cycle.skipped:
             self.finish(tick, start, read, monotonic_ns(), tick + self.slice, in_time)

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -16,6 +17,7 @@ from backplane import semaphores
 from backplane.address_map import CLOCK
 from backplane.alarms import Alarm
 from backplane.digest import digest
+from backplane.errors import EmergencyStopError
 from backplane.fault_table import FaultTable
 from backplane.lines import UtilityLines
 from backplane.segment import Segment, unlink
@@ -27,9 +29,10 @@ from boards.config.schema import RackConfig
 from boards.crate_line import CrateLine
 from boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
 from boards.errors import LaunchError
-from boards.events import Event, EventKind
+from boards.events import Event
 from boards.faults.kinds import KINDS
 from boards.heartbeat import Heartbeat
+from boards.journal import Journal
 from boards.launch import Launch, modules
 from boards.outcome import Cause, Outcome
 from boards.recovery import Recovery
@@ -50,15 +53,20 @@ class Rack:
 
     def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None) -> None:
         self.config = config
-        self.events: list[Event] = []
         self.segment: Segment
         self.outcome: Outcome | None = None
-        self._on_event = on_event
+        self._journal = Journal(on_event)
         self._crate: CrateLine | None = None
         self._pids: dict[str, int] = {}
         self._faults: list[str] = []
+        self._is_armed = False
         self._is_beyond_help = False
         self._cause: Cause | None = None
+
+    @property
+    def events(self) -> list[Event]:
+        """What has happened so far."""
+        return self._journal.events
 
     @classmethod
     def from_file(cls, name_or_path: str | Path, overrides: Sequence[str] = ()) -> Self:
@@ -90,11 +98,11 @@ class Rack:
         crate.send(Preload(modules(self.config), tuple(sys.path)))
         self._plan = plan = Launch.of(self.config)
         remove_dead(self.config.name)
-        self.segment = Segment.create(plan.layout, self.config.text())
+        self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
         self._set_words()
         semaphores.create(plan.layout)
         crate.send(Open(self.config.name, plan.crate_priority))
-        self._tell("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
+        self._journal.tell("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
         self._expect(Opened)
         # The crate has them open and every board inherits them: with no name nothing can be left behind.
         semaphores.unlink(plan.layout)
@@ -103,7 +111,7 @@ class Rack:
         self._await_ready()
         self._inject()
         for note in plan.notes(self.segment):
-            self._tell("ready", "", note)
+            self._journal.tell("ready", "", note)
 
     def _set_words(self) -> None:
         words, clock = self.segment.words, self.config.clock
@@ -137,10 +145,15 @@ class Rack:
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
         self._alarms = AlarmWatch(self.segment, self.config)
         self._heartbeat = Heartbeat(self.segment)
-        # Whoever starts a run resets the latch, as an operator would; it refuses while an input is not good.
-        UtilityLines(self.segment).reset_emergency_stop()
+        self._reset_latch()
         self._line.ask(PowerOn(CLOCK, clock))
-        self._tell("start", CLOCK, self.config.clock.mode)
+        self._journal.tell("start", CLOCK, self.config.clock.mode)
+
+    def _reset_latch(self) -> None:
+        """Reset the emergency stop for the one who starts the run, as soon as every input is good."""
+        with suppress(EmergencyStopError):
+            UtilityLines(self.segment).reset_emergency_stop()
+            self._is_armed = True
 
     def run(self, seconds: float | None = None) -> Outcome:
         """Run for `seconds` of simulated time, or until the task ends; return how it ended."""
@@ -156,13 +169,15 @@ class Rack:
         while self.outcome is None:
             self._listen(deadline - time.monotonic())
             for line in self._line.printed():
-                self._tell("printed", "", line)
+                self._journal.tell("printed", "", line)
             for heard in self._alarms.drain():
                 self._take(heard)
             for board in self._heartbeat.hanging():
-                self._tell("detection", board, f"'{board}' gives no sign of life", "hang")
+                self._journal.tell("detection", board, f"'{board}' gives no sign of life", "hang")
                 self._recovery.end_hanging(board)
             self._recovery.advance()
+            if not self._is_armed:
+                self._reset_latch()
             if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help:
                 self._end()
             if time.monotonic() >= deadline:
@@ -172,7 +187,7 @@ class Rack:
     def stop(self, why: str) -> None:
         """Have the run end at the next tick."""
         self._cause = self._cause or "stopped"
-        self._tell("stop", "", why)
+        self._journal.tell("stop", "", why)
         self.segment.words[System.STOP_REQUEST] = 1
 
     def _listen(self, timeout_s: float) -> None:
@@ -198,12 +213,12 @@ class Rack:
             case None:
                 self._is_beyond_help = True
                 text = "the crate ended, and every board with it"
-                self._tell("died", "crate", text, "died")
+                self._journal.tell("died", "crate", text, "died")
                 self._give_up("crate", text)
 
     def _take(self, heard: Heard) -> None:
         """Make an event of an alarm, and act where it is the Rack that must."""
-        self._keep(heard.event)
+        self._journal.keep(heard.event)
         if heard.alarm == Alarm.HANG:
             self._recovery.end_hanging(self._plan.layout.tasks[heard.subject].name)
         elif heard.alarm == Alarm.CLOCK_STOPPED:
@@ -218,7 +233,7 @@ class Rack:
     def _lose(self, end: Ended) -> None:
         """Tell of a board's end, and restart it or give it up."""
         text = f"board '{end.name}' ended: {_status(end.status)}"
-        self._tell("died", end.name, text, "died", end.seen_ns, end.tick)
+        self._journal.tell("died", end.name, text, "died", end.seen_ns, end.tick)
         if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
             self._give_up(end.name, text)
             return
@@ -228,17 +243,17 @@ class Rack:
             self._give_up(end.name, f"{text}; its restarts are used up")
         else:
             nth = f"restart {restart.number} of at most {restart.most} in {restart.within_s:g} s"
-            self._tell("reaction", end.name, nth, "restart")
+            self._journal.tell("reaction", end.name, nth, "restart")
 
     def _give_up(self, board: str, text: str) -> None:
         self._faults.append(text)
         self._cause = "board lost"
-        self._tell("reaction", board, f"'{board}' is given up", "given_up")
+        self._journal.tell("reaction", board, f"'{board}' is given up", "given_up")
 
     def _end(self) -> None:
         """Take the end of the run down: why, how far, and the digest; then let the boards go."""
         for heard in self._alarms.drain():
-            self._keep(heard.event)
+            self._journal.keep(heard.event)
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
         state, reason = self._plan.final_state(self.segment)
@@ -248,7 +263,7 @@ class Rack:
             self._faults += self._plan.latched(self.segment)
         self._let_go()
         self.outcome = Outcome(cause, stop, state, reason, digest(self.segment, stop), tuple(self._faults))
-        self._tell("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
+        self._journal.tell("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
 
     def close(self) -> None:
         """Take everything down; afterwards no process and no segment of this rack is left."""
@@ -276,22 +291,6 @@ class Rack:
         """Tell the boards and the clock that the run is over."""
         self.segment.words[System.STOP_REQUEST] = 1
         self.segment.words[System.STATE] = Run.STOPPED
-
-    def _tell(
-        self, kind: EventKind, board: str, text: str, code: str = "", at_ns: int | None = None, tick: int | None = None
-    ) -> None:
-        """Tell of something now, or at CLOCK_MONOTONIC `at_ns` and `tick`."""
-        if tick is None:
-            running = hasattr(self, "segment") and self.segment.words[System.STATE] != Run.STARTING
-            tick = self.segment.words[System.TICK] if running else -1
-        now_ns = time.time_ns()
-        stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
-        self._keep(Event(stamp_ns, tick, kind, board, text, code))
-
-    def _keep(self, event: Event) -> None:
-        self.events.append(event)
-        if self._on_event:
-            self._on_event(event)
 
     def _state(self, task: str) -> int:
         return self.segment.block(task)[Block.STATE]

@@ -102,9 +102,8 @@ class Task(ABC):
 
     def count_bus(self) -> None:
         """Bring the bus accounts of the control block up to date; not needed in every cycle."""
-        readers, writers = self.inputs.readers.values(), self.outputs.writers.values()
-        block = self.block
-        block[Block.READS] = sum(r.accesses for r in readers)
-        block[Block.READ_BYTES] = sum(r.transfers * r.spec.size for r in readers)
-        block[Block.WRITES] = sum(w.serial for w in writers)
-        block[Block.WRITE_BYTES] = sum(w.serial * w.spec.size for w in writers)
+        reads, writes, block = self.inputs.take_traffic(), self.outputs.take_traffic(), self.block
+        block[Block.READS] += reads[0]
+        block[Block.READ_BYTES] += reads[1]
+        block[Block.WRITES] += writes[0]
+        block[Block.WRITE_BYTES] += writes[1]

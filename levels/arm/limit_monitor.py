@@ -19,43 +19,46 @@ class LimitMonitor:
     `count` is the number of steps that broke a limit; `first` says which one the first of them broke.
     """
 
-    def __init__(self, cell: Cell, substeps: int) -> None:
-        model, bounds, joints = cell.model, cell.bounds, len(cell.qpos)
-        joint_of = model.dof_jntid[cell.dof]
-        self._names = [model.joint(int(joint)).name for joint in joint_of]
-        self._q, self._qd = np.zeros((substeps, model.nq)), np.zeros((substeps, model.nv))
-        self._motors, self._brakes = np.zeros((substeps, model.nv)), np.zeros((substeps, model.nv))
-        self._columns = (cell.qpos, cell.dof)
-        self._seen = np.zeros((3, substeps, joints))
-        low, high = bounds.position[:, 0], bounds.position[:, 1]
-        self._low = np.stack((low, -bounds.velocity, -bounds.torque))[:, None, :]
-        self._high = np.stack((high, bounds.velocity, bounds.torque))[:, None, :]
+    def __init__(self, cell: Cell, data: mujoco.MjData, substeps: int) -> None:
+        """Watch `data`, of which a tick takes `substeps` steps."""
+        model, bounds = cell.model, cell.bounds
+        self._names = [model.joint(int(joint)).name for joint in model.dof_jntid[cell.dof]]
+        # Whole rows are recorded, at no more cost than the arm's part of them; what is not the arm's has no limits.
+        self._live = data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied
+        ends = np.cumsum([model.nq, model.nv, model.nv])
+        self._seen = np.zeros((substeps, ends[-1]))
+        self._parts = [tuple(np.split(row, ends[:-1])) for row in self._seen]
+        self._columns = np.stack((cell.qpos, ends[0] + cell.dof, ends[1] + cell.dof))
+        self._low, self._high = np.full(ends[-1], -np.inf), np.full(ends[-1], np.inf)
+        self._low[self._columns] = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
+        self._high[self._columns] = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
         self.count = 0
         self.first = ""
 
-    def look(self, data: mujoco.MjData, substep: int) -> None:
+    def look(self, substep: int) -> None:
         """Record the step that has just been made, number `substep` of its tick."""
-        self._q[substep], self._qd[substep] = data.qpos, data.qvel
-        self._motors[substep], self._brakes[substep] = data.qfrc_actuator, data.qfrc_applied
+        q, qd, motors, brakes = self._live
+        position, velocity, torque = self._parts[substep]
+        position[:] = q
+        velocity[:] = qd
+        np.add(motors, brakes, out=torque)
 
     def judge(self, time_s: float) -> None:
         """Judge the steps of one tick that began at simulated `time_s`."""
-        seen, (qpos, dof) = self._seen, self._columns
-        self._motors += self._brakes
-        for part, values in zip((0, 1, 2), (self._q, self._qd, self._motors), strict=True):
-            np.take(values, qpos if part == 0 else dof, axis=1, out=seen[part])
         # What is no number is not within limits either.
-        if not ((seen >= self._low).all() and (seen <= self._high).all()):
+        if not ((self._seen >= self._low).all() and (self._seen <= self._high).all()):
             self._count(time_s)
 
     def _count(self, time_s: float) -> None:
         wrong = ~((self._seen >= self._low) & (self._seen <= self._high))
-        self.count += int(wrong.any(axis=(0, 2)).sum())
+        steps = wrong.any(axis=1)
+        self.count += int(steps.sum())
         if self.first:
             return
-        substep = int(wrong.any(axis=(0, 2)).argmax())
-        part, joint = (int(x[0]) for x in np.nonzero(wrong[:, substep]))
-        (what, unit), value = WHAT[part], self._seen[part, substep, joint]
-        low, high = self._low[part, 0, joint], self._high[part, 0, joint]
+        substep = int(steps.argmax())
+        part, joint = (int(at[0]) for at in np.nonzero(wrong[substep, self._columns]))
+        column = self._columns[part, joint]
+        what, unit = WHAT[part]
         where = f"joint '{self._names[joint]}' at {time_s:.4f} s, step {substep}"
-        self.first = f"{what} {value:.6g} {unit} of {where}; {low:g} to {high:g} is permitted"
+        permitted = f"{self._low[column]:g} to {self._high[column]:g} is permitted"
+        self.first = f"{what} {self._seen[substep, column]:.6g} {unit} of {where}; {permitted}"

@@ -47,7 +47,8 @@ class SimulatedArm:
         self._brake = Brake(cell.limits.acceleration, self._dynamics)
         self._brake.close(cell.home)  # until the first command
         self._contacts = ContactMonitor(cell)
-        self._limits = LimitMonitor(cell, self._substeps)
+        self._limits = LimitMonitor(cell, self._data, self._substeps)
+        self._farthest = FARTHEST * cell.bounds.torque
         self._most: Array | None = None
         obstacles = cell.bodies[len(cell.object_qpos) :]
         names = scene.obstacles
@@ -181,11 +182,10 @@ class SimulatedArm:
 
     def _wrong(self, torque: Array) -> Finding | None:
         """Return what is wrong with a command that no servo level gives."""
-        share = np.abs(torque) / self._cell.bounds.torque
-        if (share <= FARTHEST).all():
+        if (np.abs(torque) <= self._farthest).all():
             return None
         if np.isfinite(torque).all():
-            joint = int(share.argmax())
+            joint = int((np.abs(torque) / self._farthest).argmax())
             return Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint]))
         return Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax()))
 
@@ -212,7 +212,7 @@ class SimulatedArm:
         for substep in range(self._substeps):
             mujoco.mj_step(m, d)
             self._contacts.look(d, d.time)
-            self._limits.look(d, substep)
+            self._limits.look(substep)
         self._limits.judge(self._now_s)
         self.fault = self._broken()
         if self.fault:

@@ -22,8 +22,8 @@ FOLLOWS = 0.3
 """Part of a rise in torque that a sound motor gives at least."""
 TOO_FAST = 0.99
 """Part of a velocity limit; a joint that may come to it while motors lack torque leaves no time to be sure."""
-TURNING = 2.0 * FRICTION_SPEED
-"""Velocity, rad/s, around which dry friction may be anything up to its full value."""
+TURNING = np.array([[-2.0], [2.0]])
+"""Velocities, in `FRICTION_SPEED`, between which dry friction may be anything up to its full value."""
 
 
 class ActuatorMonitor:
@@ -40,8 +40,9 @@ class ActuatorMonitor:
         self._fastest = TOO_FAST * cell.bounds.velocity
         self._noise = NOISE * self._limits
         joints = len(self._dry)
-        self._inertia, self._bias, self._velocity = np.zeros((joints, joints)), np.zeros(joints), np.zeros(joints)
-        self._torque = np.zeros(joints)
+        self._inertia, self._twice_inertia = np.zeros((joints, joints)), np.zeros((joints, joints))
+        self._bias, self._velocity, self._torque = np.zeros((3, joints))
+        self._friction = np.zeros((2, joints))
         self._begun = False
         self._cycles, self._joint = 0, -1
         self._told = self._gave = self._most = 0.0
@@ -74,12 +75,21 @@ class ActuatorMonitor:
 
     def _left_over(self, velocity: Array, terms: Terms) -> Array:
         """Return the torques, N m, that neither the motion nor any dry friction took."""
-        gain = (velocity - self._velocity) / (2.0 * self._period_s)
-        left = self._torque - 0.5 * (self._bias + terms.bias) - (self._inertia + terms.inertia) @ gain
-        slower, faster = np.minimum(velocity, self._velocity), np.maximum(velocity, self._velocity)
-        least = self._dry * np.tanh((slower - TURNING) / FRICTION_SPEED)
-        most = self._dry * np.tanh((faster + TURNING) / FRICTION_SPEED)
-        return np.asarray(left - np.minimum(np.maximum(left, least), most))
+        gain = velocity - self._velocity
+        gain *= 0.5 / self._period_s
+        np.add(self._inertia, terms.inertia, out=self._twice_inertia)
+        left = self._bias + terms.bias
+        left *= -0.5
+        left += self._torque
+        left -= self._twice_inertia @ gain
+        friction = self._friction
+        np.minimum(velocity, self._velocity, out=friction[0])
+        np.maximum(velocity, self._velocity, out=friction[1])
+        friction /= FRICTION_SPEED
+        friction += TURNING
+        np.tanh(friction, out=friction)
+        friction *= self._dry
+        return np.asarray(left - np.minimum(np.maximum(left, friction[0]), friction[1]))
 
     def _lacking(self, left: Array, velocity: Array) -> Finding | None:
         """Follow cycles in which motors that lack torque explain all that is left over, until it is sure."""
@@ -98,6 +108,7 @@ class ActuatorMonitor:
         self._most = max(self._most, abs(told[joint] - lacks[joint]))
         ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
         if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
+            self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
         return None
 

@@ -25,7 +25,8 @@ class Stopping:
     """Weighs demands on the arm, faults of its sensors and faults of its motors: the strongest reaction wins.
 
     A motor at fault is tried again after a while: the arm holds with it, and follows when that went well for
-    `good_cycles`. `reason` says in one line why the arm does not follow; empty: it does.
+    `good_cycles`. Where it fails while the arm ramps or holds with it, the brakes close. `reason` says in one line why
+    the arm does not follow; empty: it does.
     """
 
     def __init__(self, params: ServoParams, retry_ticks: int, every: int) -> None:
@@ -33,6 +34,7 @@ class Stopping:
         self._on_motors = Reaction[params.on_actuator_fault.upper()]
         self._retry_ticks, self._good_ticks = retry_ticks, params.good_cycles * every
         self._retry_at: int | None = None
+        self._standing = self._on_motors
         self._motors = ""
         self.reason = ""
 
@@ -43,9 +45,10 @@ class Stopping:
 
     def motor_fails(self, joint: str, tick: int) -> Reaction:
         """Take in that a motor does not do what it is told; return the reaction."""
+        self._standing = self._on_motors if self._retry_at is None else Reaction.BRAKE
         self._retry_at = tick + self._retry_ticks
         self._motors = f"joint '{joint}': the motor does not give the torque it was told"
-        return self._on_motors
+        return self._standing
 
     def decide(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
         """Return the reaction of this cycle."""
@@ -63,4 +66,4 @@ class Stopping:
             self._retry_at = None
             return Reaction.NONE
         self.reason = self._motors
-        return self._on_motors if tick < retry_at else Reaction.HOLD
+        return self._standing if tick < retry_at else Reaction.HOLD

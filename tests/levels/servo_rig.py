@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from backplane.alarms import Alarm
 from backplane.message import Message
-from levels.level import Demand, Fault, Finding
+from levels.level import Fault, Finding
 from levels.messages import JOINT_SET_POINT
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
@@ -56,7 +56,6 @@ class ServoRig:
         self.positions: list[Array] = []
         self.found: list[Found] = []
         self.acted: list[int] = []
-        self.demand = Demand.NONE
         self._faults: list[Fault] = []
 
     @property
@@ -91,9 +90,8 @@ class ServoRig:
             self.positions.append(self.status.position.copy())
 
     def step(self) -> None:
-        """Run one tick as a board does: hand in the demand, take out what was found and which faults acted."""
+        """Run one tick as a board does: take out what was found and which faults acted."""
         servo = self.servo
-        servo.demand = self.demand
         self.rack.step()
         self.found += [Found(self.rack.tick - 1, finding) for finding in servo.findings]
         self.acted += [self.rack.tick - 1] * bool(servo.acted)

@@ -24,9 +24,9 @@ class Dash:
         self._home, self._joint, self._side = np.array(robot.home), joint, side
         self.speed, self._hardest = 0.95 * bounds.velocity[joint], 0.9 * robot.acceleration[joint]
         self.way = self.speed**2 / self._hardest + 0.3
-        low, high = np.clip(bounds.position[joint], -2.6, 2.6) + [0.05, -0.05]
+        low, high = np.clip(bounds.position[joint], -2.6, 2.6)
         self._start = self._home.copy()
-        middle = np.clip(self._home[joint], low + self.way / 2, high - self.way / 2)
+        middle = np.clip(self._home[joint], low + 0.05 + self.way / 2, high - 0.05 - self.way / 2)
         self._start[joint] = middle - side * self.way / 2
 
     @property
@@ -117,13 +117,24 @@ def test_a_motor_at_fault_is_tried_again_and_the_set_points_are_followed_once_it
     assert (rig.status.violations, len(found(rig))) == (0, 1)
 
 
-def test_an_arm_with_a_weak_motor_may_ramp_to_rest_instead_of_braking() -> None:
+@pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
+def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(reaction: str, braked: int) -> None:
+    rig, dash = dashing("puma560", 0, 1.0, on_actuator_fault=reaction)
+    rig.inject("actuator-saturated", joint=0, part=0.1)
+    rig.run(195, dash.at)
+    assert len(found(rig)) == 1
+    assert (rig.status.stopped, rig.status.braked) == (1, braked)
+    assert np.abs(rig.status.velocity).max() < 0.01
+    assert rig.status.violations == 0
+
+
+def test_an_arm_that_falls_while_it_is_to_ramp_to_rest_is_braked() -> None:
     rig, dash = dashing("k1607", 0, 1.0, on_actuator_fault="stop")
     rig.inject("actuator-saturated", joint=3, part=0.05)
-    rig.run(20, dash.at)
+    rig.run(6, dash.at)
     assert (rig.status.stopped, rig.status.braked) == (1, 0)
     rig.run(150, dash.at)
-    assert (rig.status.violations, rig.status.stopped) == (0, 1)
+    assert (rig.status.violations, rig.status.stopped, rig.status.braked) == (0, 1, 1)
 
 
 def test_a_motor_that_is_asked_for_nothing_is_not_missed() -> None:

@@ -151,6 +151,18 @@ def test_recovery_lasts_until_the_last_reaction_is_undone() -> None:
     assert (fault.reactions, fault.is_recovered, fault.recovery) == (("restart", "brakes_closed"), True, 240)
 
 
+def test_brakes_that_closed_for_missed_cycles_are_open_again_when_that_is_told() -> None:
+    fault = judged(strike("overrun", "lower", 100), event(104, "reaction", "brakes_closed", "lower", value=3.0))
+    assert (fault.reactions, fault.is_recovered, fault.recovery) == (("brakes_closed",), True, 4)
+    demanded = judged(strike("command-nan", "lower", 100), event(100, "reaction", "brakes_closed", "lower"))
+    assert not demanded.is_recovered
+
+
+def test_a_reaction_long_after_a_fault_is_not_its_own() -> None:
+    late = event(5000, "reaction", "brakes_closed", "lower", value=2.0)
+    assert judged(strike("command-nan", "lower", 100), late).reactions == ()
+
+
 def test_a_reaction_that_is_not_undone_is_no_recovery() -> None:
     events = (event(100, "reaction", "restart", "lower"), event(300, "recovery", "rejoined", "upper"))
     fault = judged(strike("kill", "lower", 100), *events)

@@ -47,7 +47,9 @@ class Course:
     def window(self, target: Target, length: int) -> int:
         """Return the ticks from the beginning of a fault to the next: it is seen, over, and recovered from."""
         restart = self.restart_s if target.kind in ("kill", "hang", "lock-held", EXTERNAL) else 0.0
-        return max(length, 5 * target.cycle) + target.cycle + round((restart + SETTLE_S) * self.second)
+        # A board that hangs is killed as soon as it is found: its fault is over then.
+        lasts = 0 if target.kind == "hang" else length
+        return max(lasts, 5 * target.cycle) + target.cycle + round((restart + SETTLE_S) * self.second)
 
 
 class Deck:

@@ -127,9 +127,11 @@ class _Judge:
         return max(0, event.time_ns - self._offset_ns - strike.time_ns) * 1e-6
 
     def _horizon(self, place: int) -> int:
-        """Return the tick up to which reactions and recoveries are of this fault: the next one strikes then."""
-        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick]
-        return min(later, default=self._last + 1)
+        """Return the tick up to which reactions are of this fault: the next one strikes then, or it is long over."""
+        strike = self._strikes[place]
+        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > strike.tick]
+        over = max(strike.ends if strike.ends >= 0 else self._last, strike.tick + (self._bound(strike, None) or 0))
+        return min([*later, over + self._settle, self._last + 1])
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
         reactions, recovery, recovered = self._aftermath(strike, horizon)
@@ -161,8 +163,8 @@ class _Judge:
         """Return what was done about a fault, the ticks until the last of it was undone, whether all of it was."""
         if strike.tick < 0:
             return (), None, True
-        after = [e for e in self._events if strike.tick <= e.tick < horizon]
-        reactions = [e for e in after if e.kind == "reaction"]
+        after = [e for e in self._events if e.tick >= strike.tick]
+        reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon]
         undone = [self._undone(reaction, after) for reaction in reactions]
         whole = all(tick is not None for tick in undone)
         recovery = max((tick for tick in undone if tick is not None), default=None) if whole else None
@@ -174,6 +176,9 @@ class _Judge:
         codes = UNDONE_BY.get(reaction.code)
         if codes is None:
             return None
+        if reaction.code == "brakes_closed" and reaction.value > 0:
+            # They were closed for the cycles without torque, which are told of when there is torque again.
+            return reaction.tick
         board = reaction.board if reaction.code == "restart" else None
         ticks = (
             e.tick

@@ -80,7 +80,7 @@ class Judged:
             "judgements": [asdict(fault) for fault in self.verdict.faults],
             "unexplained": [asdict(event) for event in self.verdict.unexplained],
             "shortfalls": self.shortfalls,
-            "events": [asdict(event) for event in trial.events if event.kind != MISS],
+            "events": [asdict(event) for event in trial.events],
         }
 
 
