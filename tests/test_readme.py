@@ -17,12 +17,13 @@ README = Path(__file__).parent.parent / "README.md"
 BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
+ELSEWHERE = re.compile(r"<|\.toml|RUN|rack (status|stop|record|replay|inject|estop)|kill-each-board|--view")
+"""Commands that need a run, or a running rack, of another line: they have tests of their own in tests/tools."""
 COMMANDS = [
     line.partition("#")[0].split()[1:]
     for block in SHELL.findall(README.read_text())
     for line in block.splitlines()
-    # What needs a run, or a running rack, of another line has tests of its own in tests/tools.
-    if line.startswith("rack ") and not re.search(r"<|\.toml|RUN|rack (status|stop|record|replay|inject|estop)|kill-each-board|--view", line)
+    if line.startswith("rack ") and not ELSEWHERE.search(line)
 ]
 
 

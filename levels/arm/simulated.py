@@ -182,7 +182,7 @@ class SimulatedArm:
 
     def _wrong(self, torque: Array) -> Finding | None:
         """Return what is wrong with a command that no servo level gives."""
-        if (np.abs(torque) <= self._farthest).all():
+        if np.count_nonzero(np.abs(torque) <= self._farthest) == torque.size:
             return None
         if np.isfinite(torque).all():
             joint = int((np.abs(torque) / self._farthest).argmax())

@@ -64,11 +64,11 @@ class ActuatorMonitor:
         if not self._begun:
             return None
         far = np.abs(astray)
-        if far.max() > self._following:
+        if np.count_nonzero(far > self._following):
             joint = int(far.argmax())
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
         left = self._left_over(velocity, terms)
-        if (np.abs(left) <= self._noise).all():
+        if not np.count_nonzero(np.abs(left) > self._noise):
             self._cycles = 0
             return None
         return self._lacking(left, velocity)

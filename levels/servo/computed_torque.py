@@ -43,5 +43,5 @@ class ComputedTorque:
         )
         torque = inertia @ acceleration + terms.bias + self._dynamics.friction(wanted.velocity)
         possible = np.minimum(np.maximum(torque, -self._limits), self._limits)
-        self.cut += bool((possible != torque).any())
+        self.cut += bool(np.count_nonzero(possible != torque))
         return np.asarray(possible)

@@ -86,13 +86,13 @@ class SensorMonitor:
             # Driven on for a while, then braked: faster in between than at both ends.
             room += passed_s * 4.0 * self._every * self._tick_s * self._braking
         fits = np.abs(q - self.position - way) <= room  # never true for what is no number
-        if self.faulty or not fits.all() or not self._stirs(q, qd, change, wanted):
+        if self.faulty or np.count_nonzero(fits) < fits.size or not self._stirs(q, qd, change, wanted):
             self._doubtful(q, qd, way, fits, passed_s)
             return
         self._take(q, qd, change != 0.0)
 
     def _take(self, q: Array, qd: Array, changed: Mask) -> None:
-        if self.doubt.any():
+        if np.count_nonzero(self.doubt):
             # What does not change proves nothing: it may be stuck.
             self.doubt[changed] = 0.0
         np.copyto(self.position, q)
@@ -102,8 +102,8 @@ class SensorMonitor:
 
     def _stirs(self, q: Array, qd: Array, change: Array, wanted: Array | None) -> bool:
         """Say whether no joint has been still for too long while it was under way."""
-        if wanted is None or change.all():
-            if self._still.any():
+        if wanted is None or np.count_nonzero(change) == change.size:
+            if np.count_nonzero(self._still):
                 self._still[:] = 0
             return True
         still = (change == 0.0) & (q == self._raw[0]) & (np.abs(wanted) > UNDER_WAY)

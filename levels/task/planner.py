@@ -58,7 +58,7 @@ class TaskPlanner(Planner):
             return False
         if self._plan is not None:
             return True
-        if not (read.servo.is_there and read.world.is_there):
+        if not (read.servo.is_there and read.world.is_there and read.world.value.revision):
             return False
         objects = len(self.context.scene.objects)
         speeds = np.linalg.norm(read.world.value.velocity[:objects], axis=1)

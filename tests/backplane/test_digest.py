@@ -8,8 +8,12 @@ from backplane.digest import chains, digest
 from backplane.protocols import open_writer
 from backplane.segment import Segment, unlink
 from backplane.words import System
+from boards.faults.masquerade import masquerade
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, exit_status, fork
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
 
 OTHER = "writer.other"
 
@@ -85,7 +89,14 @@ def test_where_no_message_is_left_there_is_no_chain(bus: Segment) -> None:
 
 def test_a_damaged_message_has_no_hash_and_the_one_before_it_has(bus: Segment) -> None:
     write(bus, NAME, list(range(500)))
-    before = chains(bus, 2 * 499)[NAME]
+    before = chains(bus, 999)[NAME]
     bus.bytes[message_address(bus, 500)] ^= 1
     assert chains(bus, 5000)[NAME] == before == (499, before[1])
     assert before[1] != bytes(8)
+
+
+def test_a_forged_message_is_no_part_of_the_run(bus: Segment) -> None:
+    write(bus, NAME, [1, 2, 3])
+    before = chains(bus, 100)[NAME]
+    assert exit_status(fork(lambda: masquerade(bus, NAME, 6))) == 0
+    assert chains(bus, 100)[NAME] == before

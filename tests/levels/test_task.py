@@ -276,6 +276,16 @@ def test_planner_that_is_lost_plans_again_only_what_was_lost(finished: bool, awa
     assert rack.boxes["task.plan"].at(rack.tick)[0] == published
 
 
+def test_world_of_which_nothing_was_seen_is_not_planned_with() -> None:
+    rack = WholeRack(actions=[HOME])
+    rack.after(4, lambda: rack.lose("world", 1000))
+    rack.run(2.4)
+    assert rack.read("world.model").revision == 0
+    assert rack.run_to_end(20.0).state == State.DONE
+    assert rack.read("task.plan").count == 1
+    assert rack.seconds > 5.0
+
+
 def test_plan_that_is_lost_on_its_way_is_published_again() -> None:
     rack = WholeRack(actions=[HOME])
     rack.disturb("task.plan", lose_some(1.0, seed=1), 1000)

@@ -107,7 +107,7 @@ _SHAPES: Mapping[str, Callable[[Drawing], Shape]] = {
     "lock-held": lambda d: Shape(0, {"killed": d.rng.randint(0, 1)}),
     "clock-stop": lambda d: Shape(d.ticks(0.05, 0.3)),
     "clock-skip": lambda d: Shape(0, {"ticks": d.rng.randint(1, 20)}),
-    "clock-jitter": lambda d: Shape(d.ticks(0.2, 0.6), {"late": d.part(0.6, 0.95)}),
+    "clock-jitter": lambda d: Shape(d.ticks(0.2, 0.6), {"late": d.part(0.75, 0.95)}),
     "sensor-nan": lambda d: Shape(d.ticks(0.02, 0.3), {"joint": d.joint()}),
     "sensor-stuck": lambda d: Shape(max(d.cycles(40, 80), d.ticks(0.3, 0.8)), {"joint": d.joint()}),
     "sensor-dropout": lambda d: Shape(d.ticks(0.02, 0.3)),
