@@ -73,10 +73,10 @@ class PathMotion:
         away = np.linalg.norm(points - position, axis=1)
         before, behind = np.append(np.inf, away[:-1]), np.append(away[1:], np.inf)
         near = np.flatnonzero((away <= before) & (away <= behind) & (away <= away.min() + NEAREST_STEP_RAD))
-        last = max(len(points) - 1, 1)
-        nearest = near[np.argmin(np.abs(near / last - progress))]
-        # Rounding must not put it beyond the end, where no trajectory begins.
-        return self._rest(min(self.path.length * nearest / last, self.path.length), position)
+        # Linear spacing has an exact end: rounding must not put it beyond that, where no trajectory begins.
+        places = np.linspace(0.0, self.path.length, len(points))[near]
+        nearest = np.argmin(np.abs(places - progress * self.path.length))
+        return self._rest(float(places[nearest]), position)
 
     def follow(self, trajectory: Trajectory) -> None:
         """Set out along `trajectory`, which begins at rest where the motion rests."""

@@ -98,7 +98,7 @@ def test_a_request_to_a_crate_that_is_gone_is_a_launch_error(line: CrateLine) ->
     wait_until(lambda: not runs(line.pid))
     with pytest.raises(LaunchError, match="the crate has ended"):
         line.send(Preload((), ()))
-    line.power_off()
+    line.ask(Preload((), ()))
 
 
 def test_an_interrupt_from_the_terminal_is_the_racks_affair() -> None:

@@ -1,4 +1,4 @@
-"""Boards that die or hang come back on the grid, as their policy permits; what repeats in lockstep repeats with them."""
+"""Boards that die or hang come back on the grid, as their policy permits; a run in lockstep repeats with them."""
 
 from __future__ import annotations
 

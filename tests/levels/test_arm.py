@@ -131,15 +131,16 @@ def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Cal
     made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # what hits something is stopped by that
     extremes, rng = watched(made), np.random.default_rng(7)
     for block in range(60):
-        side = rng.choice([-2.0, 2.0], len(made.home)) if block < 40 else np.full(len(made.home), 2.0)
+        side = rng.choice([-1.0, 1.0], len(made.home)) if block < 40 else np.ones(len(made.home))
         for _ in range(20):
             arm.drive(side * made.bounds.torque, 0.0)
             arm.step(1)
     assert extremes.steps == 60 * 20 * 5
-    assert extremes.speed <= 1.0
-    assert extremes.torque <= 1.0
+    assert 0.9 < extremes.speed <= 1.0
+    assert 0.9 < extremes.torque <= 1.0
     assert extremes.beyond <= 0.0
-    assert arm.clipped == 60 * 20
+    assert arm.clipped > 60 * 20 / 2
+    assert arm.violations == 0
 
 
 def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(watched: Callable[[Cell], Extremes]) -> None:

@@ -158,6 +158,11 @@ def test_brakes_that_closed_for_missed_cycles_are_open_again_when_that_is_told()
     assert not demanded.is_recovered
 
 
+def test_brakes_that_closed_for_missed_cycles_are_no_reaction_to_a_lost_message() -> None:
+    stall = event(104, "reaction", "brakes_closed", "lower", value=3.0)
+    assert judged(strike("drop", "upper", 100, 110), stall).reactions == ()
+
+
 def test_a_reaction_long_after_a_fault_is_not_its_own() -> None:
     late = event(5000, "reaction", "brakes_closed", "lower", value=2.0)
     assert judged(strike("command-nan", "lower", 100), late).reactions == ()
@@ -193,3 +198,9 @@ def test_in_lockstep_a_death_is_bounded_in_ticks_for_the_wall_clock_means_nothin
     (fault,) = judge([strike("kill", "lower", 100)], [died, END], LAYOUT, 0, lockstep=True).faults
     # It strikes before its tick is given out: the Rack may see the tick before.
     assert (fault.seen, fault.delay, fault.bound, fault.delay_ms, fault.is_within) == ("detected", 0, 2, None, True)
+
+
+def test_in_lockstep_a_death_that_the_clock_knows_nothing_of_has_neighbours_for_its_bound() -> None:
+    died = Event(900 * TICK_NS, 190, "died", "lower", "died", "died")
+    (fault,) = judge([strike(EXTERNAL, "lower", 100)], [died, END], LAYOUT, 0, lockstep=True).faults
+    assert (fault.seen, fault.delay, fault.bound, fault.is_within) == ("detected", 90, None, True)

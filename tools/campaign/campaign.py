@@ -100,6 +100,8 @@ class Campaign:
 
     def _trials(self, plans: list[Plan]) -> Iterator[Judged]:
         for place, plan in enumerate(plans, 1):
+            if self._interrupt.is_set:
+                return
             self._progress.begin(f"trial {place} of {len(plans)}: {_told(plan)}")
             judged = self._judged(plan)
             if judged.trial.is_interrupted:
@@ -111,7 +113,7 @@ class Campaign:
             yield judged
 
     def _faultless(self, results: Results) -> None:
-        """Run without faults, first alone, then beside busy processes; what is interrupted counts as far as it came."""
+        """Run without faults, first alone, then beside busy processes."""
         for loaded in (False, True) if self.order.faultless_s else ():
             with ExitStack() as stack:
                 load = stack.enter_context(cpu_load()) if loaded else 0
@@ -120,13 +122,14 @@ class Campaign:
                     beside = f" beside {load} busy processes" if load else ""
                     self._progress.begin(f"faultless{beside}, {left:.0f} s to go")
                     seconds = left if left < self._ticks / self._second else self.order.seconds
-                    judged.append(self._judged(Plan(0, "faultless", lockstep=False), seconds))
-                    outcome = judged[-1].trial.outcome
-                    if outcome is None:
+                    run = self._judged(Plan(0, "faultless", lockstep=False), seconds)
+                    if run.trial.is_interrupted:
                         break
-                    ran_s = outcome.ticks / self._second / self._config.clock.speed
+                    judged.append(run)
+                    # A run that has not come to an end would come to none the next time either.
+                    ran_s = run.trial.outcome.ticks / self._second if run.trial.outcome else left
                     total += ran_s
-                    self._progress.end(ran_s, judged[-1].ended, judged[-1].shortfalls)
+                    self._progress.end(ran_s, run.ended, run.shortfalls)
                 results.faultless.append(Faultless(load, total, tuple(judged)))
 
     def _judged(self, plan: Plan, seconds: float | None = None) -> Judged:

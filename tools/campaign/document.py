@@ -72,12 +72,7 @@ def _summary(results: Results) -> Document:
 
 def _shortfalls(results: Results, summary: Document) -> list[str]:
     """Return what fails the campaign, a line each."""
-    found = [
-        f"{_run_of(judged)}: {line}"
-        for judged in results.runs
-        for line in judged.shortfalls
-        # What a size is to show in the curve, it need not be found.
-    ]
+    found = [f"{_run_of(judged)}: {line}" for judged in results.runs for line in judged.shortfalls]
     if summary["drawn"] and not summary["injected"]:
         found.append(f"none of the {summary['drawn']} faults that were drawn has struck")
     return found

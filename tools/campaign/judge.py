@@ -10,7 +10,7 @@ from backplane.fault_table import Injection
 from backplane.layout import Layout
 from boards.events import Event
 from boards.faults.bounds import RACK_NS, bound_ticks, cycle_ticks
-from boards.faults.kinds import KINDS, NUMBERS
+from boards.faults.kinds import KINDS, NUMBERS, Where
 from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates
 from tools.campaign.ending import Strike
 from tools.campaign.plan import EXTERNAL
@@ -26,6 +26,8 @@ UNDONE_BY: Mapping[str, tuple[str, ...]] = {
     "restart": ("rejoined",),
 }
 """Reactions, and the recovery that undoes each."""
+TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
+"""Where faults strike that keep boards from their cycles."""
 AFTERMATH_S = 1.5
 """Simulated time behind a fault's end, and its recovery, in which detections may still be its consequence."""
 
@@ -112,16 +114,20 @@ class _Judge:
     def _detection(self, event: Event, strike: Strike) -> Detection:
         delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
         if event.kind == "died":
-            bound_ms = None if delay_ms is None else RACK_NS * 1e-6
-            return Detection(event, delay, self._bound(strike, None), delay_ms, bound_ms)
+            bound_ms = None if self._lockstep else RACK_NS * 1e-6
+            return Detection(event, delay, self._death_bound(strike), delay_ms, bound_ms)
         if event.code != "clock_skipped":
             delay -= self._left_out.between(strike.tick, event.tick)
         reader = event.board if event.code in MAILBOX_ALARMS else None
         return Detection(event, delay, self._bound(strike, reader), delay_ms)
 
+    def _death_bound(self, strike: Strike) -> int | None:
+        # Lockstep waits for the end of a process that its own clock has killed. Of any other it knows nothing, and
+        # goes as fast as it can: neither ticks nor time are a measure.
+        return None if self._lockstep and strike.kind == EXTERNAL else self._bound(strike, None)
+
     def _delay_ms(self, event: Event, strike: Strike) -> float | None:
-        # Lockstep waits for the end of a process that its clock has killed, and goes on meanwhile after any other.
-        if self._lockstep and strike.kind != EXTERNAL:
+        if self._lockstep:
             return None
         # A fault of the arm is counted behind the cycle that has already found it.
         return max(0, event.time_ns - self._offset_ns - strike.time_ns) * 1e-6
@@ -164,7 +170,7 @@ class _Judge:
         if strike.tick < 0:
             return (), None, True
         after = [e for e in self._events if e.tick >= strike.tick]
-        reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon]
+        reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon and _can_react(strike, e)]
         undone = [self._undone(reaction, after) for reaction in reactions]
         whole = all(tick is not None for tick in undone)
         recovery = max((tick for tick in undone if tick is not None), default=None) if whole else None
@@ -199,6 +205,12 @@ class _Judge:
         around = [strike for strike, first, last in windows if strike.tick >= 0 and first <= event.tick <= last]
         # A process that ends ends of its own fault, not of another's.
         return not any(event.kind != "died" or strike.board == event.board for strike in around)
+
+
+def _can_react(strike: Strike, reaction: Event) -> bool:
+    """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles."""
+    for_misses = reaction.code == "brakes_closed" and reaction.value > 0
+    return not for_misses or strike.kind == EXTERNAL or KINDS[NUMBERS[strike.kind]].where in TAKE_CYCLES
 
 
 def _takes_mailbox(strike: Strike) -> bool:

@@ -8,6 +8,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from tools.campaign.statistics import part_of_bound
 
@@ -25,7 +26,7 @@ WIDEST = 1.5
 
 def plot(report: Report, path: Path) -> None:
     """Draw a campaign's document into a PNG file: delays against bounds, curves of size, recovery times."""
-    figure = Figure(figsize=SIZE_IN, layout="constrained")
+    figure = Figure(figsize=SIZE_IN)
     delays, sizes, recoveries = (figure.add_subplot(place) for place in _places(figure))
     _delays(delays, report)
     _sizes(sizes, report)
@@ -37,7 +38,10 @@ def plot(report: Report, path: Path) -> None:
 
 def _places(figure: Figure) -> Iterator[SubplotSpec]:
     """Yield the places of the three drawings: one on the left, two on the right."""
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
+    # Fixed, for the numbers beside the left one and the names of kinds need their room whatever there is to draw.
+    grid = figure.add_gridspec(
+        2, 2, width_ratios=(1.15, 1.0), left=0.11, right=0.98, top=0.91, bottom=0.08, wspace=0.52, hspace=0.28
+    )
     yield from (grid[:, 0], grid[0, 1], grid[1, 1])
 
 
@@ -56,13 +60,18 @@ def _delays(axes: Axes, report: Report) -> None:
         axes.annotate(_numbers(report["by_kind"][kind]), place, xycoords=frame, fontsize=8, va="center")
     axes.axvline(1.0, color=BOUND, linewidth=1.2)
     axes.set_xlim(-0.03, WIDEST)
-    axes.set_yticks(range(len(kinds)), kinds, fontsize=8)
+    _name_rows(axes, kinds)
     axes.set_xlabel("time to detection as a part of its bound (red); the mark is the median")
     axes.set_title("found of injected; median, longest, cycles", fontsize=9, loc="right")
 
 
 def _row(axes: Axes, row: int, values: list[float]) -> None:
     axes.scatter(values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False)
+
+
+def _name_rows(axes: Axes, names: list[str]) -> None:
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_ylim(-0.7, max(0, len(names) - 1) + 0.7)
 
 
 def _part(fault: Report) -> float | None:
@@ -79,20 +88,26 @@ def _numbers(figures: Report) -> str:
 
 def _sizes(axes: Axes, report: Report) -> None:
     """Draw the size of a sensor's error against the time to its detection."""
-    edge = axes.get_xaxis_transform()
+    edge, clock_ms = axes.get_xaxis_transform(), report["clock_ms"]
+    longest = 10 * clock_ms
     for (kind, found), marker in zip(report["sizes"].items(), "os", strict=False):
         seen = [point for point in found["curve"] if point["delay_ms"] is not None]
         unseen = [point["size"] for point in found["curve"] if point["delay_ms"] is None]
         sizes, delays = [point["size"] for point in seen], [point["delay_ms"] for point in seen]
+        longest = max([longest, *delays])
         (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
         axes.plot(unseen, [1.0] * len(unseen), "x", color=line.get_color(), transform=edge, clip_on=False)
         axes.axvline(found["judged_from"], color=line.get_color(), linewidth=0.9, linestyle=":")
     if report["sizes"]:
         axes.set_xscale("log")
-        axes.set_yscale("symlog", linthresh=report["clock_ms"])
-        axes.set_ylim(bottom=-0.5 * report["clock_ms"])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        # Linear up to a tick, for a delay of none is the usual one.
+        axes.set_yscale("symlog", linthresh=clock_ms)
+        axes.set_ylim(-0.5 * clock_ms, 1.5 * longest)
         axes.legend(fontsize=8)
-    axes.set_xlabel("size of the error, rad; from the dotted line on it must be seen; x: it was not", fontsize=9)
+    else:
+        axes.text(0.5, 0.5, "no size was tried", ha="center", transform=axes.transAxes, fontsize=9)
+    axes.set_xlabel("size of the error, rad (dotted: must be seen from there; x: was not seen)", fontsize=9)
     axes.set_ylabel("time to detection, ms")
 
 
@@ -106,6 +121,6 @@ def _recoveries(axes: Axes, report: Report) -> None:
     rows = {kind: found for kind, found in seconds.items() if found}
     for row, found in enumerate(rows.values()):
         _row(axes, row, found)
-    axes.set_yticks(range(len(rows)), list(rows), fontsize=8)
+    _name_rows(axes, list(rows))
     axes.set_xlim(left=0.0)
     axes.set_xlabel("from the strike until every reaction is undone, s of simulated time", fontsize=9)

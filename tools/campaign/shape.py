@@ -109,7 +109,8 @@ _SHAPES: Mapping[str, Callable[[Drawing], Shape]] = {
     "clock-skip": lambda d: Shape(0, {"ticks": d.rng.randint(1, 20)}),
     "clock-jitter": lambda d: Shape(d.ticks(0.2, 0.6), {"late": d.part(0.75, 0.95)}),
     "sensor-nan": lambda d: Shape(d.ticks(0.02, 0.3), {"joint": d.joint()}),
-    "sensor-stuck": lambda d: Shape(max(d.cycles(40, 80), d.ticks(0.3, 0.8)), {"joint": d.joint()}),
+    # A joint that stands does not show that its sensor is stuck: some are stuck all together, for long enough.
+    "sensor-stuck": lambda d: Shape(d.ticks(0.5, 1.5), {"joint": d.rng.choice((-1, d.rng.randrange(d.joints)))}),
     "sensor-dropout": lambda d: Shape(d.ticks(0.02, 0.3)),
     "sensor-bias": _sized,
     "sensor-noise": _sized,
