@@ -21,8 +21,8 @@ from backplane.words import Block, Head, System
 
 _RELEASED = int(Block.RELEASED)
 _TICK = int(System.TICK)
-CLOCK_TICKS = 3
-"""Ticks after which a release that does not come is the clock's: it is looked at then."""
+CLOCK_TICKS = 2
+"""Ticks behind a release that does not come after which the clock is looked at."""
 CLOCK_SILENT_S = 0.5
 """Time without a tick after which the clock is called stopped though its process could run."""
 CHECK_S = 0.25

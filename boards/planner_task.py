@@ -43,7 +43,9 @@ class PlannerTask(Task):
         with self._critical_section():
             in_time = self.outputs.write(tick, self.clock.now(), self.inputs)
         self.block[Block.PLANS] += 1
-        self.finish(tick, start, read, processed, tick + self.slice, in_time, Flag.PLANNED)
+        # A plan begun late has its whole slice: a release that had come in it by then is answered with it.
+        done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
+        self.finish(tick, start, read, processed, tick + self.slice, in_time, Flag.PLANNED, done)
 
     def _pass(self, tick: int, start: int, read: int) -> None:
         """Let a release go by without a plan; trace it when it came too late, or others were skipped."""

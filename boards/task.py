@@ -70,9 +70,20 @@ class Task(ABC):
             self._lockstep_clock.release()
 
     def finish(
-        self, tick: int, start: int, read: int, processed: int, deadline: int, in_time: bool, flags: int = 0
+        self,
+        tick: int,
+        start: int,
+        read: int,
+        processed: int,
+        deadline: int,
+        in_time: bool,
+        flags: int = 0,
+        done: int | None = None,
     ) -> None:
-        """Close a cycle: trace it, count it, say that it is done. `deadline` is a tick, the others times in ns."""
+        """Close a cycle: trace it, count it, say that it is done, with `done` all releases up to that tick.
+
+        `deadline` and `done` are ticks, the times in ns.
+        """
         end = monotonic_ns()
         block, skipped, lockstep = self.block, self.next_cycle.skipped, self.clock.is_lockstep
         missed = not in_time or (not lockstep and end > self.clock.time_of(deadline))
@@ -86,7 +97,7 @@ class Task(ABC):
         block[_CYCLES] += 1
         block[_MISSED] += missed
         block[_SKIPPED] += skipped
-        block[_DONE] = tick
+        block[_DONE] = tick if done is None else done
         self.tell_clock()
         if not block[_CYCLES] & 63:
             self.count_bus()

@@ -204,3 +204,11 @@ def test_in_lockstep_a_death_that_the_clock_knows_nothing_of_has_neighbours_for_
     died = Event(900 * TICK_NS, 190, "died", "lower", "died", "died")
     (fault,) = judge([strike(EXTERNAL, "lower", 100)], [died, END], LAYOUT, 0, lockstep=True).faults
     assert (fault.seen, fault.delay, fault.bound, fault.is_within) == ("detected", 90, None, True)
+
+
+def test_a_fault_too_slight_to_count_explains_its_own_detection_and_no_other() -> None:
+    slight = replace(strike("actuator-off", "lower", 100, 150), tick=-1, count=0)
+    own, other = found(104, "actuator", "lower", "elbow"), found(104, "sensor_range", "lower", "elbow")
+    found_out = verdict([slight], own, other)
+    assert found_out.faults[0].seen == "not struck"
+    assert found_out.unexplained == (other,)

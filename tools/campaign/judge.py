@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from backplane.fault_table import Injection
 from backplane.layout import Layout
 from boards.events import Event
 from boards.faults.bounds import RACK_NS, bound_ticks, cycle_ticks
-from boards.faults.kinds import KINDS, NUMBERS, Where
-from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates
+from boards.faults.kinds import KINDS, NUMBERS
+from tools.campaign.aftermath import aftermath
+from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, fits
 from tools.campaign.ending import Strike
 from tools.campaign.plan import EXTERNAL
 from tools.campaign.shape import SIZED, judged_size
@@ -20,14 +21,6 @@ Seen = Literal["detected", "missed", "not struck"]
 Bound = Callable[[Strike, str | None], int | None]
 """Ticks in which a fault must be found, by a reader or, None, by whoever else."""
 
-UNDONE_BY: Mapping[str, tuple[str, ...]] = {
-    "brakes_closed": ("brakes_opened",),
-    "demand": ("demand",),
-    "restart": ("rejoined",),
-}
-"""Reactions, and the recovery that undoes each."""
-TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
-"""Where faults strike that keep boards from their cycles."""
 AFTERMATH_S = 1.5
 """Simulated time behind a fault's end, and its recovery, in which detections may still be its consequence."""
 
@@ -140,7 +133,7 @@ class _Judge:
         return min([*later, over + self._settle, self._last + 1])
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
-        reactions, recovery, recovered = self._aftermath(strike, horizon)
+        after = aftermath(strike, self._events, horizon)
         seen: Seen = "not struck" if strike.tick < 0 else "missed" if best is None else "detected"
         return Judgement(
             kind=strike.kind,
@@ -160,57 +153,32 @@ class _Judge:
             bound=best.bound if best else self._bound(strike, None),
             bound_ms=best.bound_ms if best else None,
             is_within=best is not None and best.is_within,
-            reactions=reactions,
-            is_recovered=recovered,
-            recovery=recovery,
+            reactions=after.reactions,
+            is_recovered=after.is_recovered,
+            recovery=after.recovery,
         )
-
-    def _aftermath(self, strike: Strike, horizon: int) -> tuple[tuple[str, ...], int | None, bool]:
-        """Return what was done about a fault, the ticks until the last of it was undone, whether all of it was."""
-        if strike.tick < 0:
-            return (), None, True
-        after = [e for e in self._events if e.tick >= strike.tick]
-        reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon and _can_react(strike, e)]
-        undone = [self._undone(reaction, after) for reaction in reactions]
-        whole = all(tick is not None for tick in undone)
-        recovery = max((tick for tick in undone if tick is not None), default=None) if whole else None
-        names = tuple(dict.fromkeys(e.code for e in reactions))
-        return names, None if recovery is None else recovery - strike.tick, whole
-
-    def _undone(self, reaction: Event, after: Sequence[Event]) -> int | None:
-        """Return the tick at which a reaction was undone; None when it was not."""
-        codes = UNDONE_BY.get(reaction.code)
-        if codes is None:
-            return None
-        if reaction.code == "brakes_closed" and reaction.value > 0:
-            # They were closed for the cycles without torque, which are told of when there is torque again.
-            return reaction.tick
-        board = reaction.board if reaction.code == "restart" else None
-        ticks = (
-            e.tick
-            for e in after
-            if e.kind == "recovery" and e.code in codes and e.tick >= reaction.tick and board in (None, e.board)
-        )
-        return min(ticks, default=None)
 
     def _window(self, strike: Strike, judgement: Judgement) -> tuple[Strike, int, int]:
         """Return the ticks in which detections are the fault's, or its consequence."""
         ends = strike.ends if strike.ends >= 0 else self._last
-        last = max(ends, strike.tick + (judgement.recovery or 0), strike.tick + (judgement.bound or 0))
-        return strike, strike.tick - 1, last + self._settle
+        first = strike.tick if strike.tick >= 0 else strike.began
+        last = max(ends, first + (judgement.recovery or 0), first + (judgement.bound or 0))
+        return strike, first - 1, last + self._settle
 
     def _is_unexplained(self, event: Event, windows: Sequence[tuple[Strike, int, int]]) -> bool:
         if event.kind not in ("detection", "died"):
             return False
-        around = [strike for strike, first, last in windows if strike.tick >= 0 and first <= event.tick <= last]
-        # A process that ends ends of its own fault, not of another's.
-        return not any(event.kind != "died" or strike.board == event.board for strike in around)
+        around = (strike for strike, first, last in windows if strike.began >= 0 and first <= event.tick <= last)
+        return not any(_explains(strike, event) for strike in around)
 
 
-def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles."""
-    for_misses = reaction.code == "brakes_closed" and reaction.value > 0
-    return not for_misses or strike.kind == EXTERNAL or KINDS[NUMBERS[strike.kind]].where in TAKE_CYCLES
+def _explains(strike: Strike, event: Event) -> bool:
+    """Say whether an event in a fault's time can be its consequence."""
+    if strike.tick < 0:
+        # It was too slight to count as an injection, and may have been found all the same.
+        return fits(event, replace(strike, tick=strike.began))
+    # A process that ends ends of its own fault, not of another's.
+    return event.kind != "died" or strike.board == event.board
 
 
 def _takes_mailbox(strike: Strike) -> bool:

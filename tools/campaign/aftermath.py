@@ -1,0 +1,54 @@
+"""What was done about a fault, and when all of it was undone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from boards.events import Event
+from boards.faults.kinds import KINDS, NUMBERS, Where
+from tools.campaign.ending import Strike
+from tools.campaign.plan import EXTERNAL
+
+UNDONE_BY: Mapping[str, str] = {"brakes_closed": "brakes_opened", "demand": "demand", "restart": "rejoined"}
+"""Reactions, and the recovery that undoes each."""
+TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
+"""Where faults strike that keep boards from their cycles."""
+
+
+class Aftermath(NamedTuple):
+    """Reactions by code, whether all of them were undone, and the ticks from the strike to the last undone."""
+
+    reactions: tuple[str, ...] = ()
+    is_recovered: bool = True
+    recovery: int | None = None
+
+
+def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermath:
+    """Return what came of a fault; reactions from tick `horizon` on are not to it."""
+    if strike.tick < 0:
+        return Aftermath()
+    after = [event for event in events if event.tick >= strike.tick]
+    reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon and _can_react(strike, e)]
+    undone = [_undone(reaction, after) for reaction in reactions]
+    names = tuple(dict.fromkeys(event.code for event in reactions))
+    if any(tick is None for tick in undone):
+        return Aftermath(names, is_recovered=False)
+    last = max((tick for tick in undone if tick is not None), default=None)
+    return Aftermath(names, True, None if last is None else last - strike.tick)
+
+
+def _can_react(strike: Strike, reaction: Event) -> bool:
+    """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles."""
+    for_misses = reaction.code == "brakes_closed" and reaction.value > 0
+    return not for_misses or strike.kind == EXTERNAL or KINDS[NUMBERS[strike.kind]].where in TAKE_CYCLES
+
+
+def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
+    """Return the tick at which a reaction was undone; None when it was not."""
+    if reaction.code == "brakes_closed" and reaction.value > 0:
+        # They were closed for the cycles without torque, which are told of when there is torque again.
+        return reaction.tick
+    code, board = UNDONE_BY.get(reaction.code), reaction.board if reaction.code == "restart" else None
+    later = (e for e in after if e.kind == "recovery" and e.code == code and e.tick >= reaction.tick)
+    return min((event.tick for event in later if board in (None, event.board)), default=None)
