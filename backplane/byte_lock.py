@@ -37,5 +37,7 @@ class ByteLock:
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._give_back)
 
     def close(self) -> None:
-        """Release the lock for good."""
-        os.close(self._fd)
+        """Release the lock for good; once is enough."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 from pathlib import Path
 
 GONE = "ZX"
@@ -44,6 +45,16 @@ def is_alive(pid: int, started: int = 0) -> bool:
     """Say whether the process runs; with `started`, whether it is still that same process."""
     found = start_time(pid) if pid > 0 else 0
     return found > 0 and started in (0, found)
+
+
+def readable(fd: int, timeout_s: float) -> bool:
+    """Wait until a descriptor can be read, a pidfd until its process has ended; False when the time is over.
+
+    Whatever its number: `select` takes none above 1023.
+    """
+    waiting = select.poll()
+    waiting.register(fd, select.POLLIN)
+    return bool(waiting.poll(max(0.0, timeout_s) * 1000))
 
 
 def pin(core: int) -> None:

@@ -13,6 +13,7 @@ from backplane import semaphores
 from backplane.alarms import Alarm, AlarmWriter, alarm_ring
 from backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
 from backplane.layout import Protocol
+from backplane.lock import LockReader
 from backplane.ring import mailbox_ring
 from backplane.segment import SHM_FOLDER, Segment, unlink
 from backplane.trace import Flag, TraceWriter
@@ -91,6 +92,14 @@ class Link:
         self._reader_first = reader_first
         self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
 
+    def close(self) -> None:
+        """Give back what the tasks and the bus hold."""
+        self.writer.close()
+        for reader in self.reader.ports.readers.values():
+            if isinstance(reader, LockReader):
+                reader.lock.close()
+        self.segment.close()
+
     def run(self, first: int, last: int) -> None:
         """Do the ticks from `first` up to and without `last`."""
         for tick in range(first, last):
@@ -152,6 +161,7 @@ def links(rack: str) -> Iterator[MakeLink]:
 
     yield make
     for found in made:
+        found.close()
         semaphores.unlink_all(found.segment.rack)
         unlink(found.segment.rack)
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack in path.name]

@@ -34,6 +34,10 @@ class EventLog:
     def end(self, outcome: dict[str, Any]) -> None:
         """Write the outcome and close the file."""
         self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
+        self.close()
+
+    def close(self) -> None:
+        """Close the file, with or without an outcome."""
         if self._file is not None:
             self._file.close()
 

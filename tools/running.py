@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
@@ -81,7 +81,7 @@ def run_rack(
     """
     log = EventLog(display)
     sources: list[Callable[[], list[str]]] = []
-    with _recorder(folder) as recorder:
+    with closing(log), _recorder(folder) as recorder:
         with Rack(config, log.add) as rack:
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -96,18 +96,18 @@ def run_rack(
             wall_s, segment = time.monotonic() - started, rack.segment
         recording = recorder.finish() if recorder is not None else "none"
         _hear(sources, segment, log)
-    skipped = segment.words[System.CLOCK_SKIPPED]
-    result = RunResult(
-        rack=config.name,
-        outcome=outcome,
-        wall_s=wall_s,
-        clock_skipped=skipped,
-        tasks=_counters(segment),
-        recording=recording,
-        faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
-        clock_offset_ns=time.time_ns() - time.monotonic_ns(),
-    )
-    log.end(result.document())
+        skipped = segment.words[System.CLOCK_SKIPPED]
+        result = RunResult(
+            rack=config.name,
+            outcome=outcome,
+            wall_s=wall_s,
+            clock_skipped=skipped,
+            tasks=_counters(segment),
+            recording=recording,
+            faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
+            clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+        )
+        log.end(result.document())
     return result
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import select
 
-from backplane.process import is_alive
+from backplane.process import is_alive, readable
 from backplane.segment import Segment
 from backplane.words import Head, System
 
@@ -27,6 +26,6 @@ def stop_rack(rack: str, timeout_s: float) -> bool:
         return True
     try:
         # The pid may have been taken over between the two looks.
-        return not is_alive(pid, started) or bool(select.select([launcher], [], [], timeout_s)[0])
+        return not is_alive(pid, started) or readable(launcher, timeout_s)
     finally:
         os.close(launcher)

@@ -72,6 +72,9 @@ class FaultRules:
         for key in ("tick", "at", "when") if kind.where == "start" else ():
             if self._value(key) is not None:
                 yield self._mistake(key, f"{kind.name} strikes as the board starts; leave it out")
+        if self.fault.phase and not kind.takes_phase:
+            takers = ", ".join(other.name for other in KINDS if other.takes_phase)
+            yield self._mistake("phase", f"{kind.name} begins with a cycle; kinds that strike within a tick: {takers}")
         if self.fault.mailbox is not None and not kind.takes_mailbox:
             takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
             yield self._mistake("mailbox", f"{kind.name} is of no mailbox; kinds that are: {takers}")

@@ -52,6 +52,11 @@ class Kind:
     recoverable: bool = True
     takes_mailbox: bool = False
 
+    @property
+    def takes_phase(self) -> bool:
+        """Whether it can strike within a tick; any other begins with a cycle, or is of the ticks themselves."""
+        return self.where in ("process", "bus") or self.name == "clock-stop"
+
 
 def _joint(default: float = 0) -> Parameter:
     return Parameter("joint", "1", "joint concerned, from 0; -1: all", default, -1, 15, is_whole=True)

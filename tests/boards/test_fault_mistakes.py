@@ -169,6 +169,15 @@ def test_a_kind_that_needs_real_time_says_so_in_lockstep(config: MakeConfig, kin
     )
 
 
+@pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_phase], ids=lambda kind: kind.name)
+def test_a_kind_that_begins_with_a_cycle_has_no_phase(config: MakeConfig, kind: Kind) -> None:
+    line = told(config, fault_of(kind, phase=0.5), settings=settings_for(kind))
+    assert line == (
+        f"fault[0].phase = 0.5: {kind.name} begins with a cycle; kinds that strike within a tick: "
+        "kill, hang, masquerade, clock-stop"
+    )
+
+
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.once], ids=lambda kind: kind.name)
 @pytest.mark.parametrize("key", ["for", "cycles"])
 def test_a_kind_that_strikes_once_does_not_last(config: MakeConfig, kind: Kind, key: str) -> None:

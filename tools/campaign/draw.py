@@ -181,7 +181,7 @@ def _table(course: Course, target: Target, found: Shape, tick: int, phase: float
         table["tick"] = tick
     if found.ticks and not kind.once:
         table["for"] = round(found.ticks / course.second, 6)
-    if phase:
+    if phase and kind.takes_phase:
         table["phase"] = phase
     if target.mailbox is not None:
         table["mailbox"] = target.mailbox

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import select
 import time
 from contextlib import suppress
 from pathlib import Path
 
-from backplane.process import is_alive
+from backplane.process import is_alive, readable
 from backplane.segment import SHM_FOLDER
 
 BOUND_S = 2.0
@@ -63,6 +62,6 @@ def _await_end(pids: set[int]) -> None:
         except ProcessLookupError:
             continue
         try:
-            select.select([descriptor], [], [], max(0.0, deadline - time.monotonic()))
+            readable(descriptor, deadline - time.monotonic())
         finally:
             os.close(descriptor)

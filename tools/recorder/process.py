@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+from backplane.process import readable
 
 PROJECT = Path(__file__).resolve().parents[2]
 ATTACH_S = 30.0
@@ -79,7 +80,7 @@ class RecorderProcess:
     def _read(self, timeout_s: float) -> bool:
         """Take what it has printed; False when there is nothing within the time, or its output has ended."""
         stdout = self._process.stdout
-        if stdout is None or not select.select([stdout], [], [], max(0.0, timeout_s))[0]:
+        if stdout is None or not readable(stdout.fileno(), timeout_s):
             return False
         block = os.read(stdout.fileno(), 1 << 16)
         *lines, self._unread = (self._unread + block).split(b"\n")
