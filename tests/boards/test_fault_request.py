@@ -95,8 +95,13 @@ def test_verbs_of_elemental_moves_have_names() -> None:
 def test_parameters_stand_in_the_order_of_their_kind(config: MakeConfig) -> None:
     (found,) = injected(config, {"kind": "sensor-bias", "board": "driven", "joint": 3})
     assert found.parameters == (0.02, 3.0)
-    (found,) = injected(config, {"kind": "overrun", "board": "wave", "random": True, "phase": 0.2505})
-    assert (found.parameters, found.phase) == ((1.5, 1.0), 250)
+    (found,) = injected(config, {"kind": "overrun", "board": "wave", "random": True})
+    assert found.parameters == (1.5, 1.0)
+
+
+def test_a_phase_is_cut_to_thousandths_of_a_tick(config: MakeConfig) -> None:
+    (found,) = injected(config, {"kind": "kill", "board": "wave", "phase": 0.2505})
+    assert found.phase == 250
 
 
 def test_faults_throw_dice_of_their_own_that_the_racks_seed_repeats(config: MakeConfig) -> None:
