@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from backplane.address_map import CLOCK
-from backplane.alarms import Alarm
+from backplane.alarms import MISSES, Alarm
 from backplane.fault_table import Entry, FaultEntry, FaultTable
 from backplane.layout import Layout
 from backplane.words import Demand
@@ -19,8 +19,6 @@ from boards.faults.text import board_of, joint_name, subject_of, what
 About = Literal["task", "mailbox", "joint", "nothing"]
 EMERGENCY_STOP = "emergency stop"
 
-MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
-"""Alarms that a busy machine explains: they are counted, and nobody reacts to them."""
 KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
     Alarm.FAULT_ENDS: "fault",

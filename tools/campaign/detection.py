@@ -25,7 +25,8 @@ class Detection:
 
     `delay` and `bound` are ticks; ticks that the clock itself left out did not happen and are not counted.
     `delay_ms` is time of the wall clock, None where that means nothing: in lockstep. `bound_ms` is the bound of a death
-    at the Rack, which hears of it as time goes, whatever the clock does.
+    at the Rack; beyond that there is still the one of the neighbours, in ticks, for the loss stands on the backplane as
+    soon as the Rack's crate has seen it.
     """
 
     event: Event
@@ -37,8 +38,8 @@ class Detection:
     @property
     def is_within(self) -> bool:
         """Whether the fault was found as soon as it must be."""
-        if self.bound_ms is not None and self.delay_ms is not None:
-            return self.delay_ms <= self.bound_ms
+        if self.bound_ms is not None and self.delay_ms is not None and self.delay_ms <= self.bound_ms:
+            return True
         return self.bound is None or self.delay <= self.bound
 
     @property

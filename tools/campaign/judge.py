@@ -25,6 +25,10 @@ AFTERMATH_S = 1.5
 """Simulated time behind a fault's end, and its recovery, in which detections may still be its consequence."""
 
 
+NEIGHBOURS_CYCLES = 4
+"""Cycles of a task that died within which its neighbours must know."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """What became of one fault. Delays, bounds and recovery are ticks, `cycle` the ticks of the task's cycle.
@@ -108,6 +112,7 @@ class _Judge:
         delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
         if event.kind == "died":
             bound_ms = None if self._lockstep else RACK_NS * 1e-6
+            delay -= self._left_out.between(strike.tick, event.tick)
             return Detection(event, delay, self._death_bound(strike), delay_ms, bound_ms)
         if event.code != "clock_skipped":
             delay -= self._left_out.between(strike.tick, event.tick)
@@ -117,7 +122,9 @@ class _Judge:
     def _death_bound(self, strike: Strike) -> int | None:
         # Lockstep waits for the end of a process that its own clock has killed. Of any other it knows nothing, and
         # goes as fast as it can: neither ticks nor time are a measure.
-        return None if self._lockstep and strike.kind == EXTERNAL else self._bound(strike, None)
+        if self._lockstep:
+            return None if strike.kind == EXTERNAL else self._bound(strike, None)
+        return NEIGHBOURS_CYCLES * cycle_ticks(self._layout, strike.board)
 
     def _delay_ms(self, event: Event, strike: Strike) -> float | None:
         if self._lockstep:

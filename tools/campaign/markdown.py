@@ -46,6 +46,7 @@ def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
     yield "injected", summary["injected"]
     yield "detected", summary["detected"]
     yield "within the bound", summary["within_bound"]
+    yield "deaths seen at the Rack later than 5 ms", summary["late_at_rack"]
     yield "recovered from", summary["recovered"]
     ends = [f"{summary[key]} {name}" for key, name in _ENDS if summary[key]]
     yield "trials ended", ", ".join(ends) or "none"

@@ -31,6 +31,7 @@ def totals(faults: Iterable[Judgement]) -> Figures:
         "missed": sum(fault.seen == "missed" for fault in struck),
         "not_struck": len(judged) - len(struck),
         "within_bound": sum(fault.is_within for fault in struck),
+        "late_at_rack": sum((f.delay_ms or 0.0) > f.bound_ms for f in struck if f.bound_ms is not None),
         "recovered": sum(fault.is_recovered for fault in struck),
     }
 
