@@ -88,7 +88,9 @@ def test_a_death_is_bounded_in_time_at_the_rack_and_in_cycles_at_a_neighbour() -
     died = Event(100 * TICK_NS + 4_900_000, 101, "died", "lower", "died", "died")
     fault = judged(killed, died)
     assert (fault.found_by, fault.delay_ms, fault.bound_ms, fault.is_within) == ("the Rack", 4.9, 5.0, True)
-    late = Event(100 * TICK_NS + 5_100_000, 102, "died", "lower", "died", "died")
+    # Later than that, the loss must stand on the backplane for the neighbours within four cycles.
+    assert judged(killed, Event(100 * TICK_NS + 5_100_000, 102, "died", "lower", "died", "died")).is_within
+    late = Event(100 * TICK_NS + 12_600_000, 105, "died", "lower", "died", "died")
     assert not judged(killed, late).is_within
     # 4 cycles of the writer, and one of the reader.
     fault = judged(killed, late, found(112, "stale", "upper", "lower.status"))
