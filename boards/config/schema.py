@@ -57,7 +57,7 @@ class SupervisionConfig(Table):
     """`[supervision]`: boards that die or hang are restarted. When restarts are used up, the arm is braked for good."""
 
     restarts: Restarts = Field(5, description="restarts of one task within within_s, at most; 0: never")
-    within_s: Positive = Field(10.0, description="time over which restarts are counted, s of the wall clock")
+    within_s: Positive = Field(10.0, description="time over which restarts are counted, simulated s")
     lockstep_restart_s: Positive = Field(
         0.5,
         description="in lockstep, simulated time from a task's loss to its return, s; real time takes its own",
