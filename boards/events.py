@@ -11,7 +11,6 @@ EventKind = Literal[
     "start",
     "printed",
     "died",
-    "hang",
     "stop",
     "end",
     "recorder",

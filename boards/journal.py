@@ -19,12 +19,19 @@ class Journal:
         self._on_event = on_event
 
     def tell(
-        self, kind: EventKind, board: str, text: str, code: str = "", at_ns: int | None = None, tick: int | None = None
+        self,
+        kind: EventKind,
+        board: str,
+        text: str,
+        code: str = "",
+        at_ns: int | None = None,
+        tick: int | None = None,
+        subject: str = "",
     ) -> None:
         """Keep something that happens now, or that happened at CLOCK_MONOTONIC `at_ns` and `tick`."""
         now_ns = time.time_ns()
         stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
-        self.keep(Event(stamp_ns, self._tick if tick is None else tick, kind, board, text, code))
+        self.keep(Event(stamp_ns, self._tick if tick is None else tick, kind, board, text, code, subject=subject))
 
     def keep(self, event: Event) -> None:
         """Keep an event, and hand it on."""

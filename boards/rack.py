@@ -173,7 +173,7 @@ class Rack:
             for heard in self._alarms.drain():
                 self._take(heard)
             for board in self._heartbeat.hanging():
-                self._journal.tell("detection", board, f"'{board}' gives no sign of life", "hang")
+                self._journal.tell("detection", "rack", f"'{board}' gives no sign of life", "hang", subject=board)
                 self._recovery.end_hanging(board)
             self._recovery.advance()
             if not self._is_armed:

@@ -21,7 +21,6 @@ RACK = "rack"
 """Lane of events that are of no board."""
 LEVELS = {
     "died": "ERROR",
-    "hang": "ERROR",
     "detection": "ERROR",
     "fault": "WARN",
     "reaction": "WARN",
@@ -62,7 +61,7 @@ class Events:
         self._stream.at(tick, stamp_ns, (LOG, "events"), line)
         if kind not in UNSHOWN:
             self._show(tick, stamp_ns, board, kind, code)
-        if kind in ("died", "hang"):
+        if kind == "died":
             self._hierarchy.lose(tick, stamp_ns, board)
         elif code == "hang":
             self._hierarchy.lose(tick, stamp_ns, event["subject"])
