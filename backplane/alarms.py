@@ -53,7 +53,7 @@ class Alarm(IntEnum):
     MASQUERADE = 27  # [mailbox; process id that the message names]  not from the writer that holds the claim
     LOCKED = 28  # [mailbox; -]  the bound of a wait for a lock cut an access off
     # Tasks tell of the clock.
-    CLOCK_STOPPED = 30  # [-1; ticks]
+    CLOCK_STOPPED = 30  # [process id of the clock that is meant; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks left out]
     CLOCK_LATE = 32  # [-1; lateness, ns]
     # The servo level tells of the arm.

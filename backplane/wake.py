@@ -109,10 +109,11 @@ class NextCycle:
             self._clock_is_silent = False
             return
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
-        stopped = state_of(self._words[System.CLOCK_PID]) in STOPPED + GONE
+        clock = self._words[System.CLOCK_PID]
+        stopped = state_of(clock) in STOPPED + GONE
         if not self._clock_is_silent and (stopped or silent_s > CLOCK_SILENT_S):
             self._clock_is_silent = True
-            alarms.ring(now, Alarm.CLOCK_STOPPED, value=now - newest, since=newest)
+            alarms.ring(now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest)
 
     def _spin(self) -> bool:
         block, last = self._block, self._last

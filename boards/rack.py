@@ -221,7 +221,8 @@ class Rack:
         self._journal.keep(heard.event)
         if heard.alarm == Alarm.HANG:
             self._recovery.end_hanging(self._plan.layout.tasks[heard.subject].name)
-        elif heard.alarm == Alarm.CLOCK_STOPPED:
+        elif heard.alarm == Alarm.CLOCK_STOPPED and heard.subject == self._pids.get(CLOCK):
+            # Only the clock that was meant: the news may come when the next one has begun.
             self._recovery.end_hanging(CLOCK)
 
     def _expect(self, kind: type) -> None:

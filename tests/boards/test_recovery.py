@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from backplane.alarms import alarm_ring
+from backplane.alarms import Alarm, AlarmWriter, alarm_ring
 from backplane.words import Block, System
 from boards.config.schema import RackConfig
 from boards.events import Event
@@ -156,6 +156,23 @@ def test_a_stopped_clock_is_found_by_the_fastest_board(config: MakeConfig) -> No
     assert stopped.since == 120
     assert of(events, "recovery", "rejoined")[0].board == "clock"
     assert outcome.worked
+
+
+def test_late_news_of_a_clock_that_died_does_not_end_its_successor(config: MakeConfig) -> None:
+    with Rack(config("clock.mode=realtime")) as rack:
+        rack.start(2.0)
+        words = rack.segment.words
+        while words[System.TICK] < 200:
+            assert rack.watch(0.05)
+        dead = words[System.CLOCK_PID]
+        os.kill(dead, signal.SIGKILL)
+        while not of(rack.events, "recovery", "rejoined"):
+            assert rack.watch(0.05)
+        AlarmWriter(rack.segment, "watch").ring(words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 200)
+        while rack.watch(0.1):
+            continue
+    assert "watch" in [event.board for event in of(rack.events, "detection", "clock_stopped")]
+    assert [event.board for event in of(rack.events, "died")] == ["clock"]
 
 
 def test_the_latch_is_set_before_the_start_and_reset_by_it(config: MakeConfig) -> None:
