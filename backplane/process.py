@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 from pathlib import Path
+from time import process_time_ns
 
 GONE = "ZX"
 """States of a process that has ended."""
@@ -55,6 +56,15 @@ def readable(fd: int, timeout_s: float) -> bool:
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
     return bool(waiting.poll(max(0.0, timeout_s) * 1000))
+
+
+def compute_until(processor_time_ns: int) -> None:
+    """Compute until the calling process has used that much processor time, as `process_time_ns` counts it.
+
+    Time in which it is preempted does not count.
+    """
+    while process_time_ns() < processor_time_ns:
+        pass
 
 
 def pin(core: int) -> None:

@@ -1,7 +1,8 @@
 """Trace rings: one fixed record a cycle of a task, written without ever waiting.
 
-One record gives lateness (start - release), t_comm (read and write parts), t_exec (the process part)
-and t_residual (deadline - end) of eq. 3.5. A reader that falls behind knows how many it lost.
+One record gives lateness (start - release), t_comm (read and write parts), t_exec (the process part) and t_residual
+(deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 (plan - start), and the processor time that a cycle really
+took, whoever preempted it. A reader that falls behind knows how many it lost.
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ RECORD = np.dtype(
         ("tick", "i8"),  # release, in ticks
         ("release_ns", "i8"),  # the grid point of that tick, CLOCK_MONOTONIC
         ("start_ns", "i8"),
-        ("read_ns", "i8"),  # commands, statuses, plan read
+        ("plan_ns", "i8"),  # an executor has read its plan; where there is none to read: start_ns
+        ("read_ns", "i8"),  # commands, statuses read
         ("process_ns", "i8"),  # process done
         ("end_ns", "i8"),  # commands, statuses written
         ("flags", "i8"),  # Flag in the low 16 bits; above them the releases skipped just before this one
         ("state", "i8"),  # state of the level
+        ("processor_ns", "i8"),  # processor time since the last record: this cycle, and waking up for it
     ]
 )
 FIELDS = tuple(RECORD.names or ())

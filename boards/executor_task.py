@@ -7,6 +7,7 @@ from time import monotonic_ns
 from backplane.segment import Segment
 from backplane.words import Demand, System
 from boards.task import Task
+from boards.transfer import slowed
 from boards.wiring import TaskWiring
 from levels.level import Executor
 
@@ -19,11 +20,16 @@ class ExecutorTask(Task):
     def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None) -> None:
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
+        self._read_plan = slowed(self.inputs.read_plan, wiring.transfer.exchange_ns)
+        self._read = slowed(self.inputs.read, wiring.transfer.read_ns)
+        self._write = slowed(self.outputs.write, wiring.transfer.write_ns)
 
     def cycle(self, tick: int) -> None:
-        """Read command, status and plan; process; write command and status."""
+        """Read plan, command and status; process; write command and status."""
         start = monotonic_ns()
-        self.inputs.read(tick)
+        self._read_plan(tick)
+        plan = monotonic_ns()
+        self._read(tick)
         read = monotonic_ns()
         executor = self.executor
         executor.demand = _DEMANDS[self.words[_DEMAND]]
@@ -31,8 +37,8 @@ class ExecutorTask(Task):
         if executor.findings or executor.acted or self.faults.loads:
             self._tell(tick)
         processed = monotonic_ns()
-        in_time = self.outputs.write(tick, self.clock.now(), self.inputs)
-        self.finish(tick, start, read, processed, tick + self.spec.every, in_time)
+        in_time = self._write(tick, self.clock.now(), self.inputs)
+        self.finish(tick, (start, plan, read, processed), tick + self.spec.every, in_time)
 
     def _tell(self, tick: int) -> None:
         """Ring what the level has found, count the faults that acted, and compute as long as they say."""

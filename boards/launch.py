@@ -15,9 +15,11 @@ from boards.config import context, shared_out, wire
 from boards.config.cores import obtained_core
 from boards.config.ports import TaskPorts, all_ports
 from boards.config.schema import RackConfig
+from boards.config.timing import is_critical
 from boards.faults.kinds import KINDS
 from boards.faults.request import injections
 from boards.outcome import Cause
+from boards.transfer import Transfer
 from boards.wiring import TaskWiring
 
 LINGER_S = 0.5
@@ -118,8 +120,7 @@ def modules(config: RackConfig) -> tuple[str, ...]:
 
 def _task(config: RackConfig, layout: Layout, ports: TaskPorts, fails_self_test: bool) -> TaskWiring:
     board, spec = config.board[ports.board], layout.task(ports.task)
-    tight = spec.role == "planner" and board.coupling == "tight"
-    locked = layout.mailbox(f"{ports.board}.plan").protocol == "lock" if tight else False
+    critical = spec.role == "planner" and is_critical(config, layout, ports.board)
     return TaskWiring(
         task=ports.task,
         target=f"{ports.kind.__module__}:{ports.kind.__qualname__}",
@@ -127,7 +128,8 @@ def _task(config: RackConfig, layout: Layout, ports: TaskPorts, fails_self_test:
         outputs=dict(ports.writes),
         context=context(config, ports.board),
         poll=(board.wake or config.clock.wake) == "poll" and spec.role == "executor",
-        critical_priority=board.priority if locked else 0,
+        critical_priority=board.priority if critical else 0,
         guards_clock=spec.role == "executor" and spec.every == min(task.every for task in layout.tasks),
         fails_self_test=fails_self_test,
+        transfer=Transfer(**{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}),
     )

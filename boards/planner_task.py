@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from time import monotonic_ns
+from time import monotonic_ns, process_time_ns
 
 from backplane.segment import Segment
 from backplane.trace import Flag
 from backplane.words import Block
 from boards.processor import set_priority
 from boards.task import Task
+from boards.transfer import slowed
 from boards.wiring import TaskWiring
 from levels.level import Planner
 
@@ -24,10 +25,12 @@ class PlannerTask(Task):
         self.slice = self.spec.every * self.spec.within_cycles
         self._critical_priority = wiring.critical_priority
         self._priority = self.block[Block.PRIORITY]
+        self._write = slowed(self.outputs.write, wiring.transfer.update_ns)
 
     def cycle(self, tick: int) -> None:
         """Read what the plan rests on; plan when one is wanted; write the plan."""
         start = monotonic_ns()
+        self.inputs.read_plan(tick)
         self.inputs.read(tick)
         read = monotonic_ns()
         if not self.planner.wanted(self.inputs.values, tick):
@@ -41,19 +44,21 @@ class PlannerTask(Task):
         self.faults.burn(tick)
         processed = monotonic_ns()
         with self._critical_section():
-            in_time = self.outputs.write(tick, self.clock.now(), self.inputs)
+            in_time = self._write(tick, self.clock.now(), self.inputs)
         self.block[Block.PLANS] += 1
         # A plan begun late has its whole slice: a release that had come in it by then is answered with it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
-        self.finish(tick, start, read, processed, tick + self.slice, in_time, Flag.PLANNED, done)
+        self.finish(tick, (start, start, read, processed), tick + self.slice, in_time, Flag.PLANNED, done)
 
     def _pass(self, tick: int, start: int, read: int) -> None:
         """Let a release go by without a plan; trace it when it came too late, or others were skipped."""
         self.outputs.flush(tick, self.clock.now())
         in_time = self.clock.now() < tick + self.slice
         if not in_time or self.next_cycle.skipped:
-            self.finish(tick, start, read, monotonic_ns(), tick + self.slice, in_time)
+            self.finish(tick, (start, start, read, monotonic_ns()), tick + self.slice, in_time)
             return
+        # No part of the next plan's record.
+        self.processor_ns = process_time_ns()
         self.block[Block.CYCLES] += 1
         self.block[Block.DONE] = tick
         self.tell_clock()

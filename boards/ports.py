@@ -20,18 +20,26 @@ from levels.level import Ports, Reading, Verdict
 class InputPorts:
     """The mailboxes that a task reads, watched; `values` holds what the last `read` gave, by port."""
 
-    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter) -> None:
+    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, plan: str = "") -> None:
+        """Read `mailboxes` by port; `plan` is the one that holds the task's own plan."""
         self._witness = Witness()
         watched = {port: WatchedReader(segment, name, alarms, self._witness) for port, name in mailboxes.items()}
         self.readers = {port: found.reader for port, found in watched.items()}
         self.values = Ports(**{port: Reading(r.message, Verdict.NONE) for port, r in self.readers.items()})
-        self._slots = [(self.values.__dict__, port, found.read) for port, found in watched.items()]
+        slots = [(self.values.__dict__, port, found.read) for port, found in watched.items()]
+        self._plan = [slot for slot in slots if mailboxes[slot[1]] == plan]
+        self._rest = [slot for slot in slots if mailboxes[slot[1]] != plan]
         self._counted = self._traffic
 
-    def read(self, tick: int) -> None:
-        """Sample every mailbox as of `tick`: commands, statuses, plan, world model."""
+    def read_plan(self, tick: int) -> None:
+        """Begin to sample as of `tick`, with the plan where the task reads one."""
         self._witness.reads(tick)
-        for values, port, read in self._slots:
+        for values, port, read in self._plan:
+            values[port] = read(tick)
+
+    def read(self, tick: int) -> None:
+        """Sample every other mailbox: commands, statuses, world model."""
+        for values, port, read in self._rest:
             values[port] = read(tick)
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from time import monotonic_ns
+from time import monotonic_ns, process_time_ns
 
 from backplane.alarms import AlarmWriter
 from backplane.clock import SystemClock
@@ -38,7 +38,7 @@ class Task(ABC):
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
         self.next_cycle = NextCycle(segment, wiring.task, wiring.poll, self.alarms if wiring.guards_clock else None)
-        self.inputs = InputPorts(segment, wiring.inputs, self.alarms)
+        self.inputs = InputPorts(segment, wiring.inputs, self.alarms, f"{self.spec.board}.plan")
         self.outputs = OutputPorts(segment, wiring.outputs, self.alarms)
         self.faults = TaskFaults(segment, spec, self.outputs, level)
         self._generation = 0
@@ -46,11 +46,13 @@ class Task(ABC):
         self.trace = TraceWriter(segment, wiring.task)
         self.status = self.outputs.message("status")
         self._bus_errors = self._corrupt = 0
+        self.processor_ns = 0  # used before the next record begins
         self._lockstep_clock = clock_semaphore(segment.rack) if self.clock.is_lockstep else None
 
     def run(self) -> None:
         """Cycle until the run is over."""
         self.block[Block.STATE] = TaskState.RUNNING
+        self.processor_ns = process_time_ns()
         words = self.words
         while (tick := self.next_cycle.wait()) is not None:
             if words[_FAULTS] != self._generation:
@@ -72,9 +74,7 @@ class Task(ABC):
     def finish(
         self,
         tick: int,
-        start: int,
-        read: int,
-        processed: int,
+        times: tuple[int, int, int, int],
         deadline: int,
         in_time: bool,
         flags: int = 0,
@@ -82,17 +82,21 @@ class Task(ABC):
     ) -> None:
         """Close a cycle: trace it, count it, say that it is done, with `done` all releases up to that tick.
 
-        `deadline` and `done` are ticks, the times in ns.
+        `times` are those at which it began, had read its plan, had read everything, and had processed, ns.
+        `deadline` and `done` are ticks.
         """
         end = monotonic_ns()
         block, skipped, lockstep = self.block, self.next_cycle.skipped, self.clock.is_lockstep
         missed = not in_time or (not lockstep and end > self.clock.time_of(deadline))
         record = self.trace.record
         record[0] = tick
-        record[1] = start if lockstep else self.clock.time_of(tick)
-        record[2], record[3], record[4], record[5] = start, read, processed, end
-        record[6] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT | self._trouble()
-        record[7] = block[_LEVEL_STATE] = self.status.state if self.status is not None else 0
+        record[1] = times[0] if lockstep else self.clock.time_of(tick)
+        record[2], record[3], record[4], record[5] = times
+        record[6] = end
+        record[7] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT | self._trouble()
+        record[8] = block[_LEVEL_STATE] = self.status.state if self.status is not None else 0
+        used = process_time_ns()
+        record[9], self.processor_ns = used - self.processor_ns, used
         self.trace.write()
         block[_CYCLES] += 1
         block[_MISSED] += missed

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from boards.transfer import Transfer
 from levels.level import LevelContext
 
 
@@ -25,3 +26,4 @@ class TaskWiring:
     critical_priority: int = 0
     guards_clock: bool = False
     fails_self_test: bool = False
+    transfer: Transfer = field(default_factory=Transfer)

@@ -9,7 +9,7 @@ from math import gcd
 
 from backplane.layout import Layout
 from boards.config.schema import RackConfig
-from levels.timing import system_response_bound_ns, system_response_ns
+from levels.timing.equations import system_response_bound_ns, system_response_ns
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from boards.config.files import CONFIGS, FAULTS, names
 from boards.config.loading import load, loads
 from boards.config.ports import TaskPorts, task_ports
 from boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
+from boards.config.timing import budgets, timed_tasks
 from boards.config.wiring import wire
 
 __all__ = [
@@ -16,11 +17,13 @@ __all__ = [
     "ClockConfig",
     "RackConfig",
     "TaskPorts",
+    "budgets",
     "context",
     "load",
     "loads",
     "names",
     "shared_out",
     "task_ports",
+    "timed_tasks",
     "wire",
 ]

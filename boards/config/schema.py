@@ -33,6 +33,7 @@ Slot = Annotated[int, Field(gt=CLOCK_SLOT, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
+Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 
 
 class ClockConfig(Table):
@@ -44,6 +45,36 @@ class ClockConfig(Table):
     wake: Wake = Field("signal", description="how boards wait for their cycle: a semaphore each, or busy-waiting")
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
+
+
+class TimingConfig(Table):
+    """`[timing]`: what the timing model is told of the processors."""
+
+    context_switch_ms: Milliseconds = Field(0.1, description="one switch between tasks, t_cs, ms; 0.1 is the paper's")
+    clock_ms: Milliseconds = Field(0.0, description="processor time of the system clock's board in one tick, ms")
+    small_share: float = Field(
+        0.1, gt=0, le=1, description="part of a cycle that counts as much smaller than it (eq. 3.10)"
+    )
+
+
+class BudgetConfig(Table):
+    """`[board.<name>.budget]`: what the level may take in the worst case, as processor time in ms."""
+
+    read_ms: Milliseconds = Field(0.0, description="R: reading commands and statuses, a cycle")
+    process_ms: Milliseconds = Field(0.0, description="X: the executor's processing, a cycle")
+    write_ms: Milliseconds = Field(0.0, description="W: writing commands and statuses, a cycle")
+    exchange_ms: Milliseconds = Field(0.0, description="C: reading the plan, a cycle")
+    plan_ms: Milliseconds = Field(0.0, description="P: the planner, a plan")
+    update_ms: Milliseconds = Field(0.0, description="U: writing the plan, a plan")
+
+
+class TransferConfig(Table):
+    """`[board.<name>.transfer]`: a slower bus: processor time that accesses are made to take, ms."""
+
+    read_ms: Milliseconds = Field(0.0, description="R: the executor reads commands and statuses, a cycle")
+    write_ms: Milliseconds = Field(0.0, description="W: it writes commands and statuses, a cycle")
+    exchange_ms: Milliseconds = Field(0.0, description="C: it reads the plan, a cycle")
+    update_ms: Milliseconds = Field(0.0, description="U: the planner writes its plan")
 
 
 class ProtocolConfig(Table):
@@ -85,6 +116,8 @@ class BoardConfig(Table):
     reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the executor, where not the level's own")
     planner_reads: dict[str, MailboxName] = Field({}, description="the same for the planner")
     params: dict[str, Any] = Field({}, description="parameters of the level, by name")
+    budget: BudgetConfig | None = Field(None, description="what the level may take, for the timing model")
+    transfer: TransferConfig = Field(TransferConfig(), description="a slower bus for this board")
     ends_run: bool = Field(False, description="the run ends when this level's status says done or error")
     restarts: Restarts | None = Field(None, description="as in supervision, for this board's tasks; 0: never")
     restarts_within_s: Positive | None = Field(None, description="as supervision.within_s, for this board's tasks, s")
@@ -104,6 +137,7 @@ class RackConfig(Table):
     )
     clock: ClockConfig = Field(description="the system clock")
     protocol: ProtocolConfig = Field(ProtocolConfig(), description="how mailboxes are shared")
+    timing: TimingConfig = Field(TimingConfig(), description="what the timing model is told of the processors")
     robot: RobotConfig | None = Field(None, description="the arm; a rack without one has levels that need none")
     scene: SceneConfig = Field(SceneConfig(), description="what stands in the cell besides the arm")
     task: dict[str, Any] = Field({}, description="program of the task level")

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from levels import timing
+from levels.timing import equations as timing
 
 MS = 1_000_000
 READ = WRITE = UPDATE = PLANNER_EXCHANGE = 1 * MS

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from backplane.layout import TaskSpec
-from levels.timing import residual_bound_ns, residual_deviation_ns
+from levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from tools.reporting.statistics import Distribution, distribution
 
 
