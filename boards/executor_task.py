@@ -21,7 +21,7 @@ class ExecutorTask(Task):
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
         self._read_plan = slowed(self.inputs.read_plan, wiring.transfer.exchange_ns)
-        self._read = slowed(self.inputs.read, wiring.transfer.read_ns)
+        self._read = slowed(self.inputs.read_rest, wiring.transfer.read_ns)
         self._write = slowed(self.outputs.write, wiring.transfer.write_ns)
 
     def cycle(self, tick: int) -> None:

@@ -30,7 +30,6 @@ class PlannerTask(Task):
     def cycle(self, tick: int) -> None:
         """Read what the plan rests on; plan when one is wanted; write the plan."""
         start = monotonic_ns()
-        self.inputs.read_plan(tick)
         self.inputs.read(tick)
         read = monotonic_ns()
         if not self.planner.wanted(self.inputs.values, tick):

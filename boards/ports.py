@@ -31,13 +31,18 @@ class InputPorts:
         self._rest = [slot for slot in slots if mailboxes[slot[1]] != plan]
         self._counted = self._traffic
 
+    def read(self, tick: int) -> None:
+        """Sample every mailbox as of `tick`."""
+        self.read_plan(tick)
+        self.read_rest(tick)
+
     def read_plan(self, tick: int) -> None:
         """Begin to sample as of `tick`, with the plan where the task reads one."""
         self._witness.reads(tick)
         for values, port, read in self._plan:
             values[port] = read(tick)
 
-    def read(self, tick: int) -> None:
+    def read_rest(self, tick: int) -> None:
         """Sample every other mailbox: commands, statuses, world model."""
         for values, port, read in self._rest:
             values[port] = read(tick)

@@ -16,7 +16,7 @@ from backplane.layout import Protocol
 from backplane.lock import LockReader
 from backplane.ring import mailbox_ring
 from backplane.segment import SHM_FOLDER, Segment, unlink
-from backplane.trace import Flag, TraceWriter
+from backplane.trace import FIELDS, Flag, TraceWriter
 from backplane.words import Block
 from boards.faults.kinds import KINDS, NUMBERS
 from boards.ports import InputPorts, OutputPorts
@@ -53,7 +53,8 @@ class WritingTask:
 
     def end(self, tick: int, flags: int = 0) -> None:
         """Trace a cycle and say that it is done."""
-        self._trace.record[0], self._trace.record[5], self._trace.record[6] = tick, monotonic_ns(), flags
+        for field, value in (("tick", tick), ("end_ns", monotonic_ns()), ("flags", flags)):
+            self._trace.record[FIELDS.index(field)] = value
         self._trace.write()
         self._block[Block.DONE] = tick
 
