@@ -41,7 +41,7 @@ app.command()(estop)
 app.command()(record)
 app.command()(replay)
 app.command()(report)
-app.command()(bench)
+app.add_typer(bench, name="bench")
 app.command()(campaign)
 
 

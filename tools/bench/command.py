@@ -1,34 +1,41 @@
-"""`rack bench`: what the backplane and its recorder cost on this machine."""
+"""`rack bench`: what things cost on this machine."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from tools.answer import Json, print_json
 
+bench = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Measure what things cost on this machine.")
 
-def bench(
-    what: Annotated[
-        Literal["mailbox", "recording"],
-        typer.Argument(
-            help="mailbox: a write and a read of 200 bytes, by protocol; "
-            "recording: misses and lateness of a rack without it, with it, and with a live viewer"
-        ),
-    ],
-    config: Annotated[str, typer.Option(metavar="CONFIG", help="rack for 'recording', by name or path")] = "nasrem",
-    as_json: Json = False,
-) -> None:
-    """Measure the backplane. Figures are medians; on a busy machine look at the best ones beside them."""
-    if what == "recording":
-        _recording(config, as_json)
-    else:
-        _mailbox(as_json)
+Config = Annotated[str, typer.Option("--config", metavar="CONFIG", help="rack by name, or a path to a .toml file")]
 
 
-def _recording(config: str, as_json: bool) -> None:
+@bench.command()
+def mailbox(as_json: Json = False) -> None:
+    """A write and a read of 200 bytes, by protocol.
+
+    Figures are medians; on a busy machine look at the best ones beside them.
+    """
+    from tools.bench.mailbox import measure
+
+    costs = measure()
+    if as_json:
+        print_json({"mailbox": [asdict(cost) for cost in costs]})
+        return
+    print(f"mailbox: {costs[0].bytes} bytes, field access to numpy views included; us a call, median (best)")
+    for cost in costs:
+        write = f"{cost.write_us:.2f} ({cost.write_best_us:.2f})"
+        read = f"{cost.read_us:.2f} ({cost.read_best_us:.2f})"
+        print(f"  {cost.protocol:14} write {write:14} read {read}")
+
+
+@bench.command()
+def recording(config: Config = "nasrem", as_json: Json = False) -> None:
+    """Misses and lateness of a rack without a recorder, with it, and with a live viewer, interleaved."""
     from tools.bench.recording import measure
     from tools.text_table import table
 
@@ -52,15 +59,39 @@ def _recording(config: str, as_json: bool) -> None:
         print(line)
 
 
-def _mailbox(as_json: bool) -> None:
-    from tools.bench.mailbox import measure
+@bench.command()
+def switch(as_json: Json = False) -> None:
+    """The context switch t_cs of eqs 3.8 and 3.9, beside the 100 us of the paper's 68020 boards.
 
-    costs = measure()
+    An executor of real-time priority wakes up on the core of a planner that computes, as on a board with both: the
+    time from the planner's last instant to the executor's first, and back. Exit status 1 where the machine does not
+    let a process have a real-time priority.
+    """
+    from tools.bench.switch import measure
+
+    cost = measure()
+    print_json(asdict(cost)) if as_json else print(cost.text())
+
+
+@bench.command()
+def partition(
+    config: Config = "nasrem",
+    seconds: Annotated[float, typer.Option(min=1.0, help="simulated time of one run, s")] = 15.0,
+    rounds: Annotated[int, typer.Option(min=1, help="runs of each partition, interleaved")] = 2,
+    as_json: Json = False,
+) -> None:
+    """The same rack, partitioned otherwise: every planner tight or loose, on one core and on two.
+
+    Runs them in real time, one after another, and prints what the paper argues about in words: misses, residuals,
+    plan ages; and what the timing model predicts of each from what its parts took.
+    """
+    from tools.bench.partition import compare, lines_of
+    from tools.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = compare(config, seconds, rounds, progress)
     if as_json:
-        print_json({"mailbox": [asdict(cost) for cost in costs]})
+        print_json({"config": config, "seconds": seconds, "rounds": rounds, "partitions": [asdict(p) for p in found]})
         return
-    print(f"mailbox: {costs[0].bytes} bytes, field access to numpy views included; us a call, median (best)")
-    for cost in costs:
-        write = f"{cost.write_us:.2f} ({cost.write_best_us:.2f})"
-        read = f"{cost.read_us:.2f} ({cost.read_best_us:.2f})"
-        print(f"  {cost.protocol:14} write {write:14} read {read}")
+    for line in lines_of(found):
+        print(line)

@@ -67,7 +67,7 @@ def campaign(
     """
     from tools.campaign.campaign import Campaign
     from tools.campaign.interrupt import Interrupt
-    from tools.campaign.progress import progress_for
+    from tools.progress import progress_for
     from tools.folders import folder_of
 
     order = _order(config, settings, runs, seed, kinds, kills, lockstep, realtime, faultless, sizes, seconds)

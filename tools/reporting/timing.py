@@ -44,6 +44,13 @@ def _worst(slice_ns: int, execution_ns: list[int], communication_ns: list[int]) 
 def plan_age_ms(
     executor: np.ndarray, plan_tick: np.ndarray, plan_visible_at: np.ndarray, tick_ms: float
 ) -> Distribution | None:
+    """Return the distribution of `plan_ages_ms`."""
+    return distribution(plan_ages_ms(executor, plan_tick, plan_visible_at, tick_ms))
+
+
+def plan_ages_ms(
+    executor: np.ndarray, plan_tick: np.ndarray, plan_visible_at: np.ndarray, tick_ms: float
+) -> np.ndarray:
     """Return how old, in simulated time, the plan was that each cycle of an executor could read.
 
     `executor` holds the ticks of its cycles; `plan_tick` and `plan_visible_at` are of the plans, in order.
@@ -51,4 +58,4 @@ def plan_age_ms(
     # A late plan does not hide behind an earlier tick of a later one.
     newest = np.searchsorted(np.maximum.accumulate(plan_visible_at), executor, side="right") - 1
     seen = newest >= 0
-    return distribution((executor[seen] - plan_tick[newest[seen]]) * tick_ms)
+    return np.asarray((executor[seen] - plan_tick[newest[seen]]) * tick_ms)

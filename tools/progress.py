@@ -1,4 +1,4 @@
-"""How far a campaign is: a bar on a terminal, plain lines elsewhere, nothing beside JSON."""
+"""How far a command of many runs is: a bar on a terminal, plain lines elsewhere, nothing beside JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tools.live_table import console
 
 
 class Progress(Protocol):
-    """Shows a campaign. Its measure is the time that things take, about, in s."""
+    """Shows it. Its measure is the time that things take, about, in s."""
 
     def total(self, seconds: float) -> None:
         """Take what everything takes together."""

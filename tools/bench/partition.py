@@ -1,0 +1,144 @@
+"""What a partition of levels over processors costs: the same rack, run in real time in each, rounds interleaved."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from backplane.layout import Layout, TaskSpec
+from backplane.trace import SKIPPED_SHIFT, Flag
+from boards.config import RackConfig, load, wire
+from tools.bench.partitions import PARTITIONS, Partition
+from tools.display import display_for
+from tools.progress import Progress
+from tools.recording import Recording
+from tools.reporting.statistics import Distribution, distribution
+from tools.reporting.timing import plan_ages_ms
+from tools.running import run_rack
+from tools.text_table import table
+
+LAUNCH_S = 3.0
+"""About what launching and recording a run take besides its time."""
+
+
+@dataclass(frozen=True)
+class TaskFigures:
+    """One task over all runs of a partition: cycles (plans, of a planner), misses, what was left of its time slice."""
+
+    slice_ms: float
+    cycles: int
+    missed: int
+    skipped: int
+    residual_ms: Distribution | None
+
+
+@dataclass(frozen=True)
+class LevelFigures:
+    """One level in one partition. `plan_age_ms` is how old the plans were that its executor could read."""
+
+    level: str
+    executor: TaskFigures
+    planner: TaskFigures | None
+    plan_age_ms: Distribution | None
+
+
+@dataclass(frozen=True)
+class PartitionFigures:
+    """One partition, measured."""
+
+    partition: str
+    levels: tuple[LevelFigures, ...]
+
+
+def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[PartitionFigures]:
+    """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return what was measured."""
+    config = load(name)
+    racks = {partition: partition.of(config) for partition in PARTITIONS}
+    progress.total(len(racks) * rounds * (seconds + LAUNCH_S))
+    with tempfile.TemporaryDirectory() as folder:
+        runs: dict[Partition, list[Recording]] = {partition: [] for partition in racks}
+        for turn in range(rounds):
+            for number, (partition, rack) in enumerate(racks.items()):
+                progress.begin(f"{partition.name}, run {turn + 1} of {rounds}")
+                runs[partition].append(_run(rack, seconds, Path(folder) / f"{number}-{turn}"))
+                progress.end(seconds + LAUNCH_S, "done", ())
+        return [_figures(partition, racks[partition], found) for partition, found in runs.items()]
+
+
+def _run(config: RackConfig, seconds: float, folder: Path) -> Recording:
+    with display_for(silent=True) as display:
+        run_rack(config, seconds, folder, display)
+    return Recording(folder)
+
+
+def _figures(partition: Partition, config: RackConfig, runs: Sequence[Recording]) -> PartitionFigures:
+    layout = wire(config)
+    return PartitionFigures(partition.name, tuple(_level(name, layout, runs) for name in config.board))
+
+
+def _level(board: str, layout: Layout, runs: Sequence[Recording]) -> LevelFigures:
+    tasks = {task.name: task for task in layout.tasks}
+    planner, plan = tasks.get(f"{board}.planner"), f"{board}.plan"
+    ages = [_ages_ms(board, plan, layout, run) for run in runs if plan in run.mailboxes]
+    return LevelFigures(
+        level=board,
+        executor=_task(tasks[board], layout.clock_ns, runs),
+        planner=None if planner is None else _task(planner, layout.clock_ns, runs),
+        plan_age_ms=distribution(np.concatenate(ages)) if ages else None,
+    )
+
+
+def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarray:
+    made, visible_at = run.signal(plan, "tick"), run.signal(plan, "visible_at")
+    return plan_ages_ms(run.cycles[board]["tick"], made, visible_at, layout.clock_ns * 1e-6)
+
+
+def _task(task: TaskSpec, tick_ns: int, runs: Sequence[Recording]) -> TaskFigures:
+    cycles = np.concatenate([run.cycles.get(task.name, run.no_cycles) for run in runs])
+    if task.role == "planner":
+        # Not the releases that went by without a plan, which are traced when they came late.
+        skipped, cycles = cycles, cycles[(cycles["flags"] & Flag.PLANNED) > 0]
+    else:
+        skipped = cycles
+    slice_ns = task.every * task.within_cycles * tick_ns
+    residual_ns = cycles["release_ns"] + slice_ns - cycles["end_ns"]
+    return TaskFigures(
+        slice_ms=slice_ns * 1e-6,
+        cycles=len(cycles),
+        missed=int(np.count_nonzero(cycles["flags"] & Flag.MISSED)),
+        skipped=int(np.sum(skipped["flags"] >> SKIPPED_SHIFT)),
+        residual_ms=distribution(residual_ns * 1e-6),
+    )
+
+
+def lines_of(found: Sequence[PartitionFigures]) -> Iterator[str]:
+    """Yield two tables for people: executors, and planners with the ages of their plans; times in ms."""
+    levels = [(one.partition, level) for one in found for level in one.levels]
+    yield "executors: what is left of the cycle, ms"
+    head = ["partition", "level", "cycle", "cycles", "missed", "skipped", "median left", "worst"]
+    yield from table(head, [_executor_row(partition, level) for partition, level in levels])
+    yield ""
+    yield "planners: what is left of the time slice of a plan, and how old the plans are that are read, ms"
+    head = ["partition", "level", "slice", "plans", "late", "median left", "worst", "median age", "oldest"]
+    yield from table(head, [_planner_row(partition, level) for partition, level in levels if level.planner is not None])
+
+
+def _executor_row(partition: str, level: LevelFigures) -> list[str]:
+    executor = level.executor
+    counts = [str(count) for count in (executor.cycles, executor.missed, executor.skipped)]
+    return [partition, level.level, f"{executor.slice_ms:g}", *counts, *_ms(executor.residual_ms, "p50", "min")]
+
+
+def _planner_row(partition: str, level: LevelFigures) -> list[str]:
+    planner = level.planner
+    assert planner is not None, "levels without a planner have no such row"
+    row = [partition, level.level, f"{planner.slice_ms:g}", str(planner.cycles), str(planner.missed)]
+    return [*row, *_ms(planner.residual_ms, "p50", "min"), *_ms(level.plan_age_ms, "p50", "max")]
+
+
+def _ms(found: Distribution | None, *names: str) -> list[str]:
+    return ["-" if found is None else f"{found[name]:.2f}" for name in names]

@@ -1,0 +1,173 @@
+"""The context switch t_cs of eqs 3.8 and 3.9: an executor wakes up while its planner computes on the same core.
+
+The planner looks at the time without pause until there is a gap in it; the executor keeps when it was awake. What the
+gap is longer than that are the two switches.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import ceil
+from multiprocessing.process import BaseProcess
+from time import monotonic_ns
+from typing import Any
+
+import numpy as np
+import posix_ipc
+
+from backplane.process import pin
+from boards.processor import die_with_parent, set_priority
+from tools.answer import Failure
+from tools.reporting.statistics import Distribution, distribution
+
+PAPER_US = 100.0
+"""Task switching of NIST's boards (NISTIR 90-4251, section 4)."""
+WAKES = 1000
+PERIOD_S, HEAD_START_S = 0.002, 0.0005
+EXECUTOR, PLANNER = 80, 1
+"""SCHED_FIFO priorities: nobody of ordinary scheduling comes between the two."""
+PATIENCE_NS = 20_000_000
+READY_S = 20.0
+
+
+@dataclass(frozen=True)
+class SwitchCost:
+    """Times in us over `wakes` wake-ups on `core`.
+
+    `in_us` is from planner to executor, `out_us` back; `switch_us`, t_cs, is half of both together.
+    """
+
+    core: int
+    wakes: int
+    in_us: Distribution
+    out_us: Distribution
+    switch_us: Distribution
+    paper_us: float = PAPER_US
+
+    def text(self) -> str:
+        """Return the figures for people."""
+        rows = (("planner to executor", self.in_us), ("executor to planner", self.out_us), ("t_cs", self.switch_us))
+        lines = [f"context switch on core {self.core}, us; {self.wakes} times an executor came before its planner"]
+        for name, found in rows:
+            lines.append(f"  {name:20} p50 {found['p50']:6.1f}   p99 {found['p99']:6.1f}   max {found['max']:8.1f}")
+        lines.append(f"  the paper's boards   {self.paper_us:g}")
+        lines.append(f"for a config: timing.context_switch_ms = {ceil(self.switch_us['p99']) * 1e-3:.3f}")
+        return "\n".join(lines)
+
+
+def measure() -> SwitchCost:
+    """Measure on the last core of this machine, woken from another. Raises `Failure` where that cannot be had."""
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < 2:
+        raise Failure("a context switch is measured on one core and asked for on another: this machine has one")
+    return _cost(cores[-1], *_run(cores[-1], cores[0]))
+
+
+def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
+    """Let both processes run; return the planner's gaps and the executor's times awake, shape (n, 2), ns."""
+    spawn = multiprocessing.get_context("spawn")
+    gaps, awake, ready = (spawn.RawArray("q", size) for size in (2 * WAKES, 2 * WAKES, 2))
+    with _semaphore() as wake, _semaphore() as work:
+        executor = spawn.Process(target=_execute, args=(os.getpid(), core, wake.name, awake, ready), daemon=True)
+        planner = spawn.Process(target=_plan, args=(os.getpid(), core, work.name, gaps, awake, ready), daemon=True)
+        with _alive(executor, planner), _pinned(other):
+            _await(ready, executor, planner)
+            for _ in range(WAKES):
+                work.release()
+                time.sleep(HEAD_START_S)
+                wake.release()
+                time.sleep(PERIOD_S - HEAD_START_S)
+            executor.join(READY_S)
+            planner.join(READY_S)
+    return np.array(gaps).reshape(-1, 2), np.array(awake).reshape(-1, 2)
+
+
+def _execute(parent: int, core: int, wake: str, awake: Any, ready: Any) -> None:
+    """Wake up and wait again: an executor that has nothing to do."""
+    die_with_parent(parent)
+    pin(core)
+    semaphore = posix_ipc.Semaphore(wake)
+    ready[0] = 1 if set_priority(EXECUTOR) else -1
+    for at in range(WAKES):
+        semaphore.acquire()
+        awake[2 * at] = monotonic_ns()
+        awake[2 * at + 1] = monotonic_ns()
+
+
+def _plan(parent: int, core: int, work: str, gaps: Any, awake: Any, ready: Any) -> None:
+    """Compute when there is work, until the executor has come between; keep the longest gap."""
+    die_with_parent(parent)
+    pin(core)
+    semaphore = posix_ipc.Semaphore(work)
+    ready[1] = 1 if set_priority(PLANNER) else -1
+    for at in range(WAKES):
+        semaphore.acquire()
+        begin = last = monotonic_ns()
+        longest, over, seen = 0, 2 * at + 1, 0
+        while not seen and last - begin < PATIENCE_NS:
+            # Before the time: wherever in this loop the executor comes, the next look at the time shows it.
+            seen = awake[over]
+            now = monotonic_ns()
+            if now - last > longest:
+                longest = now - last
+                gaps[2 * at], gaps[over] = last, now
+                now = monotonic_ns()
+            last = now
+
+
+@contextmanager
+def _semaphore() -> Iterator[posix_ipc.Semaphore]:
+    semaphore = posix_ipc.Semaphore(None, posix_ipc.O_CREX)
+    try:
+        yield semaphore
+    finally:
+        semaphore.unlink()
+
+
+@contextmanager
+def _alive(*processes: BaseProcess) -> Iterator[None]:
+    for process in processes:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+@contextmanager
+def _pinned(core: int) -> Iterator[None]:
+    """Keep the calling process off the core that is measured."""
+    cores = os.sched_getaffinity(0)
+    pin(core)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def _await(ready: Any, *processes: BaseProcess) -> None:
+    """Wait until both are at work: they import for a moment, and have nothing to post with before."""
+    deadline = time.monotonic() + READY_S
+    while not all(ready):
+        if time.monotonic() > deadline or not all(process.is_alive() for process in processes):
+            raise Failure("a process of the measurement did not start")
+        time.sleep(0.005)
+    if min(ready) < 0:
+        raise Failure("SCHED_FIFO is refused: an executor cannot come before its planner at once")
+
+
+def _cost(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
+    """Keep the wake-ups that fell into the planner's time: with the gap around the executor's."""
+    found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
+    if not found.any():
+        raise Failure("no wake-up fell into the planner's time: the machine is too busy to measure")
+    into, back = (awake - gaps)[found, 0] * 1e-3, (gaps - awake)[found, 1] * 1e-3
+    in_us, out_us, switch_us = (distribution(times) or {} for times in (into, back, (into + back) / 2))
+    return SwitchCost(core, int(found.sum()), in_us, out_us, switch_us)
