@@ -23,8 +23,10 @@ ALARM_DEPTH = 256
 """Records in an alarm ring: whoever watches looks many times a second, and an alarm rings once an episode."""
 FAULT_ENTRY_SIZE = 256
 FAULT_ENTRIES = 64
+OPERATOR_HEAD_SIZE = LINE
+OPERATOR_ENTRIES = 128
 CLOCK = "clock"
-"""The system controller, in slot 1: its window holds the fault table."""
+"""The system controller, in slot 1: its window holds the fault table, the operator table and operators' mailboxes."""
 MAILBOX_HEAD_SIZE = LINE
 SLOT_HEAD_SIZE = 64
 ALARM_SIZE = LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
@@ -50,14 +52,15 @@ class AddressMap:
         self.alarms: dict[str, int] = {}
         self.mailboxes: dict[str, int] = {}
         self.faults = HEAD_SIZE
-        address = self._place_clock(HEAD_SIZE)
+        self.operator = HEAD_SIZE + FAULT_ENTRIES * FAULT_ENTRY_SIZE
+        address = self._place_clock(HEAD_SIZE, layout)
         for board in dict.fromkeys(task.board for task in layout.tasks):
             address = self._place_board(board, layout, address)
         self.size = address
 
-    def _place_clock(self, start: int) -> int:
-        self.alarms[CLOCK] = start + FAULT_ENTRIES * FAULT_ENTRY_SIZE
-        end = _up(self.alarms[CLOCK] + ALARM_SIZE, PAGE)
+    def _place_clock(self, start: int, layout: Layout) -> int:
+        self.alarms[CLOCK] = self.operator + OPERATOR_ENTRIES * operator_entry_size(layout)
+        end = _up(self._place_mailboxes({CLOCK}, layout, self.alarms[CLOCK] + ALARM_SIZE), PAGE)
         self.windows.append(Window(CLOCK, start, end - start))
         return end
 
@@ -69,14 +72,17 @@ class AddressMap:
             self.traces[task.name] = address + BLOCK_SIZE
             self.alarms[task.name] = _up(address + BLOCK_SIZE + trace_size(task), LINE)
             address = self.alarms[task.name] + ALARM_SIZE
-        names = {task.name for task in tasks}
-        for mailbox in layout.mailboxes:
-            if mailbox.writer in names:
-                self.mailboxes[mailbox.name] = address
-                address = _up(address + mailbox_size(mailbox), LINE)
-        end = _up(address, PAGE)
+        end = _up(self._place_mailboxes({task.name for task in tasks}, layout, address), PAGE)
         self.windows.append(Window(board, start, end - start))
         return end
+
+    def _place_mailboxes(self, writers: set[str], layout: Layout, start: int) -> int:
+        address = start
+        for mailbox in layout.mailboxes:
+            if mailbox.writer in writers:
+                self.mailboxes[mailbox.name] = address
+                address = _up(address + mailbox_size(mailbox), LINE)
+        return address
 
 
 def pages(size: int) -> int:
@@ -97,6 +103,11 @@ def slot_stride(mailbox: MailboxSpec) -> int:
 def mailbox_size(mailbox: MailboxSpec) -> int:
     """Return the bytes of a mailbox: its head and its slots."""
     return MAILBOX_HEAD_SIZE + mailbox.depth * slot_stride(mailbox)
+
+
+def operator_entry_size(layout: Layout) -> int:
+    """Return the bytes of one entry of the operator table: its head, and room for the largest of its messages."""
+    return OPERATOR_HEAD_SIZE + _up(max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), LINE)
 
 
 def _up(value: int, step: int) -> int:

@@ -38,6 +38,7 @@ class Alarm(IntEnum):
     HANG = 3  # [task; releases unanswered]
     REJOINED = 4  # [task, -1: the clock itself; ticks it was away]
     DEMAND = 5  # [task whose loss demands it, -1: the emergency stop or nobody; Demand]
+    COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was given
     # The clock tells of tasks that do not keep their cycles.
     LATE = 10  # [task; releases unanswered]  an executor has not ended before its next release
     PLAN_LATE = 11  # [task; releases unanswered]  a plan has not ended with its cycles (eq. 3.8)

@@ -6,6 +6,7 @@
 - `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
 - `ClockError`: a rate off the grid, a period that is no period.
 - `FaultTableError`: more faults than one run can have.
+- `OperatorTableError`: more commands than can wait for their ticks at once.
 - `EmergencyStopError`: a reset of the emergency stop while an input is not good.
 """
 
@@ -30,6 +31,10 @@ class ClockError(BackplaneError):
 
 class FaultTableError(BackplaneError):
     """A fault that cannot be injected."""
+
+
+class OperatorTableError(BackplaneError):
+    """A command that cannot be handed over."""
 
 
 class EmergencyStopError(BackplaneError):

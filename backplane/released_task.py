@@ -15,7 +15,8 @@ _RELEASED, _DEADLINE, _DONE, _LOST = (int(Block[name]) for name in ("RELEASED", 
 class ReleasedTask:
     """The clock's end of a task's control block.
 
-    `index` is its place in the layout. `unanswered` counts the releases given since the newest one that was finished.
+    `index` is its place in the layout. `unanswered` counts the releases given since it was last seen to finish one: 1
+    when it has become late, 2 for as long as it finishes every one too late, more when it finishes none.
     `is_stopped`: a signal has stopped its process, so that lockstep must not wait for it.
     """
 
@@ -25,6 +26,7 @@ class ReleasedTask:
         self.block = segment.block(spec.name)
         self.unanswered = 0
         self.is_stopped = False
+        self._done = self.block[_DONE]
         self._semaphore = wake_semaphore(segment.rack, spec.name)
 
     def is_due(self, tick: int, last: int) -> bool:
@@ -37,10 +39,20 @@ class ReleasedTask:
         block, release = self.block, tick - tick % self.spec.every
         if self.is_stopped:
             self.look_whether_stopped()
-        self.unanswered = 0 if block[_DONE] == block[_RELEASED] else self.unanswered + 1
+        self._count_unanswered()
         block[_DEADLINE] = release + self.spec.every
         block[_RELEASED] = release
         self._semaphore.release()
+
+    def _count_unanswered(self) -> None:
+        done, before = self.block[_DONE], self._done
+        self._done = done
+        if self.is_idle():
+            self.unanswered = 0
+        elif done != before:
+            self.unanswered = min(self.unanswered + 1, 2)
+        else:
+            self.unanswered += 1
 
     def is_idle(self) -> bool:
         """Say whether the newest release is finished."""

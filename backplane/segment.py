@@ -24,7 +24,7 @@ from backplane.process import is_alive, start_time
 from backplane.words import Block, Head, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 2
+VERSION = 3
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Where the C library keeps what `shm_open` names."""

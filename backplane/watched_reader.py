@@ -1,8 +1,9 @@
-"""A reader whose mailbox is watched: every read also looks at what came, and at what did not come."""
+"""Readers that watch their mailbox: every read also looks at what came, and at what did not come."""
 
 from __future__ import annotations
 
-from backplane.alarms import AlarmWriter
+from backplane.address_map import CLOCK
+from backplane.alarms import Alarm, AlarmWriter
 from backplane.episodes import Episodes
 from backplane.mailbox import Reading, Verdict
 from backplane.message_watch import MessageWatch
@@ -12,6 +13,13 @@ from backplane.silence_watch import SilenceWatch, Witness
 from backplane.words import Block
 
 _LOST = int(Block.LOST)
+
+
+def watched(segment: Segment, name: str, alarms: AlarmWriter, witness: Witness) -> WatchedReader | SporadicReader:
+    """Open a mailbox for a task, watched as its writer permits: what the clock writes comes now and then."""
+    if segment.layout.mailbox(name).writer == CLOCK:
+        return SporadicReader(segment, name, alarms)
+    return WatchedReader(segment, name, alarms, witness)
 
 
 class WatchedReader:
@@ -37,3 +45,28 @@ class WatchedReader:
         if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
+
+
+class SporadicReader:
+    """Reads an operator's mailbox: silence there proves nothing, but what comes must be whole, and the clock's."""
+
+    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
+        self.reader = open_reader(segment, name)
+        self._episodes = Episodes(segment, name, alarms)
+        self._bad_reads = self._corrupt = self._forged = 0
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message visible at `tick`, with its verdict."""
+        reading = self.reader.read(tick)
+        if self.reader.bad_reads != self._bad_reads:
+            self._tell(tick)
+        return reading
+
+    def _tell(self, tick: int) -> None:
+        reader, self._bad_reads = self.reader, self.reader.bad_reads
+        if reader.corrupt != self._corrupt:
+            self._corrupt = reader.corrupt
+            self._episodes.find(Alarm.DAMAGED, reader.accesses, tick)
+        if reader.forged != self._forged:
+            self._forged = reader.forged
+            self._episodes.find(Alarm.MASQUERADE, reader.accesses, tick, reader.forger)

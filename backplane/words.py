@@ -46,6 +46,8 @@ class System(IntEnum):
     SYSRESET = 48
     ACFAIL = 49
     EMERGENCY_STOP = 50
+    REQUESTED = 51  # commands put into the operator table so far
+    COMMANDED = 52  # serial of the newest command that was given; the clock's
     SYSFAIL = 64  # one word a slot, 22 of them: 1 until the board's self-test has passed
 
 

@@ -61,7 +61,8 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
 def event_of(row: np.void, owner: str, layout: Layout, faults: FaultTable, joints: Sequence[str]) -> Event:
     """Return the event that an alarm makes: a row of `backplane.alarms.RECORD` from the ring of the task `owner`.
 
-    An event's board is who found it; of a fault it is who has it, of a return it is who is back.
+    An event's board is who found it; of a fault it is who has it, of a return it is who is back. Of an operator's
+    command the event is `boards.operating.text.command_event`'s.
     """
     alarm, number, value = Alarm(row["code"]), int(row["subject"]), float(row["value"])
     kind, code, board, fault = KIND_OF.get(alarm, "detection"), alarm.name.lower(), owner, -1

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from backplane.address_map import CLOCK
 from backplane.alarms import Alarm, alarm_ring
 from backplane.fault_table import FaultTable
+from backplane.operator_table import OperatorTable
 from backplane.segment import Segment
 from boards.alarm_text import event_of
 from boards.config.schema import RackConfig
 from boards.events import Event
+from boards.operating.text import command_event
 
 
 class Heard(NamedTuple):
@@ -25,7 +29,7 @@ class AlarmWatch:
     """Reads the alarm rings of one rack. `lost` counts alarms that were overwritten unread."""
 
     def __init__(self, segment: Segment, config: RackConfig) -> None:
-        self._layout, self._faults = segment.layout, FaultTable(segment)
+        self._layout, self._faults, self._operator = segment.layout, FaultTable(segment), OperatorTable(segment)
         self._joints = config.robot.joints if config.robot is not None else ()
         self._rings = {name: alarm_ring(segment, name) for name in (CLOCK, *(t.name for t in segment.layout.tasks))}
         self.lost = 0
@@ -38,7 +42,10 @@ class AlarmWatch:
                 continue
             rows, lost = ring.drain()
             self.lost += lost
-            for row in rows:
-                event = event_of(row, owner, self._layout, self._faults, self._joints)
-                heard.append(Heard(Alarm(int(row["code"])), int(row["subject"]), event))
+            heard += [Heard(Alarm(int(row["code"])), int(row["subject"]), self._event(row, owner)) for row in rows]
         return sorted(heard, key=lambda one: one.event.time_ns)
+
+    def _event(self, row: np.void, owner: str) -> Event:
+        if row["code"] == Alarm.COMMANDED:
+            return command_event(row, self._operator.entries[int(row["subject"])], self._layout)
+        return event_of(row, owner, self._layout, self._faults, self._joints)

@@ -14,6 +14,7 @@ EventKind = Literal[
     "stop",
     "end",
     "recorder",
+    "command",
     "fault",
     "detection",
     "miss",
@@ -28,7 +29,8 @@ class Event:
 
     What faults, detections, reactions and recoveries say to programs: `code`, an alarm's name in lower case, "begins"
     or "ends"; `fault`, its entry in the fault table (-1: none); `subject`, the mailbox, joint or task
-    concerned; `value`; `since`, the tick since which it holds.
+    concerned; `value`; `since`, the tick since which it holds. Of an operator's command `code` is what it says,
+    `subject` the level and `value` the serial.
     """
 
     time_ns: int

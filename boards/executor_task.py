@@ -38,7 +38,7 @@ class ExecutorTask(Task):
             self._tell(tick)
         processed = monotonic_ns()
         in_time = self._write(tick, self.clock.now(), self.inputs)
-        self.finish(tick, (start, plan, read, processed), tick + self.spec.every, in_time)
+        self.finish(tick, (start, plan, read, processed, monotonic_ns()), tick + self.spec.every, in_time)
 
     def _tell(self, tick: int) -> None:
         """Ring what the level has found, count the faults that acted, and compute as long as they say."""

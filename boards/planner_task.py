@@ -44,17 +44,20 @@ class PlannerTask(Task):
         processed = monotonic_ns()
         with self._critical_section():
             in_time = self._write(tick, self.clock.now(), self.inputs)
+            # Behind the section the executor may have waited for its turn.
+            written = monotonic_ns()
         self.block[Block.PLANS] += 1
         # A plan begun late has its whole slice: a release that had come in it by then is answered with it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
-        self.finish(tick, (start, start, read, processed), tick + self.slice, in_time, Flag.PLANNED, done)
+        self.finish(tick, (start, start, read, processed, written), tick + self.slice, in_time, Flag.PLANNED, done)
 
     def _pass(self, tick: int, start: int, read: int) -> None:
         """Let a release go by without a plan; trace it when it came too late, or others were skipped."""
         self.outputs.flush(tick, self.clock.now())
         in_time = self.clock.now() < tick + self.slice
         if not in_time or self.next_cycle.skipped:
-            self.finish(tick, (start, start, read, monotonic_ns()), tick + self.slice, in_time)
+            now = monotonic_ns()
+            self.finish(tick, (start, start, read, now, now), tick + self.slice, in_time)
             return
         # No part of the next plan's record.
         self.processor_ns = process_time_ns()

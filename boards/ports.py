@@ -12,7 +12,7 @@ from backplane.message import Message
 from backplane.protocols import open_writer
 from backplane.segment import Segment
 from backplane.silence_watch import Witness
-from backplane.watched_reader import WatchedReader
+from backplane.watched_reader import watched
 from boards.faults.writers import FaultyWriter
 from levels.level import Ports, Reading, Verdict
 
@@ -23,10 +23,10 @@ class InputPorts:
     def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, plan: str = "") -> None:
         """Read `mailboxes` by port; `plan` is the one that holds the task's own plan."""
         self._witness = Witness()
-        watched = {port: WatchedReader(segment, name, alarms, self._witness) for port, name in mailboxes.items()}
-        self.readers = {port: found.reader for port, found in watched.items()}
+        found = {port: watched(segment, name, alarms, self._witness) for port, name in mailboxes.items()}
+        self.readers = {port: one.reader for port, one in found.items()}
         self.values = Ports(**{port: Reading(r.message, Verdict.NONE) for port, r in self.readers.items()})
-        slots = [(self.values.__dict__, port, found.read) for port, found in watched.items()]
+        slots = [(self.values.__dict__, port, one.read) for port, one in found.items()]
         self._plan = [slot for slot in slots if mailboxes[slot[1]] == plan]
         self._rest = [slot for slot in slots if mailboxes[slot[1]] != plan]
         self._counted = self._traffic

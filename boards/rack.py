@@ -20,6 +20,7 @@ from backplane.digest import digest
 from backplane.errors import EmergencyStopError
 from backplane.fault_table import FaultTable
 from backplane.lines import UtilityLines
+from backplane.operator_table import OperatorTable, RequestEntry
 from backplane.segment import Segment, unlink
 from backplane.words import Block, Run, System, TaskState
 from boards.alarm_watch import AlarmWatch, Heard
@@ -34,6 +35,7 @@ from boards.faults.kinds import KINDS
 from boards.heartbeat import Heartbeat
 from boards.journal import Journal
 from boards.launch import Launch, modules
+from boards.operating.request import asked, request, requests
 from boards.outcome import Cause, Outcome
 from boards.recovery import Recovery
 from boards.supervision import Supervision
@@ -136,6 +138,9 @@ class Rack:
             entry = table.add(injection)
             if KINDS[injection.kind].where == "core":
                 self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
+        desk = OperatorTable(self.segment)
+        for wanted in requests(self.config, self._plan.layout):
+            desk.add(wanted)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock: the run begins. It lasts `seconds` of simulated time, or until the task ends."""
@@ -189,6 +194,15 @@ class Rack:
         self._cause = self._cause or "stopped"
         self._journal.tell("stop", "", why)
         self.segment.words[System.STOP_REQUEST] = 1
+
+    def command(self, level: str, what: str, tick: int | None = None, **goal: object) -> RequestEntry:
+        """Hand an operator's command to a level, to be given at `tick`, or at once; return its entry in the table.
+
+        `what` and `goal` are as in a `[[command]]` table: `rack.command("servo", "setpoint", joints=(...))`. Raises
+        `ConfigError` with every mistake, `OperatorTableError` when too many wait.
+        """
+        wanted = asked({"level": level, "what": what, "tick": tick, **goal})
+        return OperatorTable(self.segment).add(request(wanted, self.config, self._plan.layout))
 
     def _listen(self, timeout_s: float) -> None:
         """Hear the crate, and whoever rings, for that long or until there is something."""

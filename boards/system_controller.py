@@ -1,6 +1,7 @@
 """The system controller: what the board in slot 1 does at every tick besides releasing the tasks.
 
-It lets faults begin and end, takes restarted boards up again on the grid, and tells the arm to stop or brake.
+It lets faults begin and end, gives operators' commands, takes restarted boards up again on the grid, and tells the arm
+to stop or brake.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from backplane.words import Demand, System
 from boards.clock_wiring import ClockWiring
 from boards.faults.stage import FaultStage
 from boards.faults.strikes import Strikes
+from boards.operating.desk import OperatorDesk
 
 # Plain integers for the hot path.
 _LOSSES, _EMERGENCY = int(System.LOSSES), int(System.EMERGENCY_STOP)
@@ -24,6 +26,7 @@ class SystemController:
     def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
         self._words, self._wiring, self._driver = segment.words, wiring, driver
         self._faults = FaultStage(segment, Strikes(segment, driver), driver.alarms)
+        self._desk = OperatorDesk(segment, driver.alarms)
         self._settled: tuple[int, int, int] | None = None
         self._demand = Demand(self._words[System.DEMAND])
 
@@ -31,6 +34,8 @@ class SystemController:
         """Do what is due before the tasks of `tick` are released."""
         if not self._faults.is_quiet:
             self._faults.advance(tick)
+        if not self._desk.is_quiet:
+            self._desk.advance(tick)
         words = self._words
         if self._settled != (words[_LOSSES], self._driver.watchdog.losses, words[_EMERGENCY]):
             self._mind_the_lost(tick)

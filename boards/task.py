@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from time import monotonic_ns, process_time_ns
+from time import process_time_ns
 
 from backplane.alarms import AlarmWriter
 from backplane.clock import SystemClock
@@ -74,7 +74,7 @@ class Task(ABC):
     def finish(
         self,
         tick: int,
-        times: tuple[int, int, int, int],
+        times: tuple[int, int, int, int, int],
         deadline: int,
         in_time: bool,
         flags: int = 0,
@@ -82,17 +82,15 @@ class Task(ABC):
     ) -> None:
         """Close a cycle: trace it, count it, say that it is done, with `done` all releases up to that tick.
 
-        `times` are those at which it began, had read its plan, had read everything, and had processed, ns.
+        `times` are those at which it began, had read its plan, had read everything, had processed, and had written, ns.
         `deadline` and `done` are ticks.
         """
-        end = monotonic_ns()
         block, skipped, lockstep = self.block, self.next_cycle.skipped, self.clock.is_lockstep
-        missed = not in_time or (not lockstep and end > self.clock.time_of(deadline))
+        missed = not in_time or (not lockstep and times[4] > self.clock.time_of(deadline))
         record = self.trace.record
         record[0] = tick
         record[1] = times[0] if lockstep else self.clock.time_of(tick)
-        record[2], record[3], record[4], record[5] = times
-        record[6] = end
+        record[2], record[3], record[4], record[5], record[6] = times
         record[7] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT | self._trouble()
         record[8] = block[_LEVEL_STATE] = self.status.state if self.status is not None else 0
         used = process_time_ns()

@@ -16,6 +16,7 @@ from backplane.alarms import Alarm
 from backplane.mailbox import Reading, Verdict
 from backplane.message import Message, MessageType
 from backplane.words import Demand
+from levels.operator import Commands
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 
@@ -120,6 +121,8 @@ class Executor(ABC):
     outputs: ClassVar[Mapping[str, MessageType]] = {}
     faults: ClassVar[tuple[str, ...]] = ()
     """Kinds of faults that can be injected into what the level drives."""
+    commands: ClassVar[Commands] = {}
+    """What an operator may tell the level, and how goals are given: of one that reads "own.operator"."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

@@ -10,6 +10,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from backplane.message import Field, MessageType, command, status
+from levels.operator import ANSWER, RESTS_ON
 
 WINDOW = 8
 """Elemental moves that the task level hands down at once: the next level never waits for a cycle above it."""
@@ -92,23 +93,29 @@ TASK_PLAN = MessageType(
 
 TASK_COMMAND = command(
     "task_command",
-    1,
+    2,
+    RESTS_ON,
+    Field("hold", "u1", "1", "1: ramp to rest and stay, whatever is under way"),
     Field("count", "u2", "1", "moves that follow; id is the newest one's"),
     Field("moves", ELEMENTAL_MOVE, "", "a window on the plan, oldest first", (WINDOW,)),
 )
 
 TASK_STATUS = status(
     "task_status",
-    1,
+    2,
+    *ANSWER,
     Field("action", "u2", "1", "actions done"),
     Field("actions", "u2", "1", "actions of the program"),
     Field("moves_done", "u2", "1", "elemental moves done"),
     Field("moves", "u2", "1", "elemental moves of the plan; 0 before there is one"),
+    Field("first", "u4", "1", "id under which the plan's first move is handed down"),
+    Field("detour", "u4", "1", "id of the move that an operator wants, in place of those; 0: none"),
 )
 
 MOVE_STATUS = status(
     "move_status",
-    1,
+    2,
+    *ANSWER,
     Field("done", "u4", "1", "newest elemental move done; 0: none yet"),
     Field("current", "u4", "1", "elemental move under way; 0: none"),
     Field("verb", "u1", "Verb", "of the move under way"),
@@ -118,6 +125,7 @@ MOVE_STATUS = status(
     Field("replan", "u4", "1", "open request to plan the current move anew from `start`; 0: none is open"),
     Field("start", "f8", "rad", "joint positions where that motion holds", ("joints",)),
     Field("replans", "u4", "1", "plans made anew because something was in the way"),
+    Field("resting", "u1", "1", "1: the arm rests, and whoever moves it has heard the newest command of an operator"),
 )
 
 MOVE_PLAN = MessageType(
@@ -155,7 +163,8 @@ SEGMENT = MessageType(
 
 MOVE_COMMAND = command(
     "move_command",
-    1,
+    2,
+    RESTS_ON,
     Field("hold", "u1", "1", "1: ramp to rest on the path and stay"),
     Field("count", "u2", "1", "segments that follow; id is the newest one's"),
     Field("segments", SEGMENT, "", "segments to do, oldest first", (SEGMENTS,)),
@@ -163,7 +172,8 @@ MOVE_COMMAND = command(
 
 PRIMITIVE_STATUS = status(
     "primitive_status",
-    1,
+    2,
+    *ANSWER,
     Field("done", "u4", "1", "newest segment done; 0: none yet"),
     Field("current", "u4", "1", "segment under way; 0: none"),
     Field("progress", "f8", "1", "part of the segment's path behind, 0 to 1"),
@@ -197,7 +207,8 @@ TRAJECTORY = MessageType(
 
 JOINT_SET_POINT = command(
     "joint_set_point",
-    1,
+    2,
+    RESTS_ON,
     Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point yet, hold"),
     Field("position", "f8", "rad", "joint positions", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
@@ -220,7 +231,8 @@ SERVO_PLAN = MessageType(
 
 SERVO_STATUS = status(
     "servo_status",
-    2,
+    3,
+    *ANSWER,
     Field("position", "f8", "rad", "joint positions, measured; while sensors lie, as far as known", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
     Field("torque", "f8", "N m", "torque given to the arm in this cycle, behind the limit gate", ("joints",)),
@@ -230,7 +242,7 @@ SERVO_STATUS = status(
     Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
     Field("grip_force", "f8", "N", "force given to the gripper"),
     Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
-    Field("stopped", "u1", "1", "1: set points are not followed: a demand, a fault of sensors or motors, or brakes"),
+    Field("stopped", "u1", "1", "1: set points are not followed: a demand, an operator, a fault, or brakes"),
     Field("braked", "u1", "1", "1: the brakes are closed"),
     Field("demand", "u1", "Demand", "what the safety of the rack asks of the arm in this cycle"),
     Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),

@@ -6,12 +6,15 @@ import sys
 
 import typer
 
+from tools.analyze import analyze
 from tools.answer import Failure, fail
 from tools.bench.command import bench
 from tools.campaign.command import campaign
 from tools.check import check
 from tools.clean import clean
+from tools.command import EXAMPLES, command
 from tools.estop import estop
+from tools.gantt import gantt
 from tools.inject import inject
 from tools.injecting.kinds import KindsCommand
 from tools.list import list_racks
@@ -36,11 +39,14 @@ app.command("list")(list_racks)
 app.command()(status)
 app.command()(stop)
 app.command()(clean)
+app.command(epilog=EXAMPLES)(command)
 app.command(cls=KindsCommand)(inject)
 app.command()(estop)
 app.command()(record)
 app.command()(replay)
 app.command()(report)
+app.command()(analyze)
+app.command()(gantt)
 app.add_typer(bench, name="bench")
 app.command()(campaign)
 

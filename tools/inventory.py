@@ -1,4 +1,4 @@
-"""What a config makes: tasks in their slots, mailboxes at their bus addresses, the timing that follows."""
+"""What a config makes: tasks in their slots, mailboxes at their bus addresses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 from backplane.address_map import AddressMap
 from backplane.layout import Layout, MailboxSpec
 from boards.config.schema import CLOCK_SLOT, RackConfig
-from tools.prediction import Prediction, predict
 from tools.text_table import table
 
 
@@ -44,7 +43,7 @@ class MailboxEntry:
 
 @dataclass(frozen=True)
 class Inventory:
-    """Everything that `rack check` shows."""
+    """What stands in the crate and what lies on the bus."""
 
     rack: str
     mode: str
@@ -55,7 +54,6 @@ class Inventory:
     windows: dict[str, int]
     tasks: tuple[TaskEntry, ...]
     mailboxes: tuple[MailboxEntry, ...]
-    timing: Prediction
     notes: tuple[str, ...]
 
     @classmethod
@@ -85,7 +83,6 @@ class Inventory:
             windows={window.board: window.address for window in places.windows},
             tasks=tuple(tasks),
             mailboxes=tuple(_entry(m, places, tick_ms) for m in layout.mailboxes),
-            timing=predict(config, layout),
             notes=tuple(notes),
         )
 
@@ -98,7 +95,8 @@ class Inventory:
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:
-        yield f"rack {self.rack}: {len(self.windows)} boards and the clock, {self.clock_ms:g} ms, {self.mode}"
+        boards = len({task.slot for task in self.tasks})
+        yield f"rack {self.rack}: {boards} board{'s' * (boards > 1)} and the clock, {self.clock_ms:g} ms, {self.mode}"
         yield from self.notes
         clock = [str(CLOCK_SLOT), "clock", str(self.clock_core), str(self.clock_priority or "-"), "", "", "", ""]
         yield ""
@@ -113,7 +111,6 @@ class Inventory:
         )
         yield ""
         yield f"segment: {self.segment_bytes} bytes; board windows: {_windows(self.windows)}"
-        yield from self.timing.lines()
 
 
 def _entry(mailbox: MailboxSpec, places: AddressMap, tick_ms: float) -> MailboxEntry:

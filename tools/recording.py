@@ -42,6 +42,11 @@ class Recording:
         return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
     @cached_property
+    def ended(self) -> dict[str, Any]:
+        """What was counted at the end of the run, as `tools.running.RunResult`; empty where that is not recorded."""
+        return next((event for event in self.events if event["kind"] == "outcome"), {})
+
+    @cached_property
     def layout(self) -> Layout:
         """The rack's layout; the fields of its messages are `signal`'s to know."""
         text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
@@ -55,13 +60,19 @@ class Recording:
         texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
         return {name: count for text in texts for name, count in json.loads(text).items()}
 
+    @property
+    def columns(self) -> list[str]:
+        """The columns of the trace: an earlier rack's has fewer than `backplane.trace.RECORD`."""
+        return list(self._cycles.schema_arrow.names)
+
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
         """The trace by task: structured rows, oldest first, with the fields of `backplane.trace.RECORD`."""
         table = self._cycles.read()
         names = table.column_names[1:]
         tasks = table["task"].to_numpy()
-        rows = np.empty(len(tasks), dtype=RECORD)
+        # 0 where an earlier rack has not traced a column.
+        rows = np.zeros(len(tasks), dtype=RECORD)
         for name in names:
             rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}

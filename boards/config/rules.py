@@ -16,6 +16,8 @@ from boards.errors import Mistake
 
 RESERVED = ("clock", "above", "below", "own")
 """No board can be called so: they mean something in the wiring of ports."""
+PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
+PLANNER_TRANSFER = ("exchange_ms", "update_ms")
 BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 
 
@@ -63,6 +65,17 @@ def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
     if board.coupling == "tight" and board.planner_priority >= max(board.priority, 1):
         why = f"a tightly coupled planner runs below its executor, whose priority is {board.priority}"
         yield Mistake(f"{place}.planner_priority", board.planner_priority, why)
+    if not has_planner:
+        yield from _without_planner(place, board)
+
+
+def _without_planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
+    """What the planner that is not there would take; nobody would notice that it is not counted."""
+    for table, keys in (("budget", PLANNER_BUDGET), ("transfer", PLANNER_TRANSFER)):
+        for key in keys:
+            value = getattr(getattr(board, table), key, None)
+            if value:
+                yield Mistake(f"{place}.{table}.{key}", value, "the board has no planner; leave it out, or name one")
 
 
 def _slots(config: RackConfig) -> Iterator[Mistake]:

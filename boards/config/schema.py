@@ -14,6 +14,7 @@ from backplane.clock import ticks_of
 from backplane.layout import Protocol
 from boards.config.text import to_toml
 from boards.faults.config import FaultConfig
+from boards.operating.config import CommandConfig
 from levels.robot import Positive, RobotConfig, Table
 from levels.scene import SceneConfig
 
@@ -66,6 +67,9 @@ class BudgetConfig(Table):
     exchange_ms: Milliseconds = Field(0.0, description="C: reading the plan, a cycle")
     plan_ms: Milliseconds = Field(0.0, description="P: the planner, a plan")
     update_ms: Milliseconds = Field(0.0, description="U: writing the plan, a plan")
+    plan_within_ms: float | None = Field(
+        None, gt=0, le=1e7, description="a new plan is wanted within this time, ms: what within_cycles may come to"
+    )
 
 
 class TransferConfig(Table):
@@ -144,6 +148,7 @@ class RackConfig(Table):
     board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
     supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of boards")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
+    command: tuple[CommandConfig, ...] = Field((), description="commands of an operator, given at their ticks")
 
     @property
     def clock_ns(self) -> int:

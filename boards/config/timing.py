@@ -3,24 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields
 
 from backplane.address_map import CLOCK
-from backplane.layout import Layout, TaskSpec
-from boards.config.schema import BoardConfig, RackConfig
+from backplane.layout import Layout, Role, TaskSpec
+from boards.config.rules import PLANNER_BUDGET
+from boards.config.schema import BoardConfig, BudgetConfig, RackConfig
 from levels.timing.budget import Budget
 from levels.timing.tasks import Part, TimedTask, Unit
 
 NS_PER_MS = 1e6
+PARTS = tuple(field.name for field in fields(Budget))
 
 
 def budgets(config: RackConfig) -> dict[str, Budget]:
     """Return the budgets that the config gives, by board; boards without one are left out."""
     tables = {name: board.budget for name, board in config.board.items()}
     return {
-        name: Budget(**{f"{key.removesuffix('_ms')}_ns": round(ms * NS_PER_MS) for key, ms in table})
+        name: Budget(**{key: round(getattr(table, f"{key.removesuffix('_ns')}_ms") * NS_PER_MS) for key in PARTS})
         for name, table in tables.items()
         if table is not None
     }
+
+
+def with_budgets(config: RackConfig, found: Mapping[str, Budget]) -> RackConfig:
+    """Return a config that gives these budgets, by board, and no others; how soon it wants plans stays."""
+    boards = {name: _budgeted(board, found.get(name)) for name, board in config.board.items()}
+    return config.model_copy(update={"board": boards})
+
+
+def _budgeted(board: BoardConfig, budget: Budget | None) -> BoardConfig:
+    wanted = None if board.budget is None else board.budget.plan_within_ms
+    if budget is None:
+        return board.model_copy(update={"budget": None})
+    times = {f"{part.removesuffix('_ns')}_ms": time_ns / NS_PER_MS for part, time_ns in asdict(budget).items()}
+    if board.planner is None:
+        times = {key: time for key, time in times.items() if key not in PLANNER_BUDGET}
+    return board.model_copy(update={"budget": BudgetConfig(**times, plan_within_ms=wanted)})
 
 
 def timed_tasks(config: RackConfig, layout: Layout, found: Mapping[str, Budget]) -> tuple[TimedTask, ...]:
@@ -42,6 +61,11 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
     return config.board[board].coupling == "tight" and layout.mailbox(f"{board}.plan").protocol == "lock"
 
 
+def asked_core(board: BoardConfig, role: Role) -> int:
+    """Return the core that the config asks for, whether or not this machine has it."""
+    return board.core if role == "executor" or board.planner_core is None else board.planner_core
+
+
 def _clock(config: RackConfig) -> Iterator[TimedTask]:
     time_ns = round(config.timing.clock_ms * NS_PER_MS)
     if time_ns:
@@ -57,18 +81,13 @@ def _task(config: RackConfig, layout: Layout, task: TaskSpec, budget: Budget) ->
         name=task.name,
         board=task.board,
         role=task.role,
-        core=_core(board, is_planner),
+        core=asked_core(board, task.role),
         priority=task.priority,
         every_ns=task.every * tick_ns(config),
         parts=_planner_parts(budget, critical) if is_planner else _executor_parts(budget, board),
         within_cycles=task.within_cycles,
         ceiling=board.priority if critical else 0,
     )
-
-
-def _core(board: BoardConfig, is_planner: bool) -> int:
-    """Return the core that the config asks for, whether or not this machine has it."""
-    return board.core if not is_planner or board.planner_core is None else board.planner_core
 
 
 def _executor_parts(budget: Budget, board: BoardConfig) -> tuple[Part, ...]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from backplane.address_map import CLOCK
 from backplane.errors import MailboxError
-from backplane.layout import Layout, MailboxSpec, TaskSpec, depth_for
+from backplane.layout import Layout, MailboxSpec, Protocol, TaskSpec, depth_for
 from backplane.message import MessageType
 from boards.config.cell import cell_sizes
+from boards.config.commands import command_mistakes, command_places, commandable
 from boards.config.cores import obtained_core
 from boards.config.faults import fault_mistakes, places
 from boards.config.fields import field_specs
@@ -16,7 +18,10 @@ from boards.config.rules import mistakes_in
 from boards.config.schema import BoardConfig, RackConfig
 from boards.errors import ConfigError, Mistake
 from levels.errors import ProgramError
+from levels.operator import OPERATOR_COMMAND
 
+OPERATOR_DEPTH = 128
+"""Slots of an operator's mailbox: commands come now and then."""
 HISTORY_S = 2.0
 """Simulated time that mailboxes and trace rings keep for a recorder: real-time boards may starve it for 1 s."""
 
@@ -31,6 +36,8 @@ def wire(config: RackConfig) -> Layout:
         mistakes += wiring.check_sizes(sizes)
     layout = None if mistakes else wiring.layout(sizes)
     mistakes += fault_mistakes(places(config), config, layout)
+    # Joints are looked at in the cell: one that cannot be built is a mistake already.
+    mistakes += command_mistakes(command_places(config), config) if layout is not None else []
     if layout is None or mistakes:
         raise ConfigError(mistakes)
     return layout
@@ -51,6 +58,8 @@ class Wiring:
         self._writers: dict[str, tuple[TaskPorts, MessageType]] = {}
         for ports in self._tasks:
             self._add_writer(ports)
+        self._operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
+        self._check_operated()
         for ports in self._tasks:
             self._check_reads(ports)
         self._check_rest()
@@ -65,20 +74,31 @@ class Wiring:
             else:
                 self._writers[mailbox] = ports, ports.outputs[port]
 
+    def _check_operated(self) -> None:
+        """The clock writes an operator's mailbox, and must never wait."""
+        for mailbox in self._operated:
+            if mailbox in self._writers:
+                first = self._writers[mailbox][0].task
+                self.mistakes.append(Mistake(f"mailbox {mailbox}", first, "is an operator's; the clock writes it"))
+            if self.config.protocol.mailbox.get(mailbox) == "lock":
+                why = "the clock writes it, and waits for nobody; permitted: time-slice, double-buffer"
+                self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", "lock", why))
+
     def _check_reads(self, ports: TaskPorts) -> None:
         key = "reads" if ports.role == "executor" else "planner_reads"
         for port, mailbox in ports.reads.items():
             place, wanted = f"board.{ports.board}.{key}.{port}", ports.inputs[port]
-            if mailbox not in self._writers:
+            if mailbox not in self._writers and mailbox not in self._operated:
                 if mailbox.partition(".")[0] not in self._untold:
                     self.mistakes.append(Mistake(place, mailbox, f"nobody writes it; mailboxes: {self._names()}"))
-            elif (found := self._writers[mailbox][1]) != wanted:
+            elif (found := self._kind(mailbox)) != wanted:
                 why = f"carries {found.name} {found.version}; the port wants {wanted.name} {wanted.version}"
                 self.mistakes.append(Mistake(place, mailbox, why))
 
     def _check_rest(self) -> None:
         for mailbox in self.config.protocol.mailbox:
-            if mailbox not in self._writers and mailbox.partition(".")[0] not in self._untold:
+            known = mailbox in self._writers or mailbox in self._operated
+            if not known and mailbox.partition(".")[0] not in self._untold:
                 self.mistakes.append(
                     Mistake(f"protocol.mailbox.{mailbox}", None, f"no such mailbox; mailboxes: {self._names()}")
                 )
@@ -99,8 +119,11 @@ class Wiring:
             told = (line.partition(": ") for line in str(error).splitlines())
             self.mistakes += [Mistake(place, None, why) for place, _, why in told]
 
+    def _kind(self, mailbox: str) -> MessageType:
+        return self._operated[mailbox] if mailbox in self._operated else self._writers[mailbox][1]
+
     def _names(self) -> str:
-        return ", ".join(self._writers)
+        return ", ".join([*self._writers, *self._operated])
 
     def check_sizes(self, sizes: Mapping[str, int]) -> list[Mistake]:
         """Return a mistake for every message with a size that the rack does not know."""
@@ -116,8 +139,9 @@ class Wiring:
         """Return the layout; there are no mistakes."""
         tasks = tuple(self._task(ports) for ports in self._tasks)
         by_name = {task.name: task for task in tasks}
-        mailboxes = tuple(self._mailbox(mailbox, by_name, sizes) for mailbox in self._writers)
-        return Layout(self.config.name, self.config.clock_ns, tasks, mailboxes)
+        mailboxes = [self._mailbox(mailbox, by_name, sizes) for mailbox in self._writers]
+        mailboxes += [self._operators_mailbox(mailbox, kind) for mailbox, kind in self._operated.items()]
+        return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes))
 
     def _task(self, ports: TaskPorts) -> TaskSpec:
         board, every = self.config.board[ports.board], self.config.every(ports.board)
@@ -141,16 +165,15 @@ class Wiring:
     def _mailbox(self, name: str, tasks: Mapping[str, TaskSpec], sizes: Mapping[str, int]) -> MailboxSpec:
         ports, kind = self._writers[name]
         writer = tasks[ports.task]
-        readers = [tasks[t.task] for t in self._tasks if name in t.reads.values()]
+        readers = [tasks[reader] for reader in self._readers(name)]
         delay = writer.every * writer.within_cycles
         # A reader may still read, at the end of its own slice, what was visible at its start.
         slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
-        protocol = self.config.protocol
         return MailboxSpec(
             name=name,
             writer=writer.name,
             readers=tuple(reader.name for reader in readers),
-            protocol=protocol.mailbox.get(name, protocol.default),
+            protocol=self._protocol(name),
             every=writer.every,
             delay=delay,
             depth=depth_for(max(slowest + delay, self._history_ticks), writer.every),
@@ -159,6 +182,30 @@ class Wiring:
             size=kind.dtype(sizes).itemsize,
             fields=field_specs(kind, sizes),
         )
+
+    def _operators_mailbox(self, name: str, kind: MessageType) -> MailboxSpec:
+        """Return the mailbox in which the clock gives an operator's commands to a level."""
+        protocol = self._protocol(name)
+        return MailboxSpec(
+            name=name,
+            writer=CLOCK,
+            readers=self._readers(name),
+            # With a lock the clock would wait for its readers.
+            protocol="double-buffer" if protocol == "lock" else protocol,
+            every=1,
+            delay=1,
+            depth=OPERATOR_DEPTH,
+            message=kind.name,
+            version=kind.version,
+            size=kind.dtype({}).itemsize,
+            fields=field_specs(kind, {}),
+        )
+
+    def _readers(self, mailbox: str) -> tuple[str, ...]:
+        return tuple(ports.task for ports in self._tasks if mailbox in ports.reads.values())
+
+    def _protocol(self, mailbox: str) -> Protocol:
+        return self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
 
 
 def _place(board: BoardConfig) -> tuple[int, int, int]:

@@ -10,9 +10,10 @@ import numpy as np
 from backplane.layout import FieldSpec, Layout, MailboxSpec
 from backplane.message import State
 from levels.messages import Error, SegmentKind, Verb
+from levels.operator import Answer, What
 
 FORM = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
-ENUMS: dict[str, type[IntEnum]] = {kind.__name__: kind for kind in (State, Verb, SegmentKind, Error)}
+ENUMS: dict[str, type[IntEnum]] = {kind.__name__: kind for kind in (State, Verb, SegmentKind, Error, What, Answer)}
 """What the unit of a field may name instead of a unit."""
 
 

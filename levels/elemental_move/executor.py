@@ -22,6 +22,8 @@ from levels.messages import (
     SegmentKind,
     Verb,
 )
+from levels.operator import OPERATOR_COMMAND, Commands, What
+from levels.orders import Orders
 from levels.params import read_params
 
 
@@ -29,7 +31,7 @@ class ElementalMoveExecutor(Executor):
     """Hands segments down as soon as their plans are there, and asks for another path where the arm is blocked.
 
     It reads back what it wrote itself, so that it goes on where it was when its board has been restarted. While the
-    board above is lost the arm is held on its path.
+    board above is lost, it says hold, or an operator does, the arm is held on its path.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {
@@ -38,15 +40,18 @@ class ElementalMoveExecutor(Executor):
         "plan": Input(MOVE_PLAN, "own.plan"),
         "last_command": Input(MOVE_COMMAND, "own.command"),
         "last_status": Input(MOVE_STATUS, "own.status"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     # The status first: killed between the two, the board finds a window whose done moves it only takes out again.
     outputs: ClassVar[Mapping[str, MessageType]] = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
+    commands: ClassVar[Commands] = {What.HOLD: (), What.RESUME: ()}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._params = read_params(ElementalMoveParams, context.params)
         self._gripper = context.robot.gripper
         self._plans = PlansAtHand()
+        self._orders = Orders(self.commands)
         self._started = False
         self._done = 0
         self._handed_down = 0
@@ -62,6 +67,7 @@ class ElementalMoveExecutor(Executor):
         if not self._started:
             self._go_on(read, write, segments)
         status = read.status.value
+        self._orders.take(read.operator)
         self._plans.take(read.plan, self._done, self._handed_down, write.status.end)
         self._take_window(read.command.value, status, segments)
         if not self._error:
@@ -72,8 +78,9 @@ class ElementalMoveExecutor(Executor):
             self._fill(read.command.value, segments, tick)
         if self._error:
             segments.clear()
-        write.command.hold = self._request > 0 or self._error > 0 or read.command.is_lost
+        write.command.hold = self._request > 0 or self._error > 0 or read.command.is_lost or self._is_told_to(read)
         self._report(read.command.value, status, segments, write.status)
+        self._answer(read, write)
 
     def _go_on(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
         """Go on from the last command and status in the mailboxes; plans that were at hand are lost."""
@@ -227,6 +234,20 @@ class ElementalMoveExecutor(Executor):
             report.end = status.position
         elif end is not None:
             report.end = end
+
+    def _is_told_to(self, read: Ports) -> bool:
+        """Say whether the level above, or an operator here, says hold."""
+        return bool(read.command.value.hold) or self._orders.standing is What.HOLD
+
+    def _answer(self, read: Ports, write: Ports) -> None:
+        """Answer the operator, and hand down what this cycle rests on."""
+        above, below = read.command.value.operator, read.status.value
+        write.command.operator = self._orders.rests_on(above)
+        # What rests must have heard of it.
+        write.status.resting = below.resting and below.operator >= write.command.operator
+        if write.status.resting:
+            self._orders.done()
+        self._orders.report(write.status, above)
 
     def _state(self, command: Message) -> State:
         if self._error:

@@ -17,6 +17,8 @@ from levels.messages import (
     Error,
     SegmentKind,
 )
+from levels.operator import OPERATOR_COMMAND, What
+from levels.orders import Orders
 from levels.params import read_params
 from levels.primitive.fault import Fault
 from levels.primitive.gripper_work import GripperWork
@@ -43,7 +45,8 @@ class PrimitiveExecutor(Executor):
 
     Released at tick T it writes the set point due two cycles later: the first brings it to the servo, over the second
     the servo interpolates to it. What it must not forget when its board dies it finds in its own last messages. While
-    the board above is lost it rests on its path, as with `hold`; while the servo does not follow it waits.
+    the board above is lost it rests on its path, as with `hold` from above or of an operator; while the servo does not
+    follow it waits.
     """
 
     inputs = {
@@ -53,8 +56,10 @@ class PrimitiveExecutor(Executor):
         "world": Input(WORLD_MODEL, "world.model"),
         "last_command": Input(JOINT_SET_POINT, "own.command"),
         "last_status": Input(PRIMITIVE_STATUS, "own.status"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": JOINT_SET_POINT, "status": PRIMITIVE_STATUS}
+    commands = {What.HOLD: (), What.RESUME: ()}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -68,6 +73,7 @@ class PrimitiveExecutor(Executor):
         straying = self._rules.cycles(self._params.straying)
         self._straying = Straying(context.robot.joints, self._params.following, straying)
         self._plans = Plans()
+        self._orders = Orders(self.commands)
         self._memory: Memory | None = None
         self._work: Work | None = None
         self._fault: Fault | None = None
@@ -84,6 +90,7 @@ class PrimitiveExecutor(Executor):
             self._tick, self._memory = tick - self.context.every, recall(read)
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
+        self._orders.take(read.operator)
         serials = window(read.command.value)
         self._plans.accept(read.plan, serials)
         if self._tracking.update(read.status):
@@ -95,6 +102,7 @@ class PrimitiveExecutor(Executor):
             self._fault = Fault(Error.BELOW, f"no status from below for {self._tracking.silent_cycles} cycles")
         self._write_set_point(write.command, tick)
         self._write_status(read, write.status, serials, tick)
+        self._answer(write, read.command.value.operator)
 
     def _take_up(self, read: Ports, tick: int) -> None:
         """Go on from where the servo holds the arm."""
@@ -115,7 +123,7 @@ class PrimitiveExecutor(Executor):
 
     def _go_on(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish it, drop it, begin it, step it."""
-        hold = bool(read.command.value.hold) or read.command.is_lost
+        hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.standing is What.HOLD
         if read.status.is_new:
             self._finish(read.status.value, tick)
             self._straying.update(read.status.value)
@@ -235,6 +243,13 @@ class PrimitiveExecutor(Executor):
         status.resting = path_work is None or path_work.motion.resting
         status.ends = path_work.ends_s((tick + 2 * self.context.every) * self.context.tick_s) if path_work else 0.0
         status.wants, status.begin = self._wanted(read, serials)
+
+    def _answer(self, write: Ports, above: int) -> None:
+        """Answer the operator, and hand down what this cycle rests on."""
+        if write.status.resting:
+            self._orders.done()
+        write.command.operator = self._orders.rests_on(above)
+        self._orders.report(write.status, above)
 
     def _state(self, serials: list[int], memory: Memory) -> State:
         if self._fault is not None:

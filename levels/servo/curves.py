@@ -89,3 +89,17 @@ class Decay:
         position = c0 + u * (c1 + u * u * (c3 + u * (c4 + u * c5)))
         velocity = (c1 + u * u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5))) / h
         return Motion(position, velocity, u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5)) / (h * h))
+
+
+class Passage:
+    """From rest at one place to rest at another, all joints at the same time, straight in joint space; then rest."""
+
+    def __init__(self, start: Array, end: Array, fastest: Array, hardest: Array) -> None:
+        """Take as long as no joint needs more than `fastest`, rad/s, and `hardest`, rad/s2, for."""
+        self._end = end
+        self._left = Decay(start - end, np.zeros_like(start), fastest, hardest)
+
+    def at(self, time_s: float) -> Motion:
+        """Return the motion at `time_s` from 0 on."""
+        left = self._left.at(time_s)
+        return Motion(self._end + left.position, left.velocity, left.acceleration)

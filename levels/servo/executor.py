@@ -14,6 +14,7 @@ from levels.arm.faulty import KINDS
 from levels.cell import build_cell
 from levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
 from levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
+from levels.operator import OPERATOR_COMMAND, Goal, What
 from levels.params import read_params
 from levels.servo.actuator_monitor import ActuatorMonitor
 from levels.servo.brake_log import BrakeLog
@@ -23,6 +24,7 @@ from levels.servo.grip import Grip
 from levels.servo.params import ServoParams
 from levels.servo.reference import Reference
 from levels.servo.sensor_monitor import SensorMonitor
+from levels.servo.standing import Standing
 from levels.servo.stopping import Reaction, Stopping
 
 Array = NDArray[np.float64]
@@ -33,16 +35,18 @@ class ServoExecutor(Executor):
 
     A cycle first simulates the ticks since the last one: the arm's time is the clock's also when cycles are missed.
     On a demand, and while sensors or motors are at fault, the arm holds, stops or is braked instead; afterwards it is
-    taken over where it stands.
+    taken over where it stands. Next to that comes what an operator says, and then the level above.
     """
 
     inputs = {
         "command": Input(JOINT_SET_POINT, "above.command"),
         "plan": Input(SERVO_PLAN, "own.plan"),
         "before": Input(ARM_STATE, "own.state"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
     faults = KINDS
+    commands = {What.HOLD: (), What.RESUME: (), What.SETPOINT: (Goal.JOINTS,)}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -57,6 +61,7 @@ class ServoExecutor(Executor):
         self.sensors = SensorMonitor(cell.bounds, braking, cell.home, context.tick_s, every, params.good_cycles)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, round(params.retry / context.tick_s), every)
+        self.standing = Standing(self.commands, context.robot.joints, cell.limits.position)
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._rest = np.zeros(len(cell.home))
@@ -76,6 +81,7 @@ class ServoExecutor(Executor):
         sensed, sensors = self._link.sense(), self.sensors
         sensors.look(sensed, tick, None if missed or self._left else self._wanted.velocity)
         self._take_findings()
+        self.standing.take(read.operator)
         reaction = self.stopping.decide(self.demand, sensors, tick)
         if reaction is Reaction.BRAKE:
             self._brake()
@@ -85,6 +91,7 @@ class ServoExecutor(Executor):
             self.motors.drop()  # without a new sample the arm goes on with its last torque
         self._brakes.after_cycle(tick, self.findings)
         self._report(write.status, read.command.value, sensed, reaction)
+        self.standing.orders.report(write.status, read.command.value.operator)
         self.arm.save(write.state)
         sensors.remember(write.state)
         self.arm.look(write.scene)
@@ -153,7 +160,9 @@ class ServoExecutor(Executor):
             reference.start(sensors.position, sensors.velocity, tick)
         elif missed:
             reference.meet(sensors.position, sensors.velocity, tick)
-        return reference.at(command, tick) if reaction is Reaction.NONE else reference.rest(tick)
+        if reaction is not Reaction.NONE:
+            return reference.rest(tick)
+        return self.standing.wanted(reference, tick) if self.standing.stands else reference.at(command, tick)
 
     def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
         if not self.stopping.trying:
@@ -176,7 +185,8 @@ class ServoExecutor(Executor):
         status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
         status.grip_force = arm.grip_force
         status.holding, status.braked = holding, arm.braked
-        status.stopped, status.demand = self._left or reaction is not Reaction.NONE, self.demand
+        status.stopped = self._left or reaction is not Reaction.NONE or self.standing.stands
+        status.demand = self.demand
         status.clipped = arm.clipped + self.reference.refused + self._loop.cut
         status.touches, status.violations = arm.touches, arm.violations
         status.state = State.IDLE if holding else State.EXECUTING

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from backplane.message import Message
 from levels.cell import Bounds, Limits
-from levels.servo.curves import Curve, Decay, Hermite, Motion, Ramp
+from levels.servo.curves import Curve, Decay, Hermite, Motion, Passage, Ramp
 
 Array = NDArray[np.float64]
 
@@ -41,8 +41,8 @@ class SetPoint(NamedTuple):
 class Reference:
     """Interpolates set points. Tick by tick: `at(command, tick)` gives the motion wanted at that tick.
 
-    `holding`: no fresh set point. `refused`: set points that were cut at the bounds, and cycles that saw one which is
-    no motion.
+    `holding`: no fresh set point. `goal`: where it goes by `to`, or has rested since; None: nowhere. `refused`: set
+    points that were cut at the bounds, and cycles that saw one which is no motion.
     """
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
@@ -51,6 +51,7 @@ class Reference:
         self._nothing = Decay(np.zeros(joints), np.zeros(joints), limits.velocity, limits.acceleration)
         self._due = 0
         self._next: SetPoint | None = None
+        self.goal: Array | None = None
         self.holding = True
         self.refused = 0
         self.start(np.zeros(joints), np.zeros(joints), 0)
@@ -60,6 +61,7 @@ class Reference:
         self._curve: Curve = Ramp(position.copy(), velocity.copy(), self._limits.acceleration)
         self._from = tick
         self._difference, self._differs_from = self._nothing, tick
+        self.goal = None
         self.holding = True
 
     def meet(self, position: Array, velocity: Array, tick: int) -> None:
@@ -87,9 +89,24 @@ class Reference:
     def rest(self, tick: int) -> Motion:
         """Return the motion wanted at `tick`, whatever comes from above: ramp to rest and hold."""
         self._next = None
-        if not self.holding:
+        if not self.holding or self.goal is not None:
             now = self._motion(tick)
             self.start(now.position, now.velocity, tick)
+        return self._motion(tick)
+
+    def to(self, goal: Array, tick: int) -> Motion:
+        """Return the motion wanted at `tick` on the way to `goal` (joints,), rad, whatever comes from above.
+
+        First it ramps to rest; from there it goes straight, from rest to rest, within the limits of every joint.
+        """
+        if self.goal is goal:
+            return self._motion(tick)
+        now = self.rest(tick)
+        if now.velocity.any():
+            return now
+        limits = self._limits
+        self._curve, self._from = Passage(now.position, goal, limits.velocity, limits.acceleration), tick
+        self._difference, self.goal = self._nothing, goal
         return self._motion(tick)
 
     def _receive(self, command: Message, due: int, tick: int) -> None:

@@ -5,59 +5,88 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-import numpy as np
-
 from backplane.message import Message, MessageType, State
 from levels.level import Executor, Input, LevelContext, Ports
-from levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, WINDOW, Error
+from levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
+from levels.operator import OPERATOR_COMMAND, Commands, Goal, What
+from levels.orders import Orders
+from levels.task.detour import Detour
 from levels.task.program import read_program
+from levels.task.window import ShownWindow
 
 ROUNDING_S = 1e-9
 """Ticks times the clock's period are not exact: a time just reached is not late."""
 
 
 class TaskExecutor(Executor):
-    """Reports the program done, or the error that ended it: refused, failed below, or late."""
+    """Reports the program done, or the error that ended it: refused, failed below, or late.
+
+    An operator may hold it, or send the arm elsewhere between two of its moves.
+    """
 
     inputs: ClassVar[Mapping[str, Input]] = {
         "status": Input(MOVE_STATUS, "below.status"),
         "plan": Input(TASK_PLAN, "own.plan"),
+        "last_command": Input(TASK_COMMAND, "own.command"),
         "last_status": Input(TASK_STATUS, "own.status"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs: ClassVar[Mapping[str, MessageType]] = {"command": TASK_COMMAND, "status": TASK_STATUS}
+    commands: ClassVar[Commands] = {
+        What.HOLD: (),
+        What.RESUME: (),
+        What.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
+    }
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._actions = read_program(context.task, context.robot, context.scene).action
+        self._orders = Orders(self.commands)
+        self._window = ShownWindow()
+        self._detour = Detour(context.robot)
         self._started = False
         self._done = 0
         self._error = Error.NONE
         self._reason = ""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take up what is done below; hand down what comes next."""
+        """Take up what is done below, and what an operator says; hand down what comes next."""
         if not self._started:
-            self._go_on(read.last_status.value)
+            self._go_on(read)
+        if self._orders.take(read.operator) and self._orders.standing is What.GOTO:
+            self._take_goto(read)
         plan, below = read.plan.value, read.status.value
         if not self._error:
             self._follow(plan, below)
             self._keep_time(plan, tick)
+        self._done = self._detour.step(self._orders, plan, self._done, below, self._window)
         self._hand_down(plan, write.command)
         self._report(plan, write.status)
+        self._answer(below, write)
 
-    def _go_on(self, last: Message) -> None:
-        """Go on from the last status in the mailbox, after a restart of the board."""
+    def _go_on(self, read: Ports) -> None:
+        """Go on from the last command and status in the mailboxes, after a restart of the board."""
         self._started = True
+        last = read.last_status.value
         self._done = last.moves_done
         self._error, self._reason = Error(last.error), last.reason
+        if read.last_status.is_there and read.last_command.is_there:
+            before = (last.detour or last.first + self._done) - 1
+            self._window = ShownWindow(last.first, read.last_command.value.id, before)
+            self._detour = Detour(self.context.robot, last.detour)
+
+    def _take_goto(self, read: Ports) -> None:
+        """Take up a goto, or the one that was under way when this board died."""
+        is_new = read.last_status.value.order != self._orders.serial
+        self._detour.begin(read.operator.value, self._orders, is_new)
 
     def _follow(self, plan: Message, below: Message) -> None:
         if plan.error:
             self._error, self._reason = Error(plan.error), plan.reason
-        elif plan.count:
-            first = int(plan.moves["id"][0])
-            self._done = min(max(self._done, below.done - first + 1), plan.count)
-        if below.state == State.ERROR and self._done < plan.count:
+        elif plan.count and not self._detour.move:
+            self._done = min(max(self._done, self._window.done(below)), plan.count)
+        failed = below.state == State.ERROR and below.done >= self._window.before
+        if failed and not self._detour.move and self._done < plan.count:
             action = int(plan.moves["action"][self._done])
             self._error, self._reason = Error(below.error), f"action {action}: {below.reason}"
 
@@ -76,16 +105,14 @@ class TaskExecutor(Executor):
         return len(self._actions) if self._done == plan.count else int(plan.moves["action"][self._done])
 
     def _hand_down(self, plan: Message, command: Message) -> None:
-        """Show the moves from the first one that is not done on; behind the last, the window stays."""
-        if self._error or not plan.count:
-            command.count = 0
-            command.moves = np.zeros((), command.moves.dtype)
-            return
-        first = min(self._done, max(plan.count - WINDOW, 0))
-        count = min(WINDOW, plan.count - first)
-        command.moves[:count] = plan.moves[first : first + count]
-        command.count = count
-        command.id = int(plan.moves["id"][first + count - 1])
+        """Show the program's next moves, or the one that an operator wants."""
+        detour, window = self._detour, self._window
+        if self._error or not (detour.is_known if detour.move else plan.count):
+            window.show_none(command)
+        elif detour.move:
+            window.show_one(detour.as_move(self._actions_done(plan)), command)
+        else:
+            window.show(plan, self._done, command, plan.count if detour.until is None else detour.until)
 
     def _report(self, plan: Message, status: Message) -> None:
         status.echo = plan.id
@@ -93,6 +120,16 @@ class TaskExecutor(Executor):
         status.error, status.reason = self._error, self._reason
         status.action, status.actions = self._actions_done(plan), len(self._actions)
         status.moves_done, status.moves = self._done, plan.count
+        status.first, status.detour = self._window.first, self._detour.move
+
+    def _answer(self, below: Message, write: Ports) -> None:
+        """Hold where an operator says so, answer, and hand down what this cycle rests on."""
+        orders = self._orders
+        write.command.hold = orders.standing is What.HOLD or self._detour.holds
+        write.command.operator = orders.rests_on(0)
+        if orders.standing is What.HOLD and below.resting and below.operator >= orders.basis:
+            orders.done()
+        orders.report(write.status)
 
     def _state(self, plan: Message) -> State:
         if self._error:

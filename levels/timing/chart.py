@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from levels.timing.tasks import Unit
 
@@ -21,7 +21,10 @@ class Span:
 
 @dataclass(frozen=True)
 class Job:
-    """What one release made a task compute. `end_ns` is None while it is not done; all times ns."""
+    """What one release made a task compute. `end_ns` is None while it is not done; all times ns.
+
+    A release that an executor skipped, because the next one had come, is a job that is never done.
+    """
 
     task: str
     release_ns: int
@@ -47,3 +50,16 @@ class Chart:
         """Return the jobs of a task that missed their deadline, those not done by it counted."""
         jobs = [job for job in self.jobs if job.task == task]
         return [job for job in jobs if job.is_late or (job.end_ns is None and job.deadline_ns <= self.end_ns)]
+
+    def window(self, start_ns: int, end_ns: int) -> Chart:
+        """Return the chart from `start_ns` to `end_ns`: spans are cut there; jobs are kept whole.
+
+        A job belongs to it when it was released in it, or was not done, or not due, when it began.
+        """
+        spans = tuple(
+            replace(span, start_ns=max(span.start_ns, start_ns), end_ns=min(span.end_ns, end_ns))
+            for span in self.spans
+            if span.start_ns < end_ns and span.end_ns > start_ns
+        )
+        jobs = tuple(j for j in self.jobs if j.release_ns < end_ns and max(j.deadline_ns, j.end_ns or 0) > start_ns)
+        return Chart(start_ns, end_ns, spans, jobs)

@@ -25,12 +25,17 @@ POINT = MessageType(
 
 
 def mailbox(
-    protocol: Protocol = "time-slice", every: int = 1, delay: int = 1, depth: int = 8, name: str = NAME
+    protocol: Protocol = "time-slice",
+    every: int = 1,
+    delay: int = 1,
+    depth: int = 8,
+    name: str = NAME,
+    writer: str = "writer",
 ) -> MailboxSpec:
     """Return the spec of a mailbox of points."""
     return MailboxSpec(
         name=name,
-        writer="writer",
+        writer=writer,
         readers=("reader",),
         protocol=protocol,
         every=every,

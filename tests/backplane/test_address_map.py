@@ -13,9 +13,11 @@ from backplane.address_map import (
     FAULT_ENTRY_SIZE,
     HEAD_SIZE,
     LINE,
+    OPERATOR_ENTRIES,
     PAGE,
     AddressMap,
     mailbox_size,
+    operator_entry_size,
     trace_size,
 )
 from backplane.layout import Layout, TaskSpec, depth_for
@@ -28,6 +30,7 @@ PLANNER = TaskSpec("writer.planner", "writer", "planner", 2, 0, 0, 8, 4, 64)
 @pytest.fixture
 def full() -> Layout:
     boxes = [mailbox(name=f"writer.{n}", depth=depth) for n, depth in (("a", 4), ("b", 64), ("c", 8))]
+    boxes += [mailbox(name="reader.operator", writer="clock")]
     return layout("full", boxes, [task("writer"), PLANNER, task("reader", slot=3)])
 
 
@@ -46,6 +49,7 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
     areas += [(places.mailboxes[m.name], mailbox_size(m)) for m in full.mailboxes]
     areas += [(address, ALARM_SIZE) for address in places.alarms.values()]
     areas += [(places.faults, FAULT_ENTRIES * FAULT_ENTRY_SIZE)]
+    areas += [(places.operator, OPERATOR_ENTRIES * operator_entry_size(full))]
     areas.sort()
     assert all(address % LINE == 0 for address, _ in areas)
     assert all(address + size <= following for (address, size), (following, _) in pairwise(areas))
@@ -54,8 +58,17 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
 def test_what_a_board_writes_lies_in_its_window(full: Layout) -> None:
     places = AddressMap(full)
     window = next(window for window in places.windows if window.board == "writer")
-    for address in (*places.mailboxes.values(), places.blocks["writer"], places.blocks["writer.planner"]):
+    boxes = [places.mailboxes[mailbox.name] for mailbox in full.mailboxes if mailbox.writer == "writer"]
+    for address in (*boxes, places.blocks["writer"], places.blocks["writer.planner"]):
         assert window.address <= address < window.address + window.size
+
+
+def test_what_an_operator_says_lies_in_the_window_of_the_clock_who_gives_it(full: Layout) -> None:
+    places = AddressMap(full)
+    clock = places.windows[0]
+    for address in (places.operator, places.mailboxes["reader.operator"]):
+        assert clock.address <= address < clock.address + clock.size
+    assert operator_entry_size(full) >= full.mailbox("reader.operator").size
 
 
 def test_shared_words_fit_their_places() -> None:

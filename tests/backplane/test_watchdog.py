@@ -136,3 +136,15 @@ def test_a_lost_task_is_due_again_when_it_has_rejoined(make_bus: MakeBus) -> Non
     task.rejoin()
     assert (task.lost_tick, task.unanswered, task.is_idle()) == (-1, 0, True)
     assert task.is_due(3, 2)
+
+
+def test_a_task_that_finishes_every_cycle_too_late_is_late_and_not_lost(make_bus: MakeBus) -> None:
+    watched = Watched(make_bus(), os.getpid())
+    watched.release(True)
+    rung = []
+    for tick in range(1, 20 * LEAST_NS // PERIOD_NS):
+        rung += watched.release(False)
+        # It finishes the release before this one meanwhile.
+        watched.task.block[Block.DONE] = tick - 1
+    assert rung == [Alarm.LATE]
+    assert watched.losses == 0

@@ -15,6 +15,7 @@ from backplane.mailbox import Reading, Verdict
 from backplane.message import Message, MessageType
 from levels.cell import build_cell, sizes
 from levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
+from levels.operator import OPERATOR_COMMAND
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 from tests.levels.box import Box, Disturbance
@@ -117,6 +118,7 @@ class Lockstep:
             self.boxes |= {f"{board.name}.{port}": Box(kind, self.sizes, board.every) for port, kind in kinds}
             if board.planner is not None:
                 self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
+            self.boxes[f"{board.name}.operator"] = Box(OPERATOR_COMMAND, self.sizes)
         self._contexts = {
             b.name: LevelContext(
                 board=b.name,

@@ -12,10 +12,10 @@ from backplane.layout import TaskSpec
 from backplane.trace import RECORD
 from boards.config import load
 from tools.display import SilentDisplay
-from tools.prediction import response_ticks
 from tools.reporting.report import write_report
 from tools.reporting.timing import plan_age_ms, task_times
 from tools.running import run_rack
+from tools.timing.prediction import response_ticks
 
 TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
 MS = 1_000_000

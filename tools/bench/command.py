@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import typer
 
@@ -95,3 +96,35 @@ def partition(
         return
     for line in lines_of(found):
         print(line)
+
+
+@bench.command()
+def response(
+    config: Config = "nasrem",
+    commands: Annotated[int, typer.Option(min=1, help="commands to measure, holds and resumes at every level")] = 200,
+    seed: Annotated[int, typer.Option(help="seed of their ticks")] = 1,
+    mode: Annotated[Literal["lockstep", "realtime"], typer.Option(help="how the racks run")] = "lockstep",
+    twins: Annotated[int, typer.Option(min=0, help="holds whose run is compared with one without them; lockstep")] = 4,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for response.png and .svg")] = None,
+    as_json: Json = False,
+) -> None:
+    """The response to an operator: from the tick of a command to the torque that rests on it, beside the bounds R_s.
+
+    Runs racks one after another, each with holds and resumes at random ticks, at every level in turn. In lockstep each
+    must come at the predicted tick; and without it, in a twin of the run, the torque must differ from that tick on.
+    Exit status 1 where one does not, or is beyond a bound.
+    """
+    from tools.bench.response import Bench
+    from tools.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        measured = Bench(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)
+    print_json(measured.document()) if as_json else print("\n".join(measured.lines()))
+    if out is not None:
+        from tools.responding.plot import plot
+
+        out.mkdir(parents=True, exist_ok=True)
+        paths = plot(measured.response, out)
+        if not as_json:
+            print(f"pictures: {', '.join(map(str, paths))}")
+    raise typer.Exit(0 if measured.held else 1)

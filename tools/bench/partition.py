@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import numpy as np
 
 from backplane.layout import Layout, TaskSpec
 from backplane.trace import SKIPPED_SHIFT, Flag
-from boards.config import RackConfig, load, wire
+from boards.config import RackConfig, budgets, load, timed_tasks, wire
+from levels.timing.response_time import response_times
 from tools.bench.partitions import PARTITIONS, Partition
 from tools.display import display_for
 from tools.progress import Progress
@@ -20,6 +22,7 @@ from tools.reporting.statistics import Distribution, distribution
 from tools.reporting.timing import plan_ages_ms
 from tools.running import run_rack
 from tools.text_table import table
+from tools.timing.verdicts import context_switch_ns
 
 LAUNCH_S = 3.0
 """About what launching and recording a run take besides its time."""
@@ -27,13 +30,19 @@ LAUNCH_S = 3.0
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """One task over all runs of a partition: cycles (plans, of a planner), misses, what was left of its time slice."""
+    """One task over all runs of a partition: cycles (plans, of a planner), misses, what was left of its time slice.
+
+    `predicted_ms` is the worst-case response time by the config's budgets, None without a bound; `fits` whether it is
+    within the time slice, None where the config has no budget.
+    """
 
     slice_ms: float
     cycles: int
     missed: int
     skipped: int
     residual_ms: Distribution | None
+    predicted_ms: float | None
+    fits: bool | None
 
 
 @dataclass(frozen=True)
@@ -56,7 +65,7 @@ class PartitionFigures:
 
 def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[PartitionFigures]:
     """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return what was measured."""
-    config = load(name)
+    config = load(name, [f"name=bench-{os.getpid()}"])
     racks = {partition: partition.of(config) for partition in PARTITIONS}
     progress.total(len(racks) * rounds * (seconds + LAUNCH_S))
     with tempfile.TemporaryDirectory() as folder:
@@ -77,17 +86,19 @@ def _run(config: RackConfig, seconds: float, folder: Path) -> Recording:
 
 def _figures(partition: Partition, config: RackConfig, runs: Sequence[Recording]) -> PartitionFigures:
     layout = wire(config)
-    return PartitionFigures(partition.name, tuple(_level(name, layout, runs) for name in config.board))
+    tasks = timed_tasks(config, layout, budgets(config))
+    responses = response_times(tasks, context_switch_ns(config))
+    return PartitionFigures(partition.name, tuple(_level(name, layout, responses, runs) for name in config.board))
 
 
-def _level(board: str, layout: Layout, runs: Sequence[Recording]) -> LevelFigures:
+def _level(board: str, layout: Layout, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> LevelFigures:
     tasks = {task.name: task for task in layout.tasks}
     planner, plan = tasks.get(f"{board}.planner"), f"{board}.plan"
     ages = [_ages_ms(board, plan, layout, run) for run in runs if plan in run.mailboxes]
     return LevelFigures(
         level=board,
-        executor=_task(tasks[board], layout.clock_ns, runs),
-        planner=None if planner is None else _task(planner, layout.clock_ns, runs),
+        executor=_task(tasks[board], layout.clock_ns, responses, runs),
+        planner=None if planner is None else _task(planner, layout.clock_ns, responses, runs),
         plan_age_ms=distribution(np.concatenate(ages)) if ages else None,
     )
 
@@ -97,7 +108,7 @@ def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarra
     return plan_ages_ms(run.cycles[board]["tick"], made, visible_at, layout.clock_ns * 1e-6)
 
 
-def _task(task: TaskSpec, tick_ns: int, runs: Sequence[Recording]) -> TaskFigures:
+def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> TaskFigures:
     cycles = np.concatenate([run.cycles.get(task.name, run.no_cycles) for run in runs])
     if task.role == "planner":
         # Not the releases that went by without a plan, which are traced when they came late.
@@ -106,38 +117,49 @@ def _task(task: TaskSpec, tick_ns: int, runs: Sequence[Recording]) -> TaskFigure
         skipped = cycles
     slice_ns = task.every * task.within_cycles * tick_ns
     residual_ns = cycles["release_ns"] + slice_ns - cycles["end_ns"]
+    predicted_ns = responses.get(task.name)
     return TaskFigures(
         slice_ms=slice_ns * 1e-6,
         cycles=len(cycles),
         missed=int(np.count_nonzero(cycles["flags"] & Flag.MISSED)),
         skipped=int(np.sum(skipped["flags"] >> SKIPPED_SHIFT)),
         residual_ms=distribution(residual_ns * 1e-6),
+        predicted_ms=None if predicted_ns is None else predicted_ns * 1e-6,
+        fits=predicted_ns is not None and predicted_ns <= slice_ns if task.name in responses else None,
     )
 
 
 def lines_of(found: Sequence[PartitionFigures]) -> Iterator[str]:
     """Yield two tables for people: executors, and planners with the ages of their plans; times in ms."""
     levels = [(one.partition, level) for one in found for level in one.levels]
-    yield "executors: what is left of the cycle, ms"
-    head = ["partition", "level", "cycle", "cycles", "missed", "skipped", "median left", "worst"]
+    yield "executors: the worst response predicted from budgets, and what was left of the cycle, ms"
+    head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "median left", "worst"]
     yield from table(head, [_executor_row(partition, level) for partition, level in levels])
     yield ""
-    yield "planners: what is left of the time slice of a plan, and how old the plans are that are read, ms"
-    head = ["partition", "level", "slice", "plans", "late", "median left", "worst", "median age", "oldest"]
+    yield "planners: the same of the time slice of a plan, and how old the plans were that were read, ms"
+    head = ["partition", "level", "slice", "predicted", "plans", "late", "median left", "worst", "median age", "oldest"]
     yield from table(head, [_planner_row(partition, level) for partition, level in levels if level.planner is not None])
 
 
 def _executor_row(partition: str, level: LevelFigures) -> list[str]:
     executor = level.executor
     counts = [str(count) for count in (executor.cycles, executor.missed, executor.skipped)]
-    return [partition, level.level, f"{executor.slice_ms:g}", *counts, *_ms(executor.residual_ms, "p50", "min")]
+    return [partition, level.level, *_prediction(executor), *counts, *_ms(executor.residual_ms, "p50", "min")]
 
 
 def _planner_row(partition: str, level: LevelFigures) -> list[str]:
     planner = level.planner
     assert planner is not None, "levels without a planner have no such row"
-    row = [partition, level.level, f"{planner.slice_ms:g}", str(planner.cycles), str(planner.missed)]
+    row = [partition, level.level, *_prediction(planner), str(planner.cycles), str(planner.missed)]
     return [*row, *_ms(planner.residual_ms, "p50", "min"), *_ms(level.plan_age_ms, "p50", "max")]
+
+
+def _prediction(task: TaskFigures) -> list[str]:
+    """Return the time slice, and what is predicted to be needed of it."""
+    if task.fits is None:
+        return [f"{task.slice_ms:g}", "-"]
+    response = "no bound" if task.predicted_ms is None else f"{task.predicted_ms:.2f}"
+    return [f"{task.slice_ms:g}", response if task.fits else f"{response} FAILS"]
 
 
 def _ms(found: Distribution | None, *names: str) -> list[str]:

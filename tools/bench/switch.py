@@ -65,7 +65,7 @@ def measure() -> SwitchCost:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         raise Failure("a context switch is measured on one core and asked for on another: this machine has one")
-    return _cost(cores[-1], *_run(cores[-1], cores[0]))
+    return cost_of(cores[-1], *_run(cores[-1], cores[0]))
 
 
 def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +163,7 @@ def _await(ready: Any, *processes: BaseProcess) -> None:
         raise Failure("SCHED_FIFO is refused: an executor cannot come before its planner at once")
 
 
-def _cost(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
+def cost_of(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
     """Keep the wake-ups that fell into the planner's time: with the gap around the executor's."""
     found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
     if not found.any():

@@ -18,10 +18,10 @@ from tools.campaign.draw import Course, fault_plans, kill_plans, size_plans
 from tools.campaign.interrupt import Interrupt
 from tools.campaign.load import cpu_load
 from tools.campaign.plan import Plan
-from tools.progress import Progress
 from tools.campaign.results import Faultless, Judged, Results
 from tools.campaign.targets import Targets, kinds_for
 from tools.campaign.trial import run_trial
+from tools.progress import Progress
 
 LAUNCH_S = 2.0
 """What a launch and an end take, about: the progress bar's guess."""

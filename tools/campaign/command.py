@@ -67,8 +67,8 @@ def campaign(
     """
     from tools.campaign.campaign import Campaign
     from tools.campaign.interrupt import Interrupt
-    from tools.progress import progress_for
     from tools.folders import folder_of
+    from tools.progress import progress_for
 
     order = _order(config, settings, runs, seed, kinds, kills, lockstep, realtime, faultless, sizes, seconds)
     folder, started = folder_of(out, "campaign"), time.monotonic()

@@ -13,7 +13,7 @@ SHOWN = 10
 FAULTS = ["fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after"]
 TIMES = [
     *("task", "R", "cycles", "missed", "skipped", "late p50", "p99", "max", "exec p50", "p99", "max"),
-    *("comm p99", "residual min", "deviation", "alpha", "plan age max"),
+    *("comm p99", "proc p99", "residual min", "deviation", "alpha", "plan age max"),
 ]
 
 
@@ -128,6 +128,7 @@ def _times_row(name: str, task: Report) -> list[str]:
         *(_ms(late, key) for key in ("p50", "p99", "max")),
         *(_ms(execution, key) for key in ("p50", "p99", "max")),
         _ms(task["communication_ms"], "p99"),
+        _ms(task["processor_ms"], "p99"),
         _ms(task["residual_ms"], "min"),
         *("-" if task[key] is None else f"{task[key]:.3f}" for key in ("deviation_ms", "alpha_ms")),
         _ms(task.get("plan_age_ms"), "max"),

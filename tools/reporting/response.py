@@ -13,9 +13,9 @@ import numpy as np
 
 from backplane.layout import Layout
 from boards.config.schema import RackConfig
-from tools.prediction import hierarchy, predict
 from tools.recording import Recording
 from tools.reporting.statistics import Distribution, distribution
+from tools.timing.prediction import hierarchy, predict
 
 
 def system_response(recording: Recording, config: RackConfig, layout: Layout) -> dict[str, Any] | None:

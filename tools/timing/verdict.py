@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from math import isfinite
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -28,3 +30,8 @@ class Verdict:
     def margin(self) -> float:
         """What is left of the right side."""
         return self.right - self.left
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain data, the margin with it; a side without a bound is None."""
+        sides = {"left": self.left, "right": self.right, "margin": self.margin}
+        return asdict(self) | {name: side if isfinite(side) else None for name, side in sides.items()}

@@ -10,7 +10,7 @@ from backplane.layout import Layout
 from boards.config import RackConfig
 from levels.cell import Cell
 from levels.messages import SERVO_STATUS
-from tools.prediction import hierarchy
+from tools.timing.prediction import hierarchy
 from tools.viewer import ages, load
 from tools.viewer.activity import LEVELS, LOG
 from tools.viewer.document import CONFIG

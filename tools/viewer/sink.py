@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from backplane.address_map import CLOCK
 from backplane.segment import Segment
 from backplane.words import System
 from boards.config import loads
-from tools.prediction import hierarchy
+from tools.timing.prediction import hierarchy
 from tools.viewer.ages import Age
 from tools.viewer.blocks import Block, Part
 from tools.viewer.blueprint import blueprint
@@ -56,7 +57,9 @@ class ViewSink:
             task.name: [Gantt(stream, task, speed, lockstep), Load(stream, task, slice_ns), Misses(stream, task)]
             for task in layout.tasks
         }
-        self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in layout.mailboxes}
+        # An operator's mailbox has no age: commands come now and then.
+        periodic = [mailbox for mailbox in layout.mailboxes if mailbox.writer != CLOCK]
+        self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
         self._hierarchy = Hierarchy(stream, layout, hierarchy(config))
         self._events = Events(stream, folder / "events.jsonl", self._hierarchy)
         self._losses = Losses(stream)
@@ -103,8 +106,10 @@ class ViewSink:
             self._hierarchy.write(task, block)
         for mailbox, rows in signals.items():
             block = Block(rows, "stamp_ns", self._times)
-            for part in (*self._of_mailbox[mailbox], self._ages[mailbox]):
+            for part in self._of_mailbox[mailbox]:
                 part.write(block)
+            if mailbox in self._ages:
+                self._ages[mailbox].write(block)
         for age in self._ages.values():
             age.advance(tick)
         self._events.advance()

@@ -1,0 +1,123 @@
+"""The operator table: commands that come from outside, in shared memory, in the system controller's window.
+
+Whoever commands adds a request, at any time. The clock alone gives it, at the beginning of a tick: it publishes the
+message in the level's mailbox, whose only writer it is, so that every task of the tick sees the same and a run in
+lockstep repeats with its commands. What a command means is known above: here are the bytes of a message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
+from backplane.byte_lock import ByteLock
+from backplane.errors import OperatorTableError
+from backplane.segment import Segment
+from backplane.words import System
+
+
+class RequestStage(IntEnum):
+    """Values of `RequestWord.STAGE`."""
+
+    FREE = 0
+    WAITING = 1  # for its tick
+    GIVEN = 2  # and its entry may be filled again
+
+
+class RequestWord(IntEnum):
+    """Words of an entry. The host writes them while it is free, the clock STAGE, SERIAL and GIVEN_TICK thereafter."""
+
+    STAGE = 0
+    TICKET = 1  # number of the request: an entry that was filled again has another
+    MAILBOX = 2  # index among the layout's mailboxes
+    TICK = 3  # tick at which it is to be given; -1: at once
+    SERIAL = 4  # of the command, rising over all levels in the order in which they are given; 0: not yet
+    GIVEN_TICK = 5  # -1: not yet
+
+
+@dataclass(frozen=True)
+class Request:
+    """A command to be given: the index of its mailbox, its message, and its tick; -1: as soon as possible."""
+
+    mailbox: int
+    message: bytes
+    tick: int = -1
+
+
+class RequestEntry:
+    """One entry of the table: `words` and `message` are views of shared memory."""
+
+    def __init__(self, segment: Segment, index: int) -> None:
+        size = operator_entry_size(segment.layout)
+        address = segment.map.operator + index * size
+        self.index = index
+        self.words = segment.words[address // 8 : address // 8 + len(RequestWord)]
+        self.message = segment.view(address + OPERATOR_HEAD_SIZE, size - OPERATOR_HEAD_SIZE)
+
+    def __getitem__(self, word: RequestWord) -> int:
+        """Return a word of the entry."""
+        return self.words[word]
+
+    @property
+    def stage(self) -> RequestStage:
+        """Where the request stands."""
+        return RequestStage(self.words[RequestWord.STAGE])
+
+
+class OperatorTable:
+    """The table of one rack. `entries` are all of them, free ones too."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment, self._words = segment, segment.words
+        self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
+
+    @property
+    def requested(self) -> int:
+        """Requests added so far: whoever has seen this number need not look again."""
+        return self._words[System.REQUESTED]
+
+    def add(self, request: Request) -> RequestEntry:
+        """Fill an entry, a free one or that of the command given longest ago; the clock gives it when it is due.
+
+        Raises `OperatorTableError` when all of them wait for their ticks.
+        """
+        lock = ByteLock(self._segment, self._segment.map.operator)
+        try:
+            # The bound of this wait is the time in which another process fills an entry.
+            while not lock.take():
+                continue
+            settled = [entry for entry in self.entries if entry.stage != RequestStage.WAITING]
+            if not settled:
+                why = f"{len(self.entries)} commands wait for their ticks, as many as it holds"
+                raise OperatorTableError(f"the operator table is full: {why}; permitted: once one of them is given")
+            entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
+            self._fill(entry, request)
+        finally:
+            lock.close()
+        return entry
+
+    def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
+        """Take a request back that still waits; False when it was given."""
+        words = entry.words
+        if words[RequestWord.TICKET] != ticket or words[RequestWord.STAGE] != RequestStage.WAITING:
+            return False
+        words[RequestWord.STAGE] = RequestStage.FREE
+        return words[RequestWord.GIVEN_TICK] < 0
+
+    def waiting(self) -> list[RequestEntry]:
+        """Return the requests that wait, in the order in which they were added."""
+        found = [entry for entry in self.entries if entry.words[RequestWord.STAGE] == RequestStage.WAITING]
+        return sorted(found, key=lambda entry: entry.words[RequestWord.TICKET])
+
+    def _fill(self, entry: RequestEntry, request: Request) -> None:
+        words = entry.words
+        words[RequestWord.STAGE] = RequestStage.FREE
+        words[RequestWord.TICKET] = self._words[System.REQUESTED] + 1
+        words[RequestWord.MAILBOX] = request.mailbox
+        words[RequestWord.TICK] = request.tick
+        words[RequestWord.SERIAL], words[RequestWord.GIVEN_TICK] = 0, -1
+        entry.message[: len(request.message)] = request.message
+        # From here the clock may give it.
+        words[RequestWord.STAGE] = RequestStage.WAITING
+        self._words[System.REQUESTED] += 1

@@ -1,0 +1,101 @@
+"""The operator table: requests are filled whole, wait in order, may be taken back, and make room once given."""
+
+from __future__ import annotations
+
+import pytest
+
+from backplane.address_map import OPERATOR_ENTRIES
+from backplane.errors import OperatorTableError
+from backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
+from backplane.segment import Segment
+from tests.backplane.bus import mailbox
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, exit_status, fork
+
+BOX = "reader.operator"
+
+
+@pytest.fixture
+def segment(make_bus: MakeBus) -> Segment:
+    return make_bus(mailbox(name=BOX, writer="clock"))
+
+
+def give(entry: RequestEntry, serial: int) -> None:
+    """Do to an entry what the clock does."""
+    entry.words[RequestWord.SERIAL], entry.words[RequestWord.GIVEN_TICK] = serial, 10 * serial
+    entry.words[RequestWord.STAGE] = RequestStage.GIVEN
+
+
+def test_an_entry_holds_what_was_asked_for(segment: Segment) -> None:
+    message = bytes(range(1, 1 + segment.layout.mailbox(BOX).size % 256))
+    entry = OperatorTable(segment).add(Request(0, message, tick=40))
+    read = OperatorTable(segment).entries[entry.index]
+    assert bytes(read.message[: len(message)]) == message
+    assert [read[word] for word in (RequestWord.MAILBOX, RequestWord.TICK)] == [0, 40]
+    assert (read.stage, read[RequestWord.SERIAL], read[RequestWord.GIVEN_TICK]) == (RequestStage.WAITING, 0, -1)
+
+
+def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    added = [table.add(Request(0, b"", tick)) for tick in (9, 3, 5)]
+    give(added[0], 1)
+    added.append(table.add(Request(0, b"", 7)))
+    assert [entry[RequestWord.TICK] for entry in OperatorTable(segment).waiting()] == [3, 5, 7]
+    assert table.requested == 4
+
+
+def test_a_request_that_waits_can_be_taken_back(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    entry = table.add(Request(0, b"", 9))
+    assert table.withdraw(entry, entry[RequestWord.TICKET])
+    assert table.waiting() == []
+
+
+def test_a_request_that_was_given_stays_given(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    entry = table.add(Request(0, b"", 9))
+    give(entry, 1)
+    assert not table.withdraw(entry, entry[RequestWord.TICKET])
+    assert entry.stage == RequestStage.GIVEN
+
+
+def test_nobody_takes_back_what_another_has_put_into_the_same_entry(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    entry = table.add(Request(0, b"", 9))
+    ticket = entry[RequestWord.TICKET]
+    table.withdraw(entry, ticket)
+    again = table.add(Request(0, b"", 11))
+    assert again.index == entry.index
+    assert not table.withdraw(entry, ticket)
+    assert again.stage == RequestStage.WAITING
+
+
+def test_a_full_table_makes_room_with_the_command_given_longest_ago(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    entries = [table.add(Request(0, b"", 9)) for _ in range(OPERATOR_ENTRIES)]
+    for serial, entry in enumerate(reversed(entries), 1):
+        give(entry, serial)
+    assert table.add(Request(0, b"", 9)).index == entries[-1].index
+
+
+def test_a_table_in_which_all_wait_refuses_one_more(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    for _ in range(OPERATOR_ENTRIES):
+        table.add(Request(0, b"", 9))
+    with pytest.raises(OperatorTableError, match=f"full: {OPERATOR_ENTRIES} commands wait"):
+        table.add(Request(0, b"", 9))
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_two_operators_at_once_fill_entries_of_their_own(segment: Segment) -> None:
+    half = OPERATOR_ENTRIES // 2
+
+    def add_half() -> None:
+        for _ in range(half):
+            OperatorTable(segment).add(Request(0, b"", 9))
+
+    pids = [fork(add_half) for _ in range(2)]
+    assert [exit_status(pid) for pid in pids] == [0, 0]
+    waiting = OperatorTable(segment).waiting()
+    assert len(waiting) == 2 * half
+    assert len({entry[RequestWord.TICKET] for entry in waiting}) == 2 * half

@@ -1,0 +1,52 @@
+"""A config in the terms of the timing model: its budgets, and the tasks that it makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from boards.config import budgets, load, loads, timed_tasks, wire
+from boards.config.timing import with_budgets
+from boards.errors import ConfigError
+from levels.timing.budget import Budget
+from levels.timing.tasks import Unit
+
+MEASURED = Budget(read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11)
+WITHIN = "board.lower.budget={ process_ms = 1.5, plan_ms = 3, plan_within_ms = 20 }"
+
+
+def test_budgets_are_whole_nanoseconds_by_board(small: Path) -> None:
+    config = load(small, ["board.lower.budget={ read_ms = 0.1, process_ms = 1.25, update_ms = 0.000001 }"])
+    assert budgets(config) == {"lower": Budget(read_ns=100_000, process_ns=1_250_000, update_ns=1)}
+
+
+def test_how_soon_a_plan_is_wanted_is_no_part_of_what_it_takes(small: Path) -> None:
+    assert budgets(load(small, [WITHIN])) == {"lower": Budget(process_ns=1_500_000, plan_ns=3_000_000)}
+
+
+def test_other_budgets_go_into_a_config_and_come_out_as_they_were(small: Path) -> None:
+    upper = Budget(process_ns=3, exchange_ns=5)
+    changed = loads(with_budgets(load(small, [WITHIN]), {"lower": MEASURED, "upper": upper}).text())
+    # The upper level has no planner, and so no plan to read.
+    assert budgets(changed) == {"lower": MEASURED, "upper": Budget(process_ns=3)}
+    assert changed.board["lower"].budget is not None
+    assert changed.board["lower"].budget.plan_within_ms == 20
+    assert budgets(loads(with_budgets(changed, {}).text())) == {}
+
+
+@pytest.mark.parametrize("table", ["budget", "transfer"])
+@pytest.mark.parametrize("key", ["exchange_ms", "update_ms"])
+def test_what_a_planner_would_take_is_a_mistake_without_one(small: Path, table: str, key: str) -> None:
+    with pytest.raises(ConfigError, match=rf"board\.upper\.{table}\.{key} = 1\.5: the board has no planner"):
+        load(small, [f"board.upper.{table}.{key}=1.5"])
+    assert load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"])
+
+
+def test_tasks_are_on_the_cores_that_the_config_asks_for(small: Path) -> None:
+    settings = ["core=7", "coupling=loose", "planner_slot=9", "planner_core=11", "budget.process_ms=1"]
+    config = load(small, [*(f"board.lower.{setting}" for setting in settings), "board.lower.budget.plan_ms=2"])
+    tasks = {task.name: task for task in timed_tasks(config, wire(config), budgets(config))}
+    assert {name: task.core for name, task in tasks.items()} == {"lower": 7, "lower.planner": 11}
+    assert tasks["lower.planner"].time_of(Unit.PLAN) == 2_000_000
+    assert (tasks["lower"].period_ns, tasks["lower.planner"].period_ns) == (2_500_000, 10_000_000)

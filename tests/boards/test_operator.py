@@ -1,0 +1,207 @@
+"""Commands of an operator on real boards: given at their ticks by the clock, answered, told, repeated bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from backplane.mailbox import Reading
+from backplane.operator_table import RequestEntry, RequestStage, RequestWord
+from backplane.protocols import open_observer
+from backplane.ring import mailbox_ring
+from backplane.words import Run, System
+from boards.config import load, wire
+from boards.config.schema import RackConfig
+from boards.errors import ConfigError
+from boards.events import Event
+from boards.faults.config import FaultConfig
+from boards.outcome import Outcome
+from boards.rack import Rack
+from levels.operator import Answer, What
+from tests.boards.conftest import MakeConfig
+from tests.boards.told_racks import TOLD, commands
+from tests.processes import wait_until
+
+HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
+UPPER, LOWER = 8, 1
+SECONDS = 1.0
+
+
+@pytest.fixture
+def told(config: MakeConfig) -> Callable[..., RackConfig]:
+    return lambda *settings: config(*settings, text=TOLD)
+
+
+def run(config: RackConfig, seconds: float = SECONDS) -> tuple[Outcome, list[Event], dict[str, np.ndarray]]:
+    """Run a rack; return how it ended, what happened, and what the mailboxes hold, by name."""
+    with Rack(config) as rack:
+        boxes = [box.name for box in rack.segment.layout.mailboxes]
+        outcome = rack.run(seconds)
+        return outcome, rack.events, {name: mailbox_ring(rack.segment, name).drain().rows for name in boxes}
+
+
+def first(rows: np.ndarray, serial: int) -> int:
+    """Return the tick of the first status that rests on a command."""
+    return int(rows["tick"][np.argmax(rows["message"]["operator"] >= serial)])
+
+
+def test_a_command_is_given_at_its_tick_and_goes_down_level_by_level(told: Callable[..., RackConfig]) -> None:
+    _, events, boxes = run(told(HELD))
+    given = boxes["upper.operator"]
+    assert given["tick"].tolist() == [101, 203]
+    assert given["visible_at"].tolist() == [102, 204]
+    assert given["message"]["id"].tolist() == [1, 2]
+    # Read at the next release of the upper level, 104 and 208, and visible below when that cycle is over.
+    assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
+    assert [first(boxes["lower.status"], serial) for serial in (1, 2)] == [112, 216]
+    counts = dict(zip(boxes["lower.status"]["tick"].tolist(), boxes["lower.status"]["message"]["count"], strict=True))
+    assert counts[111] == counts[110] + 1
+    assert counts[112] == counts[111] == counts[215]
+    assert counts[216] == counts[215] + 1
+    told_of = [event for event in events if event.kind == "command"]
+    assert [(e.tick, e.code, e.board, e.subject, e.value) for e in told_of] == [
+        (101, "hold", "upper", "upper", 1),
+        (203, "resume", "upper", "upper", 2),
+    ]
+
+
+def test_a_run_with_its_commands_repeats_bit_for_bit(told: Callable[..., RackConfig]) -> None:
+    digests = [run(told(setting))[0].digest for setting in (HELD, HELD, "seed=0")]
+    assert digests[0] == digests[1] != digests[2]
+
+
+@pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
+def test_commands_reach_their_level_under_any_protocol(told: Callable[..., RackConfig], protocol: str) -> None:
+    config = told(HELD, f"protocol.default={protocol}")
+    # The clock waits for nobody.
+    assert wire(config).mailbox("upper.operator").protocol == "double-buffer"
+    _, _, boxes = run(config)
+    assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
+
+
+def test_serials_rise_over_all_levels_in_the_order_of_giving(told: Callable[..., RackConfig]) -> None:
+    setting = commands(
+        "level='lower', what='hold', at=0.5",
+        "level='upper', what='hold', tick=50",
+        "level='lower', what='resume', at=0.5",
+    )
+    _, _, boxes = run(told(setting))
+    assert boxes["upper.operator"]["message"]["id"].tolist() == [1]
+    assert boxes["lower.operator"]["message"]["id"].tolist() == [2, 3]
+    assert boxes["lower.operator"]["tick"].tolist() == [200, 200]
+    # Of two for one level in one tick the newest counts.
+    assert set(boxes["lower.status"]["message"]["order"].tolist()) == {0, 3}
+
+
+def test_a_refusal_is_answered_and_goes_no_further(told: Callable[..., RackConfig]) -> None:
+    _, _, boxes = run(told(commands("level='upper', what='goto', home=true, tick=50")))
+    last = boxes["upper.status"]["message"][-1]
+    assert (last["order"], last["answer"], last["standing"]) == (1, Answer.REFUSED, What.NONE)
+    assert last["objection"] == b"the way home is closed"
+    assert not boxes["lower.status"]["message"]["operator"].any()
+
+
+@pytest.mark.parametrize("board", ["upper", "lower"])
+def test_a_board_that_comes_back_goes_on_with_what_it_was_told(told: Callable[..., RackConfig], board: str) -> None:
+    config = told(commands(f"level='{board}', what='hold', tick=50"))
+    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
+    outcome, events, boxes = run(config, 2.0)
+    assert outcome.worked
+    assert [event.board for event in events if event.code == "rejoined"] == [board]
+    last = boxes[f"{board}.status"]["message"][-1]
+    assert (last["order"], last["standing"]) == (1, What.HOLD)
+
+
+def test_a_clock_that_comes_back_goes_on_with_the_serials(told: Callable[..., RackConfig]) -> None:
+    config = told(HELD)
+    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)})
+    _, events, boxes = run(config)
+    assert [event.board for event in events if event.code == "rejoined"] == ["clock"]
+    assert boxes["upper.operator"]["message"]["id"].tolist() == [1, 2]
+    assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
+
+
+def test_a_program_commands_its_rack_while_it_runs(told: Callable[..., RackConfig]) -> None:
+    with Rack(told("clock.mode=realtime")) as rack:
+        rack.start(20.0)
+        entry = rack.command("lower", "hold")
+        await_giving(rack, entry)
+        status = open_observer(rack.segment, "lower.status")
+        watch(rack, lambda: answered(status.peek(), entry[RequestWord.SERIAL]))
+        later = rack.segment.words[System.TICK] + 40
+        second = rack.command("lower", "resume", tick=later)
+        await_giving(rack, second)
+        assert second[RequestWord.GIVEN_TICK] >= later
+        rack.stop("tried")
+        watch(rack, lambda: rack.segment.words[System.STATE] == Run.STOPPED)
+
+
+def test_what_a_program_says_must_fit_the_rack(told: Callable[..., RackConfig]) -> None:
+    with Rack(told()) as rack:
+        with pytest.raises(ConfigError, match="what = \"halt\": should be 'hold', 'resume'"):
+            rack.command("lower", "halt")
+        with pytest.raises(ConfigError, match="'lower' takes no goto; it takes: hold, resume"):
+            rack.command("lower", "goto", home=True)
+
+
+def await_giving(rack: Rack, entry: RequestEntry) -> None:
+    watch(rack, lambda: entry.stage == RequestStage.GIVEN)
+
+
+def answered(reading: Reading, serial: int) -> bool:
+    return reading.is_there and reading.value.order == serial
+
+
+def watch(rack: Rack, condition: Callable[[], bool]) -> None:
+    wait_until(lambda: condition() or not rack.watch(0.001) or condition())
+
+
+MISTAKES = {
+    "no such level": (
+        "level='uper', what='hold'",
+        'command[0].level = "uper": no level that can be commanded; levels: upper, lower',
+    ),
+    "not for this level": (
+        "level='lower', what='goto', home=true",
+        "command[0].what = \"goto\": 'lower' takes no goto; it takes: hold, resume",
+    ),
+    "no goal": ("level='upper', what='goto'", "command[0].goal: missing; goto of 'upper' has one of: home"),
+    "another goal": (
+        "level='upper', what='goto', joints=[1.0]",
+        "command[0].joints: no goal for goto of 'upper'; permitted: home",
+    ),
+    "two goals": (
+        "level='upper', what='goto', joints=[1.0], home=true",
+        "command[0].goal: joints|home are given; goto of 'upper' has one of: home",
+    ),
+    "a goal too much": ("level='upper', what='hold', home=true", "command[0].home: hold has no goal; leave it out"),
+    "two times": ("level='upper', what='hold', tick=3, at=1", "command[0].at = 1.0: tick is given as well"),
+    "unknown key": ("level='upper', what='hold', tik=3", "command[0].tik = 3: unknown key; did you mean 'tick'?"),
+}
+
+
+@pytest.mark.parametrize(("table", "told_as"), MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_of_a_command_name_place_value_and_what_is_permitted(
+    config: MakeConfig, table: str, told_as: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        wire(config(commands(table), text=TOLD))
+    assert any(str(mistake).startswith(told_as) for mistake in caught.value.mistakes), str(caught.value)
+
+
+def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
+    robot = load("nasrem").robot
+    assert robot is not None
+    beyond = [*robot.home[:2], 9.0, *robot.home[3:]]
+    with pytest.raises(ConfigError) as caught:
+        wire(load("nasrem", [commands(f"level='servo', what='setpoint', joints={beyond}")]))
+    assert str(caught.value).startswith("command[0].joints = 9.0: joint 'j3' cannot be there; permitted: ")
+    with pytest.raises(ConfigError, match="2 values; one a joint makes 6: j1, j2, "):
+        wire(load("nasrem", [commands("level='servo', what='setpoint', joints=[0.0, 0.0]")]))
+
+
+def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
+    with pytest.raises(ConfigError, match="the clock writes it, and waits for nobody"):
+        wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=TOLD))

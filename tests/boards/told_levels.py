@@ -1,0 +1,56 @@
+"""Two levels without an arm that an operator can command: what they write follows from when they are told."""
+
+from __future__ import annotations
+
+from backplane.message import Field, State, command, status
+from levels.level import Executor, Input, Ports
+from levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, What
+from levels.orders import Orders
+
+STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: do not go on"))
+COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that were not held"))
+
+
+class Upper(Executor):
+    """Says hold when an operator does; refuses to go home."""
+
+    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "status": Input(COUNTED, "below.status")}
+    outputs = {"command": STEP, "status": COUNTED}
+    commands = {What.HOLD: (), What.RESUME: (), What.GOTO: (Goal.HOME,)}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Take up what is said, and hand it down."""
+        orders = self.orders
+        if orders.take(read.operator) and orders.standing is What.GOTO:
+            orders.refuse("the way home is closed")
+        write.command.hold = orders.standing is What.HOLD
+        write.command.operator = orders.rests_on(0)
+        if read.status.value.operator >= orders.basis:
+            orders.done()
+        orders.report(write.status)
+        write.status.state = State.EXECUTING
+
+    def self_test(self) -> None:
+        """Begin without orders."""
+        self.orders = Orders(self.commands)
+
+
+class Lower(Executor):
+    """Counts, unless it is held from above or here."""
+
+    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "command": Input(STEP, "above.command")}
+    outputs = {"status": COUNTED}
+    commands = {What.HOLD: (), What.RESUME: ()}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Take up what is said; count."""
+        self.orders.take(read.operator)
+        held = bool(read.command.value.hold) or self.orders.standing is What.HOLD
+        write.status.count += not held
+        self.orders.done()
+        self.orders.report(write.status, read.command.value.operator)
+        write.status.state = State.EXECUTING
+
+    def self_test(self) -> None:
+        """Begin without orders."""
+        self.orders = Orders(self.commands)

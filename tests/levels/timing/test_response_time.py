@@ -1,0 +1,232 @@
+"""Worst-case response times against published examples, and against schedules drawn out unit by unit."""
+
+from __future__ import annotations
+
+import random
+from typing import NamedTuple
+
+import pytest
+
+from levels.timing.response_time import blocking_ns, load_of, response_time, response_times
+from levels.timing.schedule import simulate
+from levels.timing.tasks import Part, TimedTask, Unit
+
+SETS = 300
+PERIODS = (4, 5, 6, 8, 10, 12, 15, 20, 24)
+"""Their hyperperiod is short, 120."""
+
+
+class Plain(NamedTuple):
+    """A task in whole units of time; those of a set stand in the order of their priorities, highest first."""
+
+    cost: int
+    period: int
+    jitter: int = 0
+
+
+def seen(tasks: list[Plain], blocked: int = 0) -> list[int]:
+    """Draw the schedule of queueing jobs, unit by unit, until nothing is left to do; return the longest responses.
+
+    It is the worst there is: all tasks become known at 0, as long behind their release as their jitter allows, and
+    never again that late; what cannot be preempted has taken the core just before, until `blocked`.
+    """
+    queues: list[list[list[int]]] = [[] for _ in tasks]  # the jobs of each task: release, time left
+    worst, made, now = [0] * len(tasks), [0] * len(tasks), 0
+    while now == 0 or any(queues):
+        for at, (cost, period, jitter) in enumerate(tasks):
+            while (release := made[at] * period - jitter) <= now:
+                queues[at].append([release, cost])
+                made[at] += 1
+        first = next((at for at, queue in enumerate(queues) if queue), None)
+        now += 1
+        if now > blocked and first is not None:
+            queues[first][0][1] -= 1
+            if not queues[first][0][1]:
+                worst[first] = max(worst[first], now - queues[first].pop(0)[0])
+    return worst
+
+
+def analysed(tasks: list[Plain], blocked: int = 0, queueing: bool = True) -> list[int | None]:
+    return [
+        response_time(t.cost, tasks[:at], blocked, t.jitter, period=t.period if queueing else None)
+        for at, t in enumerate(tasks)
+    ]
+
+
+def drawn(draw: random.Random, full: bool = False, jitter: bool = False) -> list[Plain]:
+    """Return a random set of tasks that one processor has time for, fully loaded only if that is wanted."""
+    while True:
+        tasks = [Plain(draw.randint(1, 6), draw.choice(PERIODS)) for _ in range(draw.randint(2, 5))]
+        if sum(120 // t.period * t.cost for t in tasks) < 120 + full:
+            return [t._replace(jitter=draw.randint(0, 2 * t.period)) for t in tasks] if jitter else tasks
+
+
+def timed(name: str, core: int, priority: int, every: int, *parts: Part, **more: int) -> TimedTask:
+    return TimedTask(name, name.partition(".")[0], "executor", core, priority, every, parts, **more)
+
+
+def computing(time: int) -> Part:
+    return Part(Unit.PROCESS, time)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "expected"),
+    [
+        # A. Burns and A. Wellings, Real-Time Systems and Programming Languages: process sets B and C, rate monotonic.
+        ([Plain(3, 7), Plain(3, 12), Plain(5, 20)], [3, 6, 20]),
+        ([Plain(5, 20), Plain(10, 40), Plain(40, 80)], [5, 15, 80]),
+        # J. Lehoczky, Fixed Priority Scheduling of Periodic Task Sets with Arbitrary Deadlines (1990), table 1.
+        ([Plain(26, 70), Plain(62, 100)], [26, 118]),
+    ],
+)
+def test_published_examples_come_out(tasks: list[Plain], expected: list[int]) -> None:
+    assert analysed(tasks) == expected
+
+
+def test_the_worst_job_of_lehoczkys_example_is_not_the_first() -> None:
+    assert response_time(62, [(26, 70, 0)]) == 114
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_set_of_tasks_responds_otherwise_than_its_schedule(seed: int) -> None:
+    draw = random.Random(seed)
+    for _ in range(SETS):
+        tasks = drawn(draw, full=True)
+        assert analysed(tasks) == seen(tasks), tasks
+
+
+def test_jitter_counts_in_full_on_both_sides() -> None:
+    draw = random.Random(11)
+    for _ in range(SETS):
+        tasks = drawn(draw, jitter=True)
+        assert analysed(tasks) == seen(tasks), tasks
+
+
+def test_blocking_delays_the_whole_busy_time_once() -> None:
+    draw = random.Random(12)
+    for _ in range(SETS):
+        tasks, blocked = drawn(draw), draw.randint(1, 8)
+        assert analysed(tasks, blocked) == seen(tasks, blocked), tasks
+
+
+def test_jobs_that_skip_instead_of_queueing_respond_as_the_first_one_does() -> None:
+    draw = random.Random(13)
+    for _ in range(SETS):
+        tasks = drawn(draw, full=True)
+        queueing, skipping = analysed(tasks), analysed(tasks, queueing=False)
+        for task, queued, skipped in zip(tasks, queueing, skipping, strict=True):
+            # Full load above leaves a job no bound of its own; nobody below it is drawn then.
+            assert queued is not None
+            assert skipped is not None
+            assert skipped <= queued
+            assert skipped == queued or queued > task.period
+
+
+def test_full_load_with_jitter_ends_the_analysis() -> None:
+    assert response_time(2, [(2, 4, 0)], jitter=1, period=4) == 5
+
+
+@pytest.mark.parametrize(
+    ("above", "period"),
+    [
+        ([(2, 4, 0), (3, 6, 0)], None),
+        ([(2, 4, 0), (4, 6, 0)], None),
+        ([(2, 4, 0)], 3),
+    ],
+    ids=["full above", "overloaded above", "overloaded with its own"],
+)
+def test_overload_has_no_bound(above: list[tuple[int, int, int]], period: int | None) -> None:
+    assert response_time(2, above, period=period) is None
+
+
+def test_the_search_ends_at_its_horizon() -> None:
+    above = [(5, 10, 0), (49_999, 100_000, 0)]
+    assert response_time(7, above, horizon=100_000) is None
+    found = response_time(7, above, horizon=10_000_000)
+    assert found is not None
+    assert found > 100_000
+
+
+def test_what_takes_no_time_responds_at_once() -> None:
+    assert response_time(0, []) == 0
+
+
+def test_two_context_switches_come_with_every_job() -> None:
+    tasks = [timed("high", 0, 20, 10, computing(2)), timed("low", 0, 10, 40, computing(9))]
+    # 9 + 2 and two jobs of 2 + 2.
+    assert response_times(tasks, context_switch_ns=1) == {"high": 4, "low": 19}
+    assert load_of(tasks, context_switch_ns=1) == {0: pytest.approx(4 / 10 + 11 / 40)}
+
+
+def test_other_cores_do_not_interfere() -> None:
+    tasks = [timed("here", 0, 10, 10, computing(4)), timed("there", 1, 20, 10, computing(9))]
+    assert response_times(tasks) == {"here": 4, "there": 9}
+
+
+def test_tasks_of_equal_priority_delay_each_other() -> None:
+    tasks = [timed("one", 0, 10, 10, computing(3)), timed("other", 0, 10, 10, computing(4))]
+    assert response_times(tasks) == {"one": 7, "other": 7}
+
+
+def test_ordinary_tasks_share_time_by_turns() -> None:
+    tasks = [timed("brief", 0, 0, 100, computing(3)), timed("long", 0, 0, 1000, computing(200))]
+    assert response_time(3, [], sharing=[(200, 1000, 0)], turn=4) == 3 + 3 + 4
+    assert response_time(200, [], sharing=[(3, 100, 0)], turn=4) == 200 + 3 * 3
+    # A turn of the kernel's, 4 ms, is longer than all of it.
+    assert response_times(tasks) == {"brief": 203, "long": 209}
+
+
+def test_ordinary_tasks_wait_for_those_with_a_priority() -> None:
+    tasks = [timed("ordinary", 0, 0, 20, computing(5)), timed("first", 0, 1, 10, computing(4))]
+    assert response_times(tasks) == {"ordinary": 9, "first": 4}
+
+
+def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:
+    update = Part(Unit.UPDATE, 3, preemptible=False)
+    planner = timed("level.planner", 0, 5, 40, Part(Unit.PLAN, 6), update, ceiling=20)
+    tasks = [timed(name, 0, priority, 40, computing(1)) for name, priority in (("above", 21), ("own", 20), ("low", 4))]
+    tasks.append(planner)
+    assert {task.name: blocking_ns(task, tasks) for task in tasks} == {
+        "above": 0,
+        "own": 3,
+        "low": 0,
+        "level.planner": 0,
+    }
+    assert response_times(tasks) == {"above": 1, "own": 1 + 1 + 3, "low": 12, "level.planner": 11}
+
+
+def test_jitter_of_a_timed_task_counts() -> None:
+    tasks = [timed("high", 0, 20, 10, computing(4), jitter_ns=3), timed("low", 0, 10, 40, computing(4))]
+    # The second job of the high one may come 7 behind the first.
+    assert response_times(tasks) == {"high": 7, "low": 12}
+
+
+def test_a_task_that_computes_nothing_has_no_response() -> None:
+    assert response_times([timed("idle", 0, 10, 10)]) == {}
+
+
+def test_no_schedule_of_executors_and_planners_goes_beyond_the_bound() -> None:
+    draw, attained = random.Random(14), 0
+    for _ in range(SETS):
+        switch, tasks = draw.randint(0, 1), levels_drawn(draw)
+        bounds, periods = response_times(tasks, switch), {task.name: task.period_ns for task in tasks}
+        for job in simulate(tasks, 480, switch).jobs:
+            bound = bounds[job.task]
+            # Whoever is late once may take up its next release late.
+            if job.end_ns is not None and bound is not None and bound <= periods[job.task]:
+                # A schedule tells the end of a job's last part; the switch out of it comes behind.
+                assert job.end_ns + switch - job.release_ns <= bound, (job, tasks)
+                attained += job.end_ns + switch - job.release_ns == bound
+    assert attained > SETS
+
+
+def levels_drawn(draw: random.Random) -> list[TimedTask]:
+    """Return levels on two cores, of different priorities, with planners whose update keeps their executor out."""
+    tasks, priorities = [], iter(draw.sample(range(50, 99), 3))
+    for name, priority in zip(("task", "primitive", "servo"), priorities, strict=True):
+        core, every, within = draw.randint(0, 1), draw.choice(PERIODS), draw.randint(1, 4)
+        tasks.append(timed(name, core, priority, every, computing(draw.randint(1, 3))))
+        parts = Part(Unit.PLAN, draw.randint(1, 6)), Part(Unit.UPDATE, 1, preemptible=draw.random() < 0.5)
+        own, ceiling = priority - 49, 0 if parts[1].preemptible else priority
+        tasks.append(TimedTask(f"{name}.planner", name, "planner", core, own, every, parts, within, ceiling))
+    return tasks

@@ -1,0 +1,172 @@
+"""Schedules: the paper's figures to the millisecond, and the rack's rules for whoever is late."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+
+from levels.timing.chart import Chart
+from levels.timing.schedule import simulate
+from levels.timing.tasks import Part, TimedTask, Unit
+from tests.levels.timing.step_by_step import run
+
+C, R, X, W, P, U = Unit
+
+
+def parts(text: str, locked: str = "") -> tuple[Part, ...]:
+    """Return parts of so many units of time each, as in "R1 X2 W1"; those of `locked` are not preemptible."""
+    return tuple(Part(Unit(p[0]), int(p[1:]), p[0] not in locked) for p in text.split())
+
+
+def executor(text: str, every: int, priority: int = 80, core: int = 1, name: str = "level") -> TimedTask:
+    return TimedTask(name, name, "executor", core, priority, every, parts(text))
+
+
+def planner(text: str, every: int, cycles: int, core: int = 1, ceiling: int = 80, name: str = "level") -> TimedTask:
+    return TimedTask(f"{name}.planner", name, "planner", core, 0, every, parts(text, "U"), cycles, ceiling)
+
+
+def row(chart: Chart, core: int = 1) -> str:
+    """Return who computes in each unit of time, as the paper's figures have it."""
+    letters = ["-"] * chart.end_ns
+    for span in (span for span in chart.spans if span.core == core):
+        letters[span.start_ns : span.end_ns] = span.unit.value * (span.end_ns - span.start_ns)
+    return "".join(letters)
+
+
+def ends(chart: Chart, task: str) -> list[tuple[int, int | None]]:
+    return [(job.release_ns, job.end_ns) for job in chart.jobs if job.task == task]
+
+
+FIG_2 = (executor("R1 X2 W1", 8), planner("P6 U1", 8, 2))
+FIG_3 = (executor("R1 X2 W1", 6), planner("P6 U1", 6, 3))
+FIG_4 = (executor("C1 R1 X2 W1", 6), planner("P6 U1", 6, 2, core=2, ceiling=0))
+
+
+def test_figure_2_is_printed_as_the_paper_has_it() -> None:
+    assert row(simulate(FIG_2, 32)) == "RXXWPPPPRXXWPPU-" * 2
+
+
+def test_figure_2_with_an_executor_of_3_then_2_ms_fills_two_cycles_to_the_millisecond() -> None:
+    chart = simulate(FIG_2, 32, variants={"level": (parts("R1 X3 W1"), parts("R1 X2 W1"))})
+    assert row(chart) == "RXXXWPPPRXXWPPPU" * 2
+    assert not chart.late("level.planner")
+
+
+def test_figure_3_has_no_plan_within_three_cycles() -> None:
+    chart = simulate(FIG_3, 180)
+    assert row(chart)[:24] == "RXXWPPRXXWPPRXXWPPRXXWUP"
+    plans = [job for job in chart.jobs if job.task == "level.planner"]
+    assert len(plans) == 9
+    assert chart.late("level.planner") == plans
+    assert not chart.late("level")
+
+
+def test_figure_4_works_on_two_processors_with_waste() -> None:
+    chart = simulate(FIG_4, 24)
+    assert row(chart, 1) == "CRXXW-" * 4
+    assert row(chart, 2) == "PPPPPPU-----" * 2
+    assert not chart.late("level")
+    assert not chart.late("level.planner")
+
+
+def test_figure_4_with_a_longer_executor_misses_every_cycle() -> None:
+    chart = simulate((executor("C1 R1 X4 W1", 6), FIG_4[1]), 60)
+    assert row(chart, 1) == ("CRXXXXW" * 9)[:60]
+    assert len(chart.late("level")) == 10
+
+
+def test_whoever_is_late_takes_the_newest_release_and_skips_the_others() -> None:
+    chart = simulate([executor("X25", 10)], 60)
+    # Done at 25 and at 45: the releases of 10 and of 30 have passed, those of 20 and 40 are the newest.
+    assert ends(chart, "level") == [(0, 25), (10, None), (20, 50), (30, None), (40, None), (50, None)]
+    assert [job.release_ns for job in chart.late("level")] == [0, 10, 20, 30, 40, 50]
+
+
+def test_a_late_plan_is_followed_at_once_by_the_one_whose_slice_has_begun() -> None:
+    chart = simulate(FIG_3, 60)
+    assert ends(chart, "level.planner") == [(0, 23), (18, 42), (36, None)]
+
+
+def test_a_planner_that_is_done_early_waits_for_the_end_of_its_slice() -> None:
+    assert row(simulate([planner("P1", 2, 3)], 13)) == "P-----P-----P"
+
+
+def test_a_planner_that_lost_more_than_its_slice_skips_to_the_oldest_release_that_has_not_passed() -> None:
+    # One unit of five is left to it: a plan of seven lasts 35, far beyond its slice of 10.
+    chart = simulate((executor("X4", 5), planner("P7", 5, 2)), 110)
+    assert ends(chart, "level.planner") == [(0, 35), (30, 70), (65, 105), (100, None)]
+
+
+def test_the_plan_update_keeps_its_executor_out_and_nobody_above_it() -> None:
+    tasks = executor("R1 X1", 4), planner("P2 U3", 4, 3)
+    assert row(simulate(tasks, 12)) == "RXPPRXUUURX-"
+    above = TimedTask("clock", "clock", "clock", 1, 90, 8, parts("X1"))
+    assert row(simulate((*tasks, above), 13)) == "XRXPRXPUXUURX"
+
+
+def test_a_plan_update_without_a_ceiling_is_preempted() -> None:
+    tasks = executor("R1 X1", 4), planner("P2 U3", 4, 3, ceiling=0)
+    assert row(simulate(tasks, 12)) == "RXPPRXUURXU-"
+
+
+def test_a_release_at_the_very_moment_the_update_could_begin_comes_first() -> None:
+    assert row(simulate((executor("X2", 4), planner("P2 U1", 4, 2)), 8)) == "XXPPXXU-"
+
+
+def test_equal_priorities_take_their_turns_by_release_then_by_name() -> None:
+    tasks = executor("X3", 6, name="b"), executor("W2", 6, name="a"), executor("R1", 4, name="c")
+    assert row(simulate(tasks, 12)) == "WWXXXRWWXXXR"
+
+
+def test_every_job_costs_two_context_switches() -> None:
+    chart = simulate(FIG_2, 16, context_switch_ns=1)
+    # in, R X W, out; in, P; in, R X W, out; P: what is left of two cycles is six units, one of them a switch.
+    assert row(chart) == "-RXXW--P-RXXW-PP"
+    assert ends(chart, "level") == [(0, 5), (8, 13)]
+    assert [job.end_ns for job in chart.late("level.planner")] == [None]
+
+
+def test_a_release_that_is_known_late_delays_its_job() -> None:
+    late = replace(executor("X2", 5), jitter_ns=2)
+    chart = simulate([late], 10)
+    assert row(chart) == "--XX---XX-"
+    assert ends(chart, "level") == [(0, 4), (5, 9)]
+
+
+def test_what_is_not_done_when_the_schedule_ends_has_no_end() -> None:
+    chart = simulate([executor("X3", 10), executor("X9", 30, priority=5, name="slow")], 8)
+    assert ends(chart, "level") == [(0, 3)]
+    assert ends(chart, "slow") == [(0, None)]
+
+
+def random_tasks(seed: int) -> list[TimedTask]:
+    """Return two to five tasks on one core, with room for them or without."""
+    chance = random.Random(seed)
+    tasks = []
+    for at in range(chance.randint(1, 3)):
+        every, priority = chance.randint(4, 20), chance.choice((10, 20, 30, 40))
+        text = f"R{chance.randint(0, 1)} X{chance.randint(1, max(1, every // 3))} W{chance.randint(0, 2)}"
+        name = f"level{at}"
+        tasks.append(executor(text, every, priority, name=name))
+        if chance.random() < 0.7:
+            plan = f"P{chance.randint(0, 12)} U{chance.randint(1, 4)}"
+            ceiling = chance.choice((0, priority))
+            tasks.append(planner(plan, every, chance.randint(1, 4), ceiling=ceiling, name=name))
+    return tasks
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
+    for number in range(10):
+        tasks, until = random_tasks(1000 * seed + number), 300
+        chart = simulate(tasks, until)
+        expected, ended = run(tasks, until)
+        found = ["-"] * until
+        for span in chart.spans:
+            assert set(found[span.start_ns : span.end_ns]) == {"-"}
+            found[span.start_ns : span.end_ns] = [f"{span.unit.value} of {span.task}"] * (span.end_ns - span.start_ns)
+        assert found == expected
+        assert {(job.task, job.release_ns): job.end_ns for job in chart.jobs if job.end_ns is not None} == ended

@@ -1,0 +1,75 @@
+"""Runs of the paper's figures by real processes, recorded."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from boards.config import load
+from tools.charting.measured import Run
+from tools.charting.panel import Panel
+from tools.display import SilentDisplay
+from tools.recording import Recording
+from tools.running import run_rack
+
+SECONDS = 1.6
+ATTEMPTS = 6
+DISTURBED = 0.1
+"""Part of a run's time, lost to others on its cores, from which it tells nothing of the rack."""
+
+
+def obtains_fifo() -> bool:
+    """Say whether this machine lets a process take a real-time priority."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+needs_a_machine = pytest.mark.skipif(
+    not obtains_fifo() or len(os.sched_getaffinity(0)) < 2, reason="needs real-time priorities and two cores"
+)
+
+
+def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Run:
+    """Run a rack of the figures under a name of its own, into `folder`, and return the run."""
+    config = load(name, [f"name=test-{os.getpid()}-{name}", *settings])
+    result = run_rack(config, seconds, folder, SilentDisplay())
+    assert result.worked, result.failure()
+    return Run(Recording(folder))
+
+
+def undisturbed(name: str, folder: Path, *settings: str) -> Run:
+    """Return a run in which nobody outside the rack had its cores for long: the last attempt, if none is."""
+    for attempt in range(ATTEMPTS):
+        found = run(name, folder / str(attempt), *settings)
+        if lost(found) < DISTURBED:
+            break
+    return found
+
+
+def lost(found: Run) -> float:
+    """Return the part of a run in which its tasks waited for a core, or were on one, and did not compute.
+
+    An executor is ready at its release, a planner when its executor has let go of the core.
+    """
+    cycles = found.recording.cycles
+    waited = sum(int((rows["start_ns"] - rows["release_ns"]).clip(0).sum()) for rows in (cycles["level"],))
+    charted = sum(span.end_ns - span.start_ns for span in found.chart(0, found.end_ns).spans)
+    computed = sum(int(rows["processor_ns"].sum()) for rows in cycles.values())
+    return (waited + max(0, charted - computed)) / found.end_ns
+
+
+def whole(found: Run) -> Panel:
+    """Return the panel of a whole run."""
+    return found.panel(0, found.end_ns, lambda part: None)
+
+
+def share(counts: Counter[str], *patterns: str) -> float:
+    """Return the part of a count that some patterns make."""
+    return sum(counts[pattern] for pattern in patterns) / counts.total()

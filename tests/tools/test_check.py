@@ -1,0 +1,143 @@
+"""`rack check` as a user runs it: what it shows, what it says would do, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from boards.config import budgets, load
+from tests.tools.test_commands import rack
+from tools.timing.trial import Trial
+
+FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
+FAILS = ("--set", "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }")
+ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
+
+
+@pytest.fixture
+def recorded(small: Path, rack_name: str, tmp_path: Path) -> Path:
+    """A short run of the small rack."""
+    folder = tmp_path / "run"
+    done = rack("run", small, "--seconds", 1, "--set", f"name={rack_name}", "--out", folder, "--json")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def told(done: subprocess.CompletedProcess[str]) -> list[str]:
+    return [line for line in done.stdout.splitlines() if "FAILS" in line]
+
+
+def test_a_rack_that_fits_ends_with_status_0(small: Path) -> None:
+    done = rack("check", small, *FITS, *ALONE)
+    assert (done.returncode, told(done)) == (0, [])
+    assert "what would do" not in done.stdout
+    assert "for want of a budget (in the config, or --from a run): upper" in done.stdout
+
+
+def test_a_rack_that_fails_says_where_and_what_would_do(small: Path) -> None:
+    done = rack("check", small, *FAILS, *ALONE)
+    assert done.returncode == 1
+    assert {line.split()[0] for line in told(done)} == {"3.8", "1", "load:"}
+    assert "  board 'lower': within_cycles 4 -> 7 (a plan every 17.5 ms)" in done.stdout
+
+
+def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
+    done = rack("check", small)
+    assert done.returncode == 0
+    assert "for want of a budget (in the config, or --from a run): upper, lower" in done.stdout
+
+
+def test_json_holds_everything_with_both_sides(small: Path) -> None:
+    done = rack("check", small, *FAILS, *ALONE, "--json")
+    timing = json.loads(done.stdout)["timing"]
+    assert done.returncode == 1
+    assert not timing["holds"]
+    verdict = next(v for v in timing["verdicts"] if v["equation"] == "3.8")
+    assert (verdict["left"], verdict["sign"], verdict["right"]) == (3e6, "<", 1.8e6)
+    assert (verdict["margin"], verdict["holds"], verdict["subject"], verdict["unit"]) == (-1.2e6, False, "lower", "ns")
+    level = timing["levels"][0]
+    assert (level["cycle_ns"], level["residual_ns"], level["planning_ns"], level["slice_ns"]) == (
+        2_500_000,
+        2_000_000,
+        12_000_000,
+        10_000_000,
+    )
+    response = next(r for r in timing["responses"] if r["task"] == "lower.planner")
+    assert response["deadline_ns"] == 10_000_000
+    assert not response["holds"]
+    assert timing["loads"] == {"1": pytest.approx(0.7 / 2.5 + 12.2 / 10)}
+    assert timing["context_switch_ns"] == 100_000
+    assert timing["repair"]["fits"]
+    assert timing["repair"]["steps"][0][0]["settings"] == {"within_cycles": 7}
+
+
+def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
+    done = rack("check", small, *FAILS, *ALONE, "--fix")
+    assert done.returncode == 0
+    assert "within_cycles 4 -> 7" in done.stderr
+    fixed = tmp_path / "fixed.toml"
+    fixed.write_text(done.stdout)
+    config = load(fixed)
+    assert config.board["lower"].within_cycles == 7
+    assert Trial.of(config, budgets(config)).failing == ()
+    assert rack("check", fixed).returncode == 0
+
+
+def test_a_fix_is_json_too(small: Path) -> None:
+    document = json.loads(rack("check", small, *FAILS, *ALONE, "--fix", "--json").stdout)
+    assert document["fits"]
+    assert "within_cycles = 7" in document["config"]
+
+
+def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
+    done = rack("check", small, "--set", "board.lower.budget.process_ms=100", "--fix")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("nothing helps against 3.1 of lower")
+
+
+def test_a_rack_that_fits_is_fixed_as_it_is(small: Path) -> None:
+    done = rack("check", small, *FITS, *ALONE, "--fix")
+    assert (done.returncode, done.stderr) == (0, "nothing to change\n")
+    assert done.stdout == load(small, [*FITS[1:], *ALONE[1::2]]).text()
+
+
+def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
+    done = rack("check", small, "--from", recorded, "--percentile", 90, "--json")
+    timing = json.loads(done.stdout)["timing"]
+    assert done.returncode == (0 if timing["holds"] else 1)
+    levels = {level["board"]: level for level in timing["levels"]}
+    assert set(levels) == {"upper", "lower"}
+    assert all(0 < level["execution_ns"] < 1_000_000 for level in levels.values())
+    assert levels["lower"]["plan_ns"] > 0
+    assert levels["upper"]["plan_ns"] is None
+
+
+def test_a_fix_carries_the_measured_budgets(small: Path, recorded: Path, tmp_path: Path) -> None:
+    # A cycle this short leaves the measured planner nothing; whatever helps is judged by what was measured.
+    done = rack("check", small, "--from", recorded, "--percentile", 50, "--fix")
+    assert done.returncode == 0, done.stderr
+    fixed = tmp_path / "fixed.toml"
+    fixed.write_text(done.stdout)
+    assert set(budgets(load(fixed))) == {"upper", "lower"}
+    assert rack("check", fixed).returncode == 0
+
+
+def test_a_run_of_another_rack_is_refused_in_one_line(recorded: Path) -> None:
+    done = rack("check", "fig2", "--from", recorded)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"{recorded}: a run of other boards: lower, upper; 'fig2' has level\n"
+
+
+def test_a_folder_that_is_no_run_is_refused_in_one_line(small: Path, tmp_path: Path) -> None:
+    done = rack("check", small, "--from", tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(small: Path) -> None:
+    done = rack("check", small, "--set", "board.upper.budget.plan_ms=6")
+    assert done.returncode == 2
+    assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; leave it out, or name one\n"

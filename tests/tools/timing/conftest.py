@@ -1,0 +1,78 @@
+"""A rack of two levels with budgets, for the timing model: nothing of it is ever launched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from boards.config import budgets, load
+from tools.timing.trial import Trial
+
+BUDGETED = f"""
+name = "budgeted"
+python_path = ["{Path(__file__).resolve().parents[2]}"]
+
+[clock]
+period_ms = 2.5
+core = 0
+priority = 90
+
+[timing]
+context_switch_ms = 0.1
+
+[board.upper]
+slot = 2
+core = 0
+rate_hz = 50
+priority = 70
+below = "lower"
+executor = "two_levels:Upper"
+
+[board.upper.budget]
+read_ms = 1.0
+process_ms = 2.0
+write_ms = 1.0
+
+[board.lower]
+slot = 3
+core = 1
+rate_hz = 100
+priority = 80
+above = "upper"
+executor = "two_levels:Lower"
+planner = "two_levels:LowerPlanner"
+coupling = "tight"
+within_cycles = 4
+
+[board.lower.budget]
+read_ms = 0.5
+process_ms = 3.0
+write_ms = 0.5
+exchange_ms = 0.25
+plan_ms = 8.0
+update_ms = 0.5
+"""
+"""Lower: R 10 ms, t_exec 3, t_comm 1.25, t_residual 5.75, t_plan 8.5 within 4 cycles: fits, and could within 2."""
+
+Judge = Callable[..., Trial]
+
+
+@pytest.fixture
+def budgeted(tmp_path: Path) -> Path:
+    """The rack as a file."""
+    path = tmp_path / "budgeted.toml"
+    path.write_text(BUDGETED)
+    return path
+
+
+@pytest.fixture
+def judge(budgeted: Path) -> Judge:
+    """Put the rack, with settings, to the timing model."""
+
+    def judged(*settings: str) -> Trial:
+        config = load(budgeted, settings)
+        return Trial.of(config, budgets(config))
+
+    return judged

@@ -1,0 +1,177 @@
+"""What would do where something fails: the smallest change of each kind, tried and not assumed."""
+
+from __future__ import annotations
+
+import pytest
+
+from boards.config import budgets, load, loads
+from tests.tools.timing.conftest import Judge
+from tools.timing.changes import changes_for, first_that
+from tools.timing.repair import repair
+from tools.timing.trial import Trial
+
+
+def settings_for(trial: Trial, board: str = "lower") -> list[dict[str, object]]:
+    return [change.settings for change in changes_for(trial, board)]
+
+
+def test_the_first_that_works_is_found_in_few_attempts() -> None:
+    attempts: list[int] = []
+
+    def attempt(number: int) -> int | None:
+        attempts.append(number)
+        return number if number >= 700 else None
+
+    assert first_that(range(10_000), attempt) == 700
+    assert len(attempts) < 25
+    assert [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 7, 100)] == [None, None, 5, 5, 5]
+    assert [first_that(range(30), lambda k, least=least: k if k >= least else None) for least in range(30)] == [
+        *range(30)
+    ]
+
+
+def test_fewest_cycles_come_first_then_a_core_then_a_longer_cycle(judge: Judge) -> None:
+    # 8.5 of planning, 5.55 left in a cycle.
+    trial = judge("board.lower.within_cycles=1")
+    assert settings_for(trial) == [
+        {"within_cycles": 2},
+        # Core 0 has 4.2 of every 20 ms to do, more than 10 - 8.7.
+        {"coupling": "loose", "planner_slot": 4, "planner_core": 2},
+        # 5, 6 and 7 ticks are no grid with 8: waiting for it would take more than n R_max.
+        {"every": 8, "rate_hz": None},
+    ]
+
+
+def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
+    trial = judge("board.lower.within_cycles=1")
+    for change in changes_for(trial, "lower"):
+        assert not Trial.of(loads(change.after.config.text()), trial.budgets).failing
+
+
+def test_plans_that_must_not_grow_old_leave_fewer_changes(judge: Judge) -> None:
+    trial = judge("board.lower.within_cycles=1", "board.lower.budget.plan_within_ms=15")
+    assert settings_for(trial) == [{"coupling": "loose", "planner_slot": 4, "planner_core": 2}]
+
+
+def test_the_next_smaller_change_would_not_do(judge: Judge) -> None:
+    trial = judge("board.lower.budget.plan_ms=60")
+    assert settings_for(trial)[0] == {"within_cycles": 11}
+    assert judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=10").failing
+    assert not judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=11").failing
+
+
+def test_a_new_core_is_asked_for_where_no_used_one_has_room(judge: Judge) -> None:
+    trial = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
+    change = changes_for(trial, "lower")[1]
+    assert change.settings["planner_core"] == 2
+    assert "planner_core 2 (a core of its own" in change.text
+
+
+def test_a_core_of_unknown_load_is_left_alone(judge: Judge, budgeted: object) -> None:
+    config = load(str(budgeted), ["board.lower.within_cycles=1"])
+    known = {name: budget for name, budget in budgets(config).items() if name == "lower"}
+    assert settings_for(Trial.of(config, known))[1]["planner_core"] == 2
+
+
+def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
+    trial = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
+    loosened = changes_for(trial, "lower")[1]
+    assert loosened.after.layout.mailbox("lower.plan").protocol == "time-slice"
+    assert loosened.document()["protocols"] == {"lower.plan": "time-slice"}
+    assert "lower.plan by time-slice" in loosened.text
+
+
+def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
+    loose = ["coupling=loose", "planner_slot=4", "planner_core=0", "budget.plan_ms=31"]
+    # 8.4 of every 40 are the upper level's.
+    trial = judge(*(f"board.lower.{setting}" for setting in loose))
+    assert settings_for(trial) == [{"within_cycles": 5}, {"planner_core": 2}, {"every": 8, "rate_hz": None}]
+
+
+def test_an_executor_too_long_for_its_cycle_gets_a_longer_one_and_nothing_else(judge: Judge) -> None:
+    trial = judge("board.lower.budget.process_ms=9")
+    assert settings_for(trial) == [{"every": 8, "rate_hz": None}]
+    assert "every 4 -> 8 (cycle 10 -> 20 ms; R_s 30 -> 40 ms)" in changes_for(trial, "lower")[0].text
+
+
+def test_a_core_of_its_own_is_better_than_much_older_plans_beside_others(judge: Judge) -> None:
+    loose = ["coupling=loose", "planner_slot=4", "planner_core=1", "within_cycles=2", "budget.plan_ms=24"]
+    # 24.7 of planning need 5 cycles beside its executor, 5 beside the upper level, 3 alone.
+    trial = judge(*(f"board.lower.{setting}" for setting in loose), "board.upper.budget.process_ms=6")
+    assert settings_for(trial)[:2] == [{"within_cycles": 5}, {"within_cycles": 3, "planner_core": 2}]
+
+
+def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() -> None:
+    config = load("fig3")
+    changes = changes_for(Trial.of(config, budgets(config)), "level")
+    # The paper's own way out first, its figure 4; then its figure 2.
+    assert [change.settings for change in changes] == [
+        {"coupling": "loose", "planner_slot": 3, "planner_core": 0},
+        {"within_cycles": 2, "every": 4},
+    ]
+
+
+def test_more_cycles_would_do_for_figure_3_if_plans_could_be_old() -> None:
+    config = load("fig3", ["board.level.budget.plan_within_ms=24"])
+    assert changes_for(Trial.of(config, budgets(config)), "level")[0].settings == {"within_cycles": 4}
+
+
+def test_a_board_that_waits_for_others_gets_a_core_of_its_own(judge: Judge) -> None:
+    trial = judge("board.upper.core=1", "board.upper.budget.process_ms=13", "board.lower.budget.plan_ms=1")
+    assert {verdict.subject for verdict in trial.failing} >= {"upper"}
+    assert {"core": 0} in settings_for(trial, "upper")
+
+
+def test_a_planner_elsewhere_and_a_longer_cycle_together_are_a_last_resort(judge: Judge) -> None:
+    settings = ["budget.process_ms=9", "budget.plan_ms=29", "budget.plan_within_ms=30", "budget.exchange_ms=0"]
+    alone = ("timing.context_switch_ms=0", "board.upper.rate_hz=16.666666666666668")
+    # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of 15 beside it: just.
+    assert settings_for(judge(*(f"board.lower.{setting}" for setting in settings), *alone)) == [
+        {"within_cycles": 2, "coupling": "loose", "planner_slot": 4, "planner_core": 2, "every": 6, "rate_hz": None}
+    ]
+
+
+def test_boards_are_mended_one_after_another(judge: Judge) -> None:
+    trial = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=19")
+    mended = repair(trial)
+    assert [changes[0].board for changes in mended.steps] == ["lower", "upper"]
+    assert mended.left == ()
+    assert mended.end.failing == ()
+    # The second step rests on the first.
+    assert mended.end.config.board["lower"].within_cycles == 2
+    assert [line.split(":")[0] for line in mended.lines() if not line.startswith(" ")] == [
+        "what would do, any one of them, the smallest first",
+        "with the first of those, then",
+    ]
+
+
+def test_what_nothing_helps_against_is_said(judge: Judge) -> None:
+    hopeless = repair(judge("board.lower.budget.process_ms=200"))
+    assert hopeless.steps == ()
+    assert {verdict.equation for verdict in hopeless.left} >= {"3.1", "3.4"}
+    assert hopeless.lines()[-1].startswith("nothing helps against 3.1 of lower, ")
+    assert hopeless.document() == {"steps": [], "fits": False}
+
+
+def test_a_rack_that_fits_is_left_alone(judge: Judge) -> None:
+    trial = judge()
+    assert repair(trial).end is trial
+    assert repair(trial).lines() == []
+
+
+def test_a_crate_without_a_free_slot_has_no_board_for_a_planner(judge: Judge) -> None:
+    full = "executor = 'two_levels:Upper', below = 'lower', every = 8, core = 3"
+    others = [f"board.other{slot}={{ slot = {slot}, {full} }}" for slot in range(4, 22)]
+    trial = judge("board.lower.within_cycles=1", *others)
+    assert settings_for(trial) == [{"within_cycles": 2}, {"every": 8, "rate_hz": None}]
+
+
+@pytest.fixture(autouse=True)
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texts tell what this machine lacks: let every machine have two cores."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1})
+
+
+def test_a_core_that_the_machine_lacks_is_said_to_be_lacking(judge: Judge) -> None:
+    trial = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
+    assert "this machine has no core 2 and gives core 0" in changes_for(trial, "lower")[1].text

@@ -1,0 +1,1 @@
+"""Gantt charts of schedules and of runs, and the regions of figure 5, as text and as pictures."""
