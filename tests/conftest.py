@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
 
 import pytest
+
+from tests.machine import turn
 
 SMALL = f"""
 name = "small"
@@ -36,6 +38,20 @@ within_cycles = 4
 
 
 _NUMBERS = count()
+
+
+@pytest.fixture(autouse=True)
+def _turn(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Take turns with tests that need the machine to themselves."""
+    with turn(alone=request.node.get_closest_marker("alone") is not None):
+        yield
+
+
+@pytest.fixture(scope="module")
+def machine_alone() -> Iterator[None]:
+    """Have the machine for a module: for fixtures that its tests share."""
+    with turn(alone=True):
+        yield
 
 
 @pytest.fixture

@@ -10,20 +10,11 @@ from backplane.words import Block
 from boards.rack import Rack
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
+from tests.machine import needs_fifo
 
 SECONDS = 0.25
 TICKS = 100
 PRIORITIES = ("board.wave.priority=20", "board.watch.priority=19")
-
-
-def obtains_fifo() -> bool:
-    """Say whether this machine lets a process take a real-time priority."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    except PermissionError:
-        return False
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return True
 
 
 def digest(rack: Rack) -> str:
@@ -80,7 +71,7 @@ def test_a_rack_without_planners_runs(config: MakeConfig) -> None:
         assert rack.run(SECONDS).cause == "time over"
 
 
-@pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")
+@needs_fifo
 @pytest.mark.parametrize("protocol", ["time-slice", "lock"])
 def test_a_tight_planner_runs_below_its_executor(config: MakeConfig, protocol: str) -> None:
     settings = (*PRIORITIES, "board.wave.planner_priority=5", f"protocol.default={protocol}")

@@ -6,8 +6,6 @@ import os
 from collections import Counter
 from pathlib import Path
 
-import pytest
-
 from boards.config import load
 from tools.charting.measured import Run
 from tools.charting.panel import Panel
@@ -19,21 +17,6 @@ SECONDS = 1.6
 ATTEMPTS = 6
 DISTURBED = 0.1
 """Part of a run's time, lost to others on its cores, from which it tells nothing of the rack."""
-
-
-def obtains_fifo() -> bool:
-    """Say whether this machine lets a process take a real-time priority."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    except PermissionError:
-        return False
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return True
-
-
-needs_a_machine = pytest.mark.skipif(
-    not obtains_fifo() or len(os.sched_getaffinity(0)) < 2, reason="needs real-time priorities and two cores"
-)
 
 
 def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Run:

@@ -43,6 +43,7 @@ def verdicts(told: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
     return {(row["equation"], row["subject"]): row[side]["holds"] for row in told["equations"] if row[side] is not None}
 
 
+@pytest.mark.alone
 def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_path: Path) -> None:
     done = rack("analyze", run_of("fig4", rack_name, tmp_path / "run"), *USUAL, "--json")
     told = json.loads(done.stdout)
@@ -61,6 +62,7 @@ def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_pa
     assert json.loads((tmp_path / "run" / "analysis.json").read_text()) == told
 
 
+@pytest.mark.alone
 def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_path: Path) -> None:
     folder = run_of("fig4-overload", rack_name, tmp_path / "run")
     done = rack("analyze", folder, *USUAL, "--out", tmp_path / "analysis")

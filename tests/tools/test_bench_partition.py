@@ -9,6 +9,7 @@ import pytest
 from boards.config import load, loads
 from boards.errors import ConfigError
 from tests.boards.conftest import CLOCK, PLANNED
+from tests.machine import needs_fifo, needs_two_cores
 from tools.answer import Failure
 from tools.bench.partition import compare, lines_of
 from tools.bench.partitions import PARTITIONS, Partition
@@ -52,12 +53,12 @@ def test_a_board_that_polls_cannot_share_the_only_core() -> None:
 def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLANNED)
-    found = compare(str(path), 0.5, 2, Silent())
+    found = compare(str(path), 0.3, 1, Silent())
     assert [one.partition for one in found] == [partition.name for partition in PARTITIONS]
     for one in found:
         wave, watch = one.levels
         assert (wave.level, watch.level) == ("wave", "watch")
-        assert 0 < wave.executor.cycles <= 2 * 200
+        assert 0 < wave.executor.cycles <= 120
         assert wave.planner is not None
         assert wave.planner.slice_ms == 10.0
         assert wave.plan_age_ms is not None
@@ -70,8 +71,12 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
     assert sum("wave" in line for line in lines) == 2 * len(PARTITIONS)
 
 
+@needs_fifo
+@needs_two_cores
+@pytest.mark.alone
 def test_what_budgets_predict_stands_beside_what_was_measured() -> None:
-    found = {one.partition: one.levels[0] for one in compare("fig3", 0.6, 1, Silent())}
+    measured = compare("fig3", 0.6, 1, Silent())
+    found = {one.partition: one.levels[0] for one in measured}
     tight, loose = found["tight, 2 cores"].planner, found["loose, 2 cores"].planner
     assert tight is not None
     assert loose is not None
@@ -79,4 +84,4 @@ def test_what_budgets_predict_stands_beside_what_was_measured() -> None:
     # On its executor's core the planner needs more than three cycles: every plan is late. On its own hardly one is.
     assert tight.missed == tight.cycles > 5
     assert loose.missed < loose.cycles / 2
-    assert any("FAILS" in line for line in lines_of([*compare("fig3", 0.1, 1, Silent())]))
+    assert any("FAILS" in line for line in lines_of(measured))

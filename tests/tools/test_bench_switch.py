@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 
 from backplane.segment import SHM_FOLDER
+from tests.machine import needs_fifo, needs_two_cores
 from tools.answer import Failure
 from tools.bench.switch import PAPER_US, WAKES, cost_of, measure
 
@@ -30,7 +29,8 @@ def test_a_wake_up_outside_the_planners_time_is_no_switch_between_the_two() -> N
         cost_of(1, gaps[1:], awake[1:])
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="needs SCHED_FIFO")
+@needs_fifo
+@needs_two_cores
 def test_a_switch_is_measured_with_real_processes_and_nothing_is_left() -> None:
     before = {path.name for path in SHM_FOLDER.iterdir()}
     cost = measure()

@@ -12,19 +12,20 @@ import pytest
 from backplane.trace import Flag
 from boards.config import budgets, load, wire
 from levels.timing.tasks import Unit
-from tests.tools.figure_runs import needs_a_machine, run, share, undisturbed, whole
+from tests.machine import needs_fifo, needs_two_cores
+from tests.tools.figure_runs import run, share, undisturbed, whole
 from tools.charting.measured import Run
 from tools.charting.panel import Panel
 from tools.charting.scheduled import Schedule
 from tools.timing.verdicts import verdicts
 
-pytestmark = [needs_a_machine, pytest.mark.timeout(180)]
+pytestmark = [needs_fifo, needs_two_cores, pytest.mark.alone, pytest.mark.timeout(180)]
 FIGURES = ("fig2", "fig3", "fig4", "fig4-overload")
 MOSTLY = 0.7
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
+def runs(machine_alone: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     # An executor that is overloaded waits for itself: there is nothing to tell others by.
     launch = {"fig4-overload": run}
     return {name: launch.get(name, undisturbed)(name, tmp_path_factory.mktemp("runs")) for name in FIGURES}
@@ -107,7 +108,7 @@ def updates_met(found: Run) -> tuple[int, int]:
 STRADDLING = (
     "board.level.params.process_ms=2.0",
     "board.level.params.plan_ms=6.4",
-    "board.level.transfer.update_ms=2.0",
+    "board.level.transfer={ read_ms = 1.0, write_ms = 1.0, update_ms = 2.0 }",
     "board.level.within_cycles=3",
 )
 UPDATE_NS = 1_900_000

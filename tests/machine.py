@@ -1,0 +1,77 @@
+"""The machine that tests run on: what it permits, and whose turn it is.
+
+Tests run two at a time. One that judges what real-time processes do on their cores needs the machine to itself: it is
+marked `alone`, waits until every other test is done, and no other begins before it has ended.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+WAIT_S = 240.0
+"""Bound of a wait for one's turn: longer than any test."""
+_FOLDER = Path(tempfile.gettempdir())
+_is_taken = False
+
+
+def obtains_fifo() -> bool:
+    """Say whether this machine lets a process take a real-time priority."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")
+needs_two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+
+
+@contextmanager
+def turn(alone: bool) -> Iterator[None]:
+    """Have one's turn on the machine, alone or beside others; one within another is the outer one."""
+    global _is_taken
+    if _is_taken:
+        yield
+        return
+    # Who waits to be alone keeps the gate: nobody new comes in before it.
+    with _locked("gate", fcntl.LOCK_EX) as gate, _locked("machine", fcntl.LOCK_EX if alone else fcntl.LOCK_SH):
+        fcntl.flock(gate, fcntl.LOCK_UN)
+        _is_taken = True
+        try:
+            yield
+        finally:
+            _is_taken = False
+
+
+@contextmanager
+def _locked(name: str, how: int) -> Iterator[int]:
+    fd = os.open(_FOLDER / f"rack-tests-{os.getuid()}-{name}", os.O_CREAT | os.O_RDWR, 0o600)
+    try:
+        deadline = time.monotonic() + WAIT_S
+        while not _obtained(fd, how):
+            assert time.monotonic() < deadline, f"no turn on the machine within {WAIT_S:g} s"
+            # A lock with a bound: the kernel's own wait has none.
+            time.sleep(0.02)
+        yield fd
+    finally:
+        # Not by closing alone: a process that a test has forked holds it open.
+        fcntl.flock(fd, fcntl.LOCK_UN)
+        os.close(fd)
+
+
+def _obtained(fd: int, how: int) -> bool:
+    try:
+        fcntl.flock(fd, how | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
