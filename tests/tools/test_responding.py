@@ -173,11 +173,10 @@ def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(rack_
     assert [(twin.differs, twin.agrees) for twin in twins] == [(2256, True), (2712, True)]
 
 
-def test_a_bench_measures_as_many_as_asked_for_and_its_runs_repeat() -> None:
-    found = [Bench("nasrem", "lockstep", 3, Silent()).measure(2, twins=0) for _ in range(2)]
-    assert found[0].held
-    assert len(found[0].response.measured) >= 2
-    assert found[0].response.commands == found[1].response.commands
+def test_a_bench_measures_as_many_as_asked_for() -> None:
+    found = Bench("nasrem", "lockstep", 3, Silent()).measure(2, twins=0)
+    assert found.held
+    assert len(found.response.measured) >= 2
 
 
 def test_runs_that_are_equal_differ_nowhere(rack_name: str, tmp_path: Path) -> None:

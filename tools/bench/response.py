@@ -17,7 +17,7 @@ from tools.progress import Progress
 from tools.recording import Recording
 from tools.responding.course import courses
 from tools.responding.response import Response, response_of
-from tools.responding.schedule import RUN_S, draw
+from tools.responding.schedule import BREATH_S, RUN_S, draw
 from tools.responding.trial import run
 from tools.responding.twin import Twin, candidates, compare
 
@@ -99,11 +99,17 @@ class Bench:
     def _run(self, commands: Sequence[CommandConfig], folder: Path) -> tuple[Recording, Response | None]:
         self._runs += 1
         self._progress.begin(f"run {self._runs}: {len(commands)} commands")
-        recording = run(self._config, commands, folder, RUN_S)
+        recording = run(self._config, commands, folder, self._seconds(commands))
         response = response_of(recording)
         measured = len(response.measured) if response is not None else 0
         self._progress.end(LOCKSTEP_RUN_S, f"{measured} responses", [])
         return recording, response
+
+    def _seconds(self, commands: Sequence[CommandConfig]) -> float:
+        """Return the simulated time in which the last command is answered, and a little more."""
+        longest = max(course.longest for course in self._courses.values())
+        last = max((command.tick or 0 for command in commands), default=0)
+        return min(RUN_S, (last + longest) * self._config.clock_ns * 1e-9 + BREATH_S)
 
     def _twins(
         self, recording: Recording, response: Response, drawn: Sequence[CommandConfig], most: int, scratch: Path
