@@ -125,6 +125,7 @@ def test_up_to_a_late_cycle_a_run_is_as_ever(config: MakeConfig) -> None:
     assert realtime.until(TICKS) != lockstep.until(TICKS)
 
 
+@pytest.mark.alone
 def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
     late = "board.wave.params={ trouble = 'late', at = 40, ticks = 20 }"
     rack = Rack(config(*SLOW, *LOOSE, "board.wave.executor=wave_levels:Steady", late))

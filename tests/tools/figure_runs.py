@@ -6,6 +6,8 @@ import os
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 from boards.config import load
 from tools.charting.measured import Run
 from tools.charting.panel import Panel
@@ -14,9 +16,9 @@ from tools.recording import Recording
 from tools.running import run_rack
 
 SECONDS = 1.6
-ATTEMPTS = 6
-DISTURBED = 0.1
-"""Part of a run's time, lost to others on its cores, from which it tells nothing of the rack."""
+ATTEMPTS = 10
+QUIET, DISTURBED = 0.1, 0.25
+"""Parts of a run's time lost to others on its cores: below, it is a good one; above, it tells nothing of the rack."""
 
 
 def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Run:
@@ -28,12 +30,17 @@ def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Ru
 
 
 def undisturbed(name: str, folder: Path, *settings: str) -> Run:
-    """Return a run in which nobody outside the rack had its cores for long: the last attempt, if none is."""
+    """Return a run in which nobody outside the rack had its cores for long: of several attempts the best one."""
+    best, least = None, DISTURBED
     for attempt in range(ATTEMPTS):
         found = run(name, folder / str(attempt), *settings)
-        if lost(found) < DISTURBED:
+        if (part := lost(found)) < least:
+            best, least = found, part
+        if least < QUIET:
             break
-    return found
+    if best is None:
+        pytest.skip(f"the machine took {DISTURBED:.0%} and more of every run of {name} away")
+    return best
 
 
 def lost(found: Run) -> float:

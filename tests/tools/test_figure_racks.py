@@ -19,7 +19,7 @@ from tools.charting.panel import Panel
 from tools.charting.scheduled import Schedule
 from tools.timing.verdicts import verdicts
 
-pytestmark = [needs_fifo, needs_two_cores, pytest.mark.alone, pytest.mark.timeout(180)]
+pytestmark = [needs_fifo, needs_two_cores, pytest.mark.alone, pytest.mark.timeout(300)]
 FIGURES = ("fig2", "fig3", "fig4", "fig4-overload")
 MOSTLY = 0.7
 
