@@ -13,7 +13,7 @@ from backplane.trace import Flag
 from boards.config import budgets, load, wire
 from levels.timing.tasks import Unit
 from tests.machine import needs_fifo, needs_two_cores
-from tests.tools.figure_runs import run, share, undisturbed, whole
+from tests.tools.figure_runs import SLOWER, run, slowed, undisturbed, usual, whole
 from tools.charting.measured import Run
 from tools.charting.panel import Panel
 from tools.charting.scheduled import Schedule
@@ -22,13 +22,17 @@ from tools.timing.verdicts import verdicts
 pytestmark = [needs_fifo, needs_two_cores, pytest.mark.alone, pytest.mark.timeout(300)]
 FIGURES = ("fig2", "fig3", "fig4", "fig4-overload")
 MOSTLY = 0.7
+ENOUGH = 5
+"""Plan updates from which one can tell."""
 
 
 @pytest.fixture(scope="module")
 def runs(machine_alone: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     # An executor that is overloaded waits for itself: there is nothing to tell others by.
-    launch = {"fig4-overload": run}
-    return {name: launch.get(name, undisturbed)(name, tmp_path_factory.mktemp("runs")) for name in FIGURES}
+    folders = {name: tmp_path_factory.mktemp("runs") for name in FIGURES}
+    found = {name: undisturbed(name, folders[name]) for name in FIGURES[:3]}
+    overload = FIGURES[3]
+    return found | {overload: run(overload, folders[overload], *slowed(overload))}
 
 
 @pytest.fixture(scope="module")
@@ -43,21 +47,23 @@ def late(panel: Panel, task: str) -> float:
 
 
 def test_figure_2_repeats_its_pattern_and_plans_in_time(panels: dict[str, Panel]) -> None:
-    assert share(panels["fig2"].patterns["level"].plans, "R X W P | R X W P U -") > MOSTLY
+    assert usual(panels["fig2"].patterns["level"].plans) == "R X W P | R X W P U -"
     assert late(panels["fig2"], "level.planner") < 1 - MOSTLY
     assert late(panels["fig2"], "level") < 1 - MOSTLY
 
 
 def test_figure_3_misses_every_plan_and_no_cycle(panels: dict[str, Panel]) -> None:
-    assert late(panels["fig3"], "level.planner") == 1.0
+    plans = panels["fig3"].counts["level.planner"]
+    # The end of the run may cut the last one off.
+    assert plans.late >= plans.jobs - 1 > 5
     assert late(panels["fig3"], "level") < 1 - MOSTLY
 
 
 def test_figure_4_has_an_idle_executor_beside_a_planner_that_is_in_time(panels: dict[str, Panel]) -> None:
     panel = panels["fig4"]
     assert [(lane.core, lane.name) for lane in panel.lanes] == [(0, "level.planner"), (1, "level")]
-    assert share(panel.patterns["level"].cycles, "C R X W -") > MOSTLY
-    assert share(panel.patterns["level.planner"].plans, "P U -") > MOSTLY
+    assert usual(panel.patterns["level"].cycles) == "C R X W -"
+    assert usual(panel.patterns["level.planner"].plans) == "P U -"
     assert max(late(panel, "level"), late(panel, "level.planner")) < 1 - MOSTLY
 
 
@@ -86,7 +92,7 @@ def test_the_run_has_the_patterns_of_its_schedule(name: str, panels: dict[str, P
     for lane, scheduled in schedule.patterns.items():
         for expected, measured in zip(scheduled, panels[name].patterns[lane], strict=True):
             if expected:
-                assert measured.most_common(1)[0][0] == expected.most_common(1)[0][0]
+                assert usual(measured) == usual(expected)
 
 
 def updates_met(found: Run) -> tuple[int, int]:
@@ -106,18 +112,18 @@ def updates_met(found: Run) -> tuple[int, int]:
 
 # P ends 1 ms or less before the third cycle begins, however slow the machine is: U, of 2 ms, reaches into that.
 STRADDLING = (
-    "board.level.params.process_ms=2.0",
-    "board.level.params.plan_ms=6.4",
-    "board.level.transfer={ read_ms = 1.0, write_ms = 1.0, update_ms = 2.0 }",
+    f"board.level.params.process_ms={SLOWER * 2.0}",
+    f"board.level.params.plan_ms={SLOWER * 6.4}",
+    f"board.level.transfer={{ read_ms = {SLOWER}, write_ms = {SLOWER}, update_ms = {SLOWER * 2.0} }}",
     "board.level.within_cycles=3",
 )
-UPDATE_NS = 1_900_000
+UPDATE_NS = SLOWER * 1_900_000
 
 
 def test_the_update_of_a_plan_keeps_its_executor_waiting(tmp_path: Path) -> None:
     found = undisturbed("fig2", tmp_path, *STRADDLING)
     met, cut = updates_met(found)
-    assert met > MOSTLY * len(found.recording.cycles["level.planner"])
+    assert met > ENOUGH
     assert cut < (1 - MOSTLY) * met
     # In the chart too such an update is of one piece.
     updates = [span for span in found.chart(0, found.end_ns).spans if span.unit is Unit.UPDATE]
@@ -128,7 +134,7 @@ def test_an_update_that_is_no_critical_section_is_preempted(tmp_path: Path) -> N
     free = "protocol.mailbox={ 'level.plan' = 'time-slice' }"
     found = undisturbed("fig2", tmp_path, *STRADDLING, free)
     met, cut = updates_met(found)
-    assert met > MOSTLY * len(found.recording.cycles["level.planner"])
+    assert met > ENOUGH
     assert cut > MOSTLY * met
 
 
