@@ -84,7 +84,7 @@ def partition(
     """The same rack, partitioned otherwise: every planner tight or loose, on one core and on two.
 
     Runs them in real time, one after another, and prints what the paper argues about in words: misses, residuals,
-    plan ages; and what the timing model predicts of each from what its parts took.
+    plan ages; and beside them what the timing model predicts of each from the budgets of the config.
     """
     from tools.bench.partition import compare, lines_of
     from tools.progress import progress_for

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import ceil
 from multiprocessing.process import BaseProcess
+from multiprocessing.synchronize import Barrier
+from threading import BrokenBarrierError
 from time import monotonic_ns
 from typing import Any
 
@@ -72,11 +74,14 @@ def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
     """Let both processes run; return the planner's gaps and the executor's times awake, shape (n, 2), ns."""
     spawn = multiprocessing.get_context("spawn")
     gaps, awake, ready = (spawn.RawArray("q", size) for size in (2 * WAKES, 2 * WAKES, 2))
+    start = spawn.Barrier(3)
     with _semaphore() as wake, _semaphore() as work:
-        executor = spawn.Process(target=_execute, args=(os.getpid(), core, wake.name, awake, ready), daemon=True)
-        planner = spawn.Process(target=_plan, args=(os.getpid(), core, work.name, gaps, awake, ready), daemon=True)
+        executor = spawn.Process(target=_execute, args=(os.getpid(), core, wake.name, awake, ready, start), daemon=True)
+        planner = spawn.Process(
+            target=_plan, args=(os.getpid(), core, work.name, gaps, awake, ready, start), daemon=True
+        )
         with _alive(executor, planner), _pinned(other):
-            _await(ready, executor, planner)
+            _await(start, ready)
             for _ in range(WAKES):
                 work.release()
                 time.sleep(HEAD_START_S)
@@ -87,24 +92,26 @@ def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(gaps).reshape(-1, 2), np.array(awake).reshape(-1, 2)
 
 
-def _execute(parent: int, core: int, wake: str, awake: Any, ready: Any) -> None:
+def _execute(parent: int, core: int, wake: str, awake: Any, ready: Any, start: Barrier) -> None:
     """Wake up and wait again: an executor that has nothing to do."""
     die_with_parent(parent)
     pin(core)
     semaphore = posix_ipc.Semaphore(wake)
     ready[0] = 1 if set_priority(EXECUTOR) else -1
+    start.wait(READY_S)
     for at in range(WAKES):
         semaphore.acquire()
         awake[2 * at] = monotonic_ns()
         awake[2 * at + 1] = monotonic_ns()
 
 
-def _plan(parent: int, core: int, work: str, gaps: Any, awake: Any, ready: Any) -> None:
+def _plan(parent: int, core: int, work: str, gaps: Any, awake: Any, ready: Any, start: Barrier) -> None:
     """Compute when there is work, until the executor has come between; keep the longest gap."""
     die_with_parent(parent)
     pin(core)
     semaphore = posix_ipc.Semaphore(work)
     ready[1] = 1 if set_priority(PLANNER) else -1
+    start.wait(READY_S)
     for at in range(WAKES):
         semaphore.acquire()
         begin = last = monotonic_ns()
@@ -152,13 +159,12 @@ def _pinned(core: int) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _await(ready: Any, *processes: BaseProcess) -> None:
-    """Wait until both are at work: they import for a moment, and have nothing to post with before."""
-    deadline = time.monotonic() + READY_S
-    while not all(ready):
-        if time.monotonic() > deadline or not all(process.is_alive() for process in processes):
-            raise Failure("a process of the measurement did not start")
-        time.sleep(0.005)
+def _await(start: Barrier, ready: Any) -> None:
+    """Wait until both are at work: they import for a moment."""
+    try:
+        start.wait(READY_S)
+    except BrokenBarrierError:
+        raise Failure("a process of the measurement did not start") from None
     if min(ready) < 0:
         raise Failure("SCHED_FIFO is refused: an executor cannot come before its planner at once")
 
