@@ -26,6 +26,7 @@ class State(IntEnum):
     EXECUTING = 1
     DONE = 2
     ERROR = 3
+    HOLDING = 4  # has work and is kept from it; `reason` says by whom or what, and what ends it
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,9 @@ def status(name: str, version: int, *fields: Field) -> MessageType:
     """Return a status type: `fields` behind echo, state, error code and reason."""
     head = (
         Field("echo", "u4", "1", "serial of the command that this status answers"),
-        Field("state", "u1", "State", "idle, executing, done or error"),
+        Field("state", "u1", "State", "idle, executing, done, error or holding"),
         Field("error", "u2", "1", "error code of the level; 0: none"),
-        Field("reason", f"S{REASON_BYTES}", "ASCII", "the error, readable"),
+        Field("reason", f"S{REASON_BYTES}", "ASCII", "why it is in error or holding, readable; empty: neither"),
     )
     return MessageType(name, version, (*head, *fields))
 

@@ -90,6 +90,7 @@ class Block(IntEnum):
     LEVEL_STATE = 17  # state of the level, as in its status
     PLANS = 18  # plans made
     LOST = 19  # 1 + tick at which the task was found dead or hanging; 0: it is not. The clock clears it
+    LEVEL_SINCE = 20  # tick of the cycle in which the level came into that state
 
 
 class TaskState(IntEnum):

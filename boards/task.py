@@ -19,8 +19,9 @@ from boards.wiring import TaskWiring
 from levels.level import Executor, Planner
 
 # Plain integers for the hot path.
-_DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _CORRUPT, _BUS_ERRORS = (
-    int(Block[name]) for name in ("DONE", "CYCLES", "MISSED", "SKIPPED", "LEVEL_STATE", "CORRUPT", "BUS_ERRORS")
+_DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (
+    int(Block[name])
+    for name in ("DONE", "CYCLES", "MISSED", "SKIPPED", "LEVEL_STATE", "LEVEL_SINCE", "CORRUPT", "BUS_ERRORS")
 )
 _FAULTS = int(System.FAULTS)
 _MISS, _SKIP, _BUS_ERROR, _DAMAGED = (int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT))
@@ -92,7 +93,10 @@ class Task(ABC):
         record[1] = times[0] if lockstep else self.clock.time_of(tick)
         record[2], record[3], record[4], record[5], record[6] = times
         record[7] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT | self._trouble()
-        record[8] = block[_LEVEL_STATE] = self.status.state if self.status is not None else 0
+        state = self.status.state if self.status is not None else 0
+        if state != block[_LEVEL_STATE]:
+            block[_LEVEL_SINCE] = tick
+        record[8] = block[_LEVEL_STATE] = state
         used = process_time_ns()
         record[9], self.processor_ns = used - self.processor_ns, used
         self.trace.write()

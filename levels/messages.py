@@ -40,6 +40,10 @@ class Error(IntEnum):
     SIMULATION = 8
     BELOW = 9
     TOUCHED = 10
+    SENSORS = 11  # a sensor that did not come back within its bound
+    BLOCKED = 12  # something stays in the way: as often replanned as permitted
+    OVERLOAD = 13  # more than motors or gripper can carry
+    STALLED = 14  # nothing has moved for the time that the task permits
 
 
 class Verb(IntEnum):
