@@ -7,12 +7,14 @@ Evaluated on data of its own, with contacts and constraints off: a pure function
 from __future__ import annotations
 
 import copy
+import math
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from levels.algebra import each, gram, mat_vec, transposed_mat_vec
 from levels.cell import Cell
 
 Array = NDArray[np.float64]
@@ -74,7 +76,7 @@ class Dynamics:
 
     def friction(self, velocity: Array) -> Array:
         """Return dry friction, N m, that opposes motion at `velocity`, rad/s, (joints,)."""
-        return np.asarray(self._dry * np.tanh(velocity / FRICTION_SPEED))
+        return np.asarray(self._dry * each(math.tanh, velocity / FRICTION_SPEED))
 
     def pose(self, q: Array) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the tool at `q`. The arrays are valid until the next call."""
@@ -87,10 +89,10 @@ class Dynamics:
         """Add a point mass at the tool: m J^T J to the inertia, m J^T (Jdot qd - g) to the bias."""
         m, d, (inertia, bias) = self._model, self._data, self._terms
         tool, dof = self._cell.tool, self._cell.dof
-        centre = d.site_xpos[tool] + d.site_xmat[tool].reshape(3, 3) @ payload.offset
+        centre = d.site_xpos[tool] + mat_vec(d.site_xmat[tool].reshape(3, 3), payload.offset)
         mujoco.mj_jac(m, d, self._jacobian, None, centre, self._hand)
         mujoco.mj_jacDot(m, d, self._jacobian_dot, None, centre, self._hand)
-        jacobian = self._jacobian[:, dof]
-        acceleration = self._jacobian_dot[:, dof] @ qd - m.opt.gravity
-        inertia += payload.mass * jacobian.T @ jacobian
-        bias += payload.mass * jacobian.T @ acceleration
+        jacobian = np.take(self._jacobian, dof, axis=1)
+        acceleration = mat_vec(np.take(self._jacobian_dot, dof, axis=1), qd) - m.opt.gravity
+        inertia += payload.mass * gram(jacobian)
+        bias += payload.mass * transposed_mat_vec(jacobian, acceleration)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from backplane.message import Message
+from levels.algebra import each
 from levels.level import Executor, Input, LevelContext, Ports
 from levels.messages import SCENE, WORLD_MODEL
 from levels.params import read_params
@@ -84,4 +87,4 @@ class WorldModel(Executor):
 
 def turn(first: Array, second: Array) -> Array:
     """Return the angles (n,), rad, between orientations (n, 4); q and -q are the same orientation."""
-    return np.asarray(2.0 * np.arccos(np.clip(np.abs(np.sum(first * second, axis=1)), 0.0, 1.0)))
+    return np.asarray(2.0 * each(math.acos, np.clip(np.abs(np.sum(first * second, axis=1)), 0.0, 1.0)))

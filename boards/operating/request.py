@@ -17,6 +17,7 @@ from boards.config.schema import RackConfig
 from boards.config.schema_mistakes import mistakes_of
 from boards.errors import ConfigError
 from boards.operating.config import CommandConfig
+from levels.algebra import norm
 from levels.operator import Goal
 
 DOWN = (0.0, 0.0, -1.0)
@@ -55,7 +56,7 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
         message.position[:] = command.position
         message.direction[:] = command.direction or DOWN
     if command.quaternion is not None:
-        message.quaternion[:] = np.array(command.quaternion) / np.linalg.norm(command.quaternion)
+        message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
     return Request(index, bytes(message.raw), _tick(command, layout.clock_ns))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from levels.algebra import mat_vec
 from levels.dynamics import Dynamics
 
 Array = NDArray[np.float64]
@@ -40,4 +41,4 @@ class Brake:
         np.copyto(self.rest, q, where=np.abs(qd) > STANDSTILL)
         wanted = self._stiffness**2 * (self.rest - q) - 2.0 * self._stiffness * qd
         inertia, bias = self._dynamics.terms(q, qd)
-        return np.asarray(inertia @ np.clip(wanted, -self._braking, self._braking) + bias)
+        return np.asarray(mat_vec(inertia, np.clip(wanted, -self._braking, self._braking)) + bias)

@@ -6,6 +6,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
+from levels.algebra import mat_vec, solve
 from levels.cell import Bounds
 from levels.dynamics import Dynamics
 
@@ -62,7 +63,7 @@ class LimitGate:
         """Return what torques add to the velocities in one cycle, rad/s, as the state `q`, `qd` has it."""
         self._inertia, bias = self._dynamics.terms(q, qd)
         self._resisting = bias + self._dynamics.friction(qd)
-        return np.asarray(np.linalg.solve(self._inertia, torque - self._resisting) * self._period_s)
+        return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
 
     def _nearest(self, gain: Array, least: Array, most: Array) -> Array:
         """Return the torques whose gain in velocity, rad/s a cycle, is nearest to `gain` between `least` and `most`."""
@@ -74,7 +75,7 @@ class LimitGate:
         nearest, _, status, _ = daqp.solve(self._unity, -gain / scale, per_torque, upper, lower, self._kinds)
         if status < 0:
             nearest = np.clip(gain, least, most) / scale
-        return np.asarray(np.clip((per_torque @ nearest + offset) * self._torque, -self._torque, self._torque))
+        return np.asarray(np.clip((mat_vec(per_torque, nearest) + offset) * self._torque, -self._torque, self._torque))
 
     def _speed_towards(self, distance: Array, speed: Array) -> Array:
         """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from levels.algebra import norm
 from levels.scene import MotionConfig
 
 Array = NDArray[np.float64]
@@ -28,7 +29,7 @@ class ObstacleMotion:
             if time_s <= move.at:
                 break
             way = np.array(move.to) - place
-            length = float(np.linalg.norm(way))
+            length = norm(way)
             driven = move.speed * (min(time_s, end) - move.at)
             place = np.array(move.to) if driven >= length else place + way * (driven / length)
         return place

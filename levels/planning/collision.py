@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from levels.algebra import mat_vec
 from levels.cell import Cell
 from levels.gripper import set_opening
 from levels.scene import SceneConfig
@@ -123,7 +124,7 @@ class CollisionChecker:
         d, address = self._data, self.cell.object_qpos[row]
         tool = self.cell.tool
         mujoco.mju_mat2Quat(self._tool_quaternion, d.site_xmat[tool])
-        d.qpos[address : address + 3] = d.site_xpos[tool] + d.site_xmat[tool].reshape(3, 3) @ self._offset[0]
+        d.qpos[address : address + 3] = d.site_xpos[tool] + mat_vec(d.site_xmat[tool].reshape(3, 3), self._offset[0])
         mujoco.mju_mulQuat(d.qpos[address + 3 : address + 7], self._tool_quaternion, self._offset[1])
 
     def _filter_to_arm(self) -> NDArray[np.int32]:

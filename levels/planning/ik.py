@@ -1,15 +1,18 @@
-"""Inverse kinematics: configurations that put the tool at a pose (mink, a differential solver with restarts)."""
+"""Inverse kinematics: configurations that put the tool at a pose, by damped least squares with restarts.
+
+A step is a quadratic program whose bounds are the joints' limits; MuJoCo solves it. Mink, which does the same on numpy
+and a solver of choice, was left for its matrix products: their bits depend on the processor.
+"""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterable
-from typing import Any
 
-import mink
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from levels.algebra import gram, norm, transposed_mat_vec
 from levels.cell import Cell
 from levels.planning.pose import Pose, pose
 from levels.planning.reach import sampling_range
@@ -34,6 +37,10 @@ LIMIT_MARGIN_RAD = 1e-2
 """Solutions stay this far inside the position limits: the limit gate of the servo level brakes there."""
 MEET_RAD = 0.5
 """A warm start that ends farther away than this in a joint has left its branch."""
+DAMPING = 1e-6
+"""Of a step, in the square of a tool's error a radian, and as much again for an error of 1 m or 1 rad."""
+LIMIT_PART = 0.95
+"""Part of the way to a position limit that one step may take."""
 
 
 class InverseKinematics:
@@ -43,41 +50,36 @@ class InverseKinematics:
         self._cell = cell
         self._seed = seed
         self._pace = 1.0 / cell.limits.velocity
-        model = copy.copy(cell.model)
-        self._bound_joints(model)
-        self._configuration = mink.Configuration(model)
-        self._tool = model.site(cell.tool).name
-        self._task = mink.FrameTask(self._tool, "site", position_cost=1.0, orientation_cost=1.0, lm_damping=1e-6)
-        self._limits = [mink.ConfigurationLimit(model)]
-        others = np.setdiff1d(np.arange(model.nv), cell.dof).tolist()
-        self._frozen = [mink.DofFreezingTask(model, others)] if others else None
+        limits = cell.limits.position
+        self._inner_low, self._inner_high = limits[:, 0] + LIMIT_MARGIN_RAD, limits[:, 1] - LIMIT_MARGIN_RAD
+        self._data = mujoco.MjData(cell.model)
+        joints = len(cell.qpos)
+        self._jacobian = np.zeros((6, cell.model.nv))
+        self._factor = np.zeros((joints, joints + 7))  # room for the solver
         self._low, self._high = sampling_range(cell)
 
     def tool_at(self, q: Array) -> Pose:
         """Return the tool's pose at `q` (joints,), rad."""
         self._move_to(q)
-        placed = self._configuration.get_transform_frame_to_world(self._tool, "site")
-        return pose(placed.translation(), placed.rotation().wxyz)
+        tool, quaternion = self._cell.tool, np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, self._data.site_xmat[tool])
+        return pose(self._data.site_xpos[tool], quaternion)
 
     def reach(self, target: Pose, start: Array) -> Array | None:
         """Return the configuration (joints,) at `target` that one descent from `start` finds, or None."""
-        self._task.set_target(mink.SE3(np.concatenate([target.quaternion, target.position])))
-        self._move_to(np.clip(start, self._inner_low, self._inner_high))
+        q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
         for _ in range(ITERATIONS):
-            error = self._task.compute_error(self._configuration)
+            error = self._error(target, q)
             if max(abs(error[:3])) < POSITION_TOLERANCE_M and max(abs(error[3:])) < ANGLE_TOLERANCE_RAD:
-                return np.array(self._configuration.q[self._cell.qpos])
-            errors.append(float(np.linalg.norm(error)))
+                return q
+            errors.append(norm(error))
             if len(errors) > STALLED_ITERATIONS and errors[-1] > STALLED_PART * errors[-1 - STALLED_ITERATIONS]:
                 return None
-            try:
-                velocity = mink.solve_ik(
-                    self._configuration, [self._task], 1.0, "daqp", 1e-6, limits=self._limits, constraints=self._frozen
-                )
-            except mink.NoSolutionFound:
+            step = self._step(error, q)
+            if step is None:
                 return None
-            self._configuration.integrate_inplace(velocity, 1.0)
+            q = q + step
         return None
 
     def nearby(self, target: Pose, start: Array) -> Array | None:
@@ -116,17 +118,28 @@ class InverseKinematics:
         for _ in range(RESTARTS):
             yield rng.uniform(self._low, self._high)
 
-    def _move_to(self, q: Array) -> None:
-        whole = self._configuration.q
-        whole[self._cell.qpos] = q
-        self._configuration.update(whole)
+    def _error(self, target: Pose, q: Array) -> Array:
+        """Return (6,): how far `target` is from the tool at `q`, m, and the turn that is left, rad; world frame."""
+        tool = self.tool_at(q)
+        turn, error = np.zeros(3), np.zeros(6)
+        error[:3] = target.position - tool.position
+        mujoco.mju_subQuat(turn, target.quaternion, tool.quaternion)
+        mujoco.mju_rotVecQuat(error[3:], turn, tool.quaternion)
+        return error
 
-    def _bound_joints(self, model: Any) -> None:
-        """Give `model` the arm's position limits, a margin inside."""
-        limits = self._cell.limits.position
-        self._inner_low, self._inner_high = limits[:, 0] + LIMIT_MARGIN_RAD, limits[:, 1] - LIMIT_MARGIN_RAD
-        joints = self._cell.model.dof_jntid[self._cell.dof]
-        limited = np.isfinite(limits).all(axis=1)
-        model.jnt_limited[joints] = limited
-        model.jnt_range[joints[limited], 0] = self._inner_low[limited]
-        model.jnt_range[joints[limited], 1] = self._inner_high[limited]
+    def _step(self, error: Array, q: Array) -> Array | None:
+        """Return the step (joints,), rad, that best takes away `error`, which is that at `q`; None: there is none."""
+        m, d = self._cell.model, self._data
+        mujoco.mj_comPos(m, d)
+        mujoco.mj_jacSite(m, d, self._jacobian[:3], self._jacobian[3:], self._cell.tool)
+        jacobian = np.take(self._jacobian, self._cell.dof, axis=1)
+        hessian, step = gram(jacobian), np.zeros(len(q))
+        hessian.flat[:: len(q) + 1] += DAMPING * (1.0 + norm(error) ** 2)
+        gradient = transposed_mat_vec(jacobian, -error)
+        low, high = LIMIT_PART * (self._inner_low - q), LIMIT_PART * (self._inner_high - q)
+        rank = mujoco.mju_boxQP(step, self._factor, None, hessian, gradient, low, high)
+        return step if rank >= 0 else None
+
+    def _move_to(self, q: Array) -> None:
+        self._data.qpos[self._cell.qpos] = q
+        mujoco.mj_kinematics(self._cell.model, self._data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from levels.algebra import mat_vec, norm
 from levels.planning.ik import InverseKinematics
 from levels.planning.path import Path
 from levels.planning.pose import Pose
@@ -60,9 +61,9 @@ def _stray(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> floa
     if blended.length == 0.0:
         return 0.0
     way = target.position - begin.position
-    length = float(np.linalg.norm(way))
+    length = norm(way)
     samples = blended.sample(blended.length / (STRAY_SAMPLES * (len(path.waypoints) - 1)))
     off = np.array([ik.tool_at(q).position - begin.position for q in samples])
     if length > 0.0:
-        off -= np.outer(off @ way / length**2, way)
+        off -= np.outer(mat_vec(off, way) / length**2, way)
     return float(np.max(np.linalg.norm(off, axis=1)))

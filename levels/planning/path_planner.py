@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from levels.algebra import norm
 from levels.cell import Cell
 from levels.messages import WAYPOINTS
 from levels.planning.path import Path
@@ -41,7 +42,7 @@ class PathPlanner:
         self._seed = seed
         levers = np.maximum(lever_arms(cell, seed), LEAST_LEVER_M)
         # sum |lever_j dq_j| <= |lever| |dq|: a step of this length, in rad, moves no point by more than intended.
-        self.step_rad = STEP_PART * clearance / float(np.linalg.norm(levers))
+        self.step_rad = STEP_PART * clearance / norm(levers)
         low, high = cell.limits.position.T
         resolution = STEP_PART * clearance / float(np.sqrt(len(levers)))
         self._search = SampledSearch(low, high, levers, resolution)
@@ -93,14 +94,14 @@ class PathPlanner:
         return paths
 
     def _line_is_free(self, one: Array, other: Array, free: Free) -> bool:
-        count = int(np.ceil(np.linalg.norm(other - one) / self.step_rad)) + 1
+        count = int(np.ceil(norm(other - one) / self.step_rad)) + 1
         return all(free(q) for q in np.linspace(one, other, max(count, 2)))
 
     def _free_blend(self, waypoints: Array, corner: int, largest: float, free: Free) -> float:
         before, at, behind = waypoints[corner - 1 : corner + 2]
         for part in BLENDS:
             b = part * largest
-            ends = [at + b * (end - at) / max(float(np.linalg.norm(end - at)), b) for end in (before, behind)]
+            ends = [at + b * (end - at) / max(norm(end - at), b) for end in (before, behind)]
             if self.is_free(Path(np.array([ends[0], at, ends[1]]), np.array([0.0, b, 0.0])), free):
                 return b
         return 0.0

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from levels.algebra import norm
 
 Array = NDArray[np.float64]
 
@@ -44,7 +47,7 @@ class Pose(NamedTuple):
 
     def angle_to(self, other: Pose) -> float:
         """Return the angle between the two orientations, in rad."""
-        return float(np.linalg.norm(self._turn_to(other)))
+        return norm(self._turn_to(other))
 
     def towards(self, other: Pose, part: float) -> Pose:
         """Return the pose at `part`, 0 to 1, of the straight way with one constant turn to `other`."""
@@ -67,25 +70,25 @@ def pose(position: ArrayLike, quaternion: ArrayLike) -> Pose:
 
 def turned_about_z(yaw: float) -> Array:
     """Return the quaternion of a turn by `yaw`, in rad, about z."""
-    return np.array([np.cos(yaw / 2.0), 0.0, 0.0, np.sin(yaw / 2.0)])
+    return np.array([math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)])
 
 
 def yaw_of(quaternion: Array) -> float:
     """Return the turn about the world's z axis, in rad, that `quaternion` gives to its x axis."""
     turned = np.zeros(3)
     mujoco.mju_rotVecQuat(turned, np.array([1.0, 0.0, 0.0]), quaternion)
-    return float(np.arctan2(turned[1], turned[0]))
+    return math.atan2(turned[1], turned[0])
 
 
 def pointing(direction: ArrayLike, yaw: float = 0.0) -> Array:
     """Return the quaternion that turns z to `direction` (3,), turned by `yaw`, in rad, about it."""
     target = np.array(direction, dtype=float)
-    target /= np.linalg.norm(target)
+    target /= norm(target)
     axis = np.cross([0.0, 0.0, 1.0], target)
-    sine, cosine = float(np.linalg.norm(axis)), float(target[2])
+    sine, cosine = norm(axis), float(target[2])
     # Straight down, any horizontal axis will do: x keeps the tool's y across the yaw.
     axis = np.array([1.0, 0.0, 0.0]) if sine < PARALLEL else axis / sine
     turn, result = np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, axis, float(np.arctan2(sine, cosine)))
+    mujoco.mju_axisAngle2Quat(turn, axis, math.atan2(sine, cosine))
     mujoco.mju_mulQuat(result, turn, turned_about_z(yaw))
     return result

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from levels.algebra import norm
+
 Array = NDArray[np.float64]
 
 COINCIDENT_RAD = 1e-7
@@ -123,7 +125,7 @@ class BlendedPath:
             self._add_piece((line, -1), self._starts[corner] - b)
             if b > 0.0:
                 self._add_piece((line, corner), self._starts[corner] + b)
-            elif corner < last and float(np.linalg.norm(self._changes[corner])) > STRAIGHT:
+            elif corner < last and norm(self._changes[corner]) > STRAIGHT:
                 self.stops.append(self._starts[corner])
         if not self._pieces:
             self._pieces, self._breaks = [(-1, -1)], [0.0, self.length]
@@ -166,7 +168,7 @@ def _distinct(points: Array, radii: Array) -> tuple[Array, Array]:
     kept = [0]
     merged = radii.copy()
     for k in range(1, len(points)):
-        if float(np.linalg.norm(points[k] - points[kept[-1]])) > COINCIDENT_RAD:
+        if norm(points[k] - points[kept[-1]]) > COINCIDENT_RAD:
             kept.append(k)
         else:
             merged[kept[-1]] = min(merged[kept[-1]], radii[k])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from backplane.alarms import Alarm
+from levels.algebra import each, mat_vec
 from levels.cell import Cell
 from levels.dynamics import FRICTION_SPEED, Terms
 from levels.level import Finding
@@ -81,13 +84,13 @@ class ActuatorMonitor:
         left = self._bias + terms.bias
         left *= -0.5
         left += self._torque
-        left -= self._twice_inertia @ gain
+        left -= mat_vec(self._twice_inertia, gain)
         friction = self._friction
         np.minimum(velocity, self._velocity, out=friction[0])
         np.maximum(velocity, self._velocity, out=friction[1])
         friction /= FRICTION_SPEED
         friction += TURNING
-        np.tanh(friction, out=friction)
+        friction[:] = each(math.tanh, friction)
         friction *= self._dry
         return np.asarray(left - np.minimum(np.maximum(left, friction[0]), friction[1]))
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backplane.message import Message
+from levels.algebra import mat_vec
 from levels.cell import Cell
 from levels.dynamics import Dynamics, Payload, Terms
 from levels.servo.curves import Motion
@@ -41,7 +42,7 @@ class ComputedTorque:
             + self._damping * (wanted.velocity - velocity)
             + self._stiffness * (wanted.position - position)
         )
-        torque = inertia @ acceleration + terms.bias + self._dynamics.friction(wanted.velocity)
+        torque = mat_vec(inertia, acceleration) + terms.bias + self._dynamics.friction(wanted.velocity)
         possible = np.minimum(np.maximum(torque, -self._limits), self._limits)
         self.cut += bool(np.count_nonzero(possible != torque))
         return np.asarray(possible)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backplane.message import Message
+from levels.algebra import mat_vec, transposed_mat_vec
 from levels.cell import build_cell
 from levels.dynamics import Dynamics, Payload
 from levels.level import Input, LevelContext, Planner, Ports
@@ -57,7 +58,7 @@ class ServoPlanner(Planner):
     def _payload(self, scene: Message, held: int) -> Payload:
         """Return mass and centre, in the frame of the tool, of an object as the scene shows it."""
         mujoco.mju_quat2Mat(self._rotation, scene.quaternion[held])
-        centre = scene.position[held] + self._rotation.reshape(3, 3) @ self._centres[held]
+        centre = scene.position[held] + mat_vec(self._rotation.reshape(3, 3), self._centres[held])
         mujoco.mju_quat2Mat(self._rotation, scene.tool_quaternion)
-        offset = self._rotation.reshape(3, 3).T @ (centre - scene.tool_position)
+        offset = transposed_mat_vec(self._rotation.reshape(3, 3), centre - scene.tool_position)
         return Payload(float(self._masses[held]), offset)
