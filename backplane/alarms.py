@@ -67,6 +67,9 @@ class Alarm(IntEnum):
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond the limits was cut
     BRAKES_CLOSED = 47  # [-1; ticks without torque, 0: demanded]
     BRAKES_OPENED = 48  # [-1; ticks they were closed]
+    RE_REFERENCED = 49  # [joint; rad]  sensors are trusted again; how far the joint is from where it was thought to be
+    COLLISION = 50  # [geom; the other geom]  the arm, or what it holds, touches what no task means
+    LATCHED = 51  # [joint, -1: no single one; value]  a fault has lasted too long: the brakes stay engaged
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)

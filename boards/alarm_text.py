@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from backplane.words import Demand
 from boards.events import Event, EventKind
 from boards.faults.text import board_of, joint_name, subject_of, what
 
-About = Literal["task", "mailbox", "joint", "nothing"]
+About = Literal["task", "mailbox", "joint", "geom", "nothing"]
 EMERGENCY_STOP = "emergency stop"
 
 KIND_OF: Mapping[Alarm, EventKind] = {
@@ -26,6 +26,8 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.DEMAND: "reaction",
     Alarm.BRAKES_CLOSED: "reaction",
     Alarm.BRAKES_OPENED: "recovery",
+    Alarm.RE_REFERENCED: "recovery",
+    Alarm.LATCHED: "reaction",
     **dict.fromkeys(MISSES, "miss"),
 }
 """What an alarm is; any other is a detection."""
@@ -55,13 +57,23 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.COMMAND_INVALID: ("joint", "torque of {subject} is no number: not let through"),
     Alarm.COMMAND_LIMIT: ("joint", "torque of {subject}, {value:.3g} N m, is beyond its limit: cut"),
     Alarm.BRAKES_OPENED: ("nothing", "brakes opened after {span}"),
+    Alarm.RE_REFERENCED: ("joint", "sensor of {subject} trusted again, {value:.3g} rad from where it was estimated"),
+    Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
+    Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
 }
 
 
-def event_of(row: np.void, owner: str, layout: Layout, faults: FaultTable, joints: Sequence[str]) -> Event:
+def event_of(
+    row: np.void,
+    owner: str,
+    layout: Layout,
+    faults: FaultTable,
+    joints: Sequence[str],
+    geom: Callable[[int], str] = str,
+) -> Event:
     """Return the event that an alarm makes: a row of `backplane.alarms.RECORD` from the ring of the task `owner`.
 
-    An event's board is who found it; of a fault it is who has it, of a return it is who is back. Of an operator's
+    `geom` names a geom of the cell. An event's board is who found it; of a fault it is who has it, of a return it is who is back. Of an operator's
     command the event is `boards.operating.text.command_event`'s.
     """
     alarm, number, value = Alarm(row["code"]), int(row["subject"]), float(row["value"])
@@ -77,13 +89,15 @@ def event_of(row: np.void, owner: str, layout: Layout, faults: FaultTable, joint
     elif alarm == Alarm.BRAKES_CLOSED:
         subject, text = "", _closed(value, layout)
     else:
-        subject, text = _told(alarm, row, layout, joints)
+        subject, text = _told(alarm, row, layout, joints, geom)
         board = subject if alarm == Alarm.REJOINED else owner
     realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
     return Event(realtime_ns, int(row["tick"]), kind, board, text, code, fault, subject, value, int(row["since"]))
 
 
-def _told(alarm: Alarm, row: np.void, layout: Layout, joints: Sequence[str]) -> tuple[str, str]:
+def _told(
+    alarm: Alarm, row: np.void, layout: Layout, joints: Sequence[str], geom: Callable[[int], str]
+) -> tuple[str, str]:
     about, text = TEXTS[alarm]
     number, value = int(row["subject"]), float(row["value"])
     subject = writer = ""
@@ -91,6 +105,8 @@ def _told(alarm: Alarm, row: np.void, layout: Layout, joints: Sequence[str]) -> 
         subject = _task(number, layout, CLOCK)
     elif about == "joint":
         subject = joint_name(number, joints)
+    elif about == "geom":
+        subject, writer = geom(number), geom(int(value))
     elif about == "mailbox":
         subject, writer = layout.mailboxes[number].name, layout.mailboxes[number].writer
     span, since = _span(value, layout), int(row["since"])

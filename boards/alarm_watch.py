@@ -12,6 +12,7 @@ from backplane.fault_table import FaultTable
 from backplane.operator_table import OperatorTable
 from backplane.segment import Segment
 from boards.alarm_text import event_of
+from boards.config.cell import geom_name
 from boards.config.schema import RackConfig
 from boards.events import Event
 from boards.operating.text import command_event
@@ -30,6 +31,7 @@ class AlarmWatch:
 
     def __init__(self, segment: Segment, config: RackConfig) -> None:
         self._layout, self._faults, self._operator = segment.layout, FaultTable(segment), OperatorTable(segment)
+        self._config = config
         self._joints = config.robot.joints if config.robot is not None else ()
         self._rings = {name: alarm_ring(segment, name) for name in (CLOCK, *(t.name for t in segment.layout.tasks))}
         self.lost = 0
@@ -48,4 +50,9 @@ class AlarmWatch:
     def _event(self, row: np.void, owner: str) -> Event:
         if row["code"] == Alarm.COMMANDED:
             return command_event(row, self._operator.entries[int(row["subject"])], self._layout)
-        return event_of(row, owner, self._layout, self._faults, self._joints)
+        return event_of(row, owner, self._layout, self._faults, self._joints, self._geom)
+
+    def _geom(self, geom: int) -> str:
+        """Return the name of a geom of the cell, which is built for the first collision."""
+        config = self._config
+        return geom_name(config.robot, config.scene, config.clock_ns, geom) if config.robot is not None else str(geom)

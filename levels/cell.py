@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from levels import cell_index
 from levels.errors import RobotError
 from levels.gripper import set_opening
-from levels.limits import Bounds, Limits, joint_bounds, planned_limits
+from levels.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
 from levels.mjcf import compile_spec, load_spec
 from levels.motors import fit_gripper, fit_motors, listed
 from levels.robot import RobotConfig
@@ -42,7 +42,7 @@ class Cell:
     - `bodies`: ids in the order of `scene.bodies`; `object_qpos`: first of 7 addresses an object; `mocap`: mocap id an
       obstacle; `supports`: geom ids.
     - `touch`: (ngeom, ngeom), True where a contact is one that no task means.
-    - `bounds`: what the arm never exceeds; `limits`: what motion is planned within.
+    - `encoders`: what its sensors resolve. `bounds`: what the arm never exceeds; `limits`: what motion is planned within.
     """
 
     model: mujoco.MjModel
@@ -65,6 +65,7 @@ class Cell:
     touch: NDArray[np.bool_]
     bounds: Bounds
     limits: Limits
+    encoders: Encoders
 
     def start(self) -> mujoco.MjData:
         """Return data of the start: the arm at home, the gripper open, objects where the model puts them."""
@@ -106,6 +107,9 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
         values = getattr(robot, name)
         if values is not None and len(values) != wanted:
             raise RobotError(f"robot.{name}: {len(values)} values; one a joint is {wanted}")
+    for name, given in robot.sensors:
+        if isinstance(given, tuple) and len(given) != wanted:
+            raise RobotError(f"robot.sensors.{name}: {len(given)} values; one for all joints, or one a joint: {wanted}")
     for name in robot.joints:
         joint = spec.joint(name)
         if joint is None:
@@ -174,6 +178,7 @@ def index(
         touch=touch_matrix(model, arm_geoms, gripper_geoms, object_geoms, supports),
         bounds=bounds,
         limits=planned_limits(bounds, robot),
+        encoders=Encoders.of(robot),
     )
 
 

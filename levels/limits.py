@@ -47,6 +47,46 @@ class Limits:
     torque: NDArray[np.float64]
 
 
+EDGE_TIMING_S = 0.1
+"""A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
+the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and without the lag of a filter behind one."""
+SIGMAS = 6.0
+"""Standard deviations of noise that a monitor allows for: less than one sample in a billion is farther off."""
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """What the joints' sensors resolve, (joints,) each: `resolution` and `noise` of positions, rad.
+
+    Of velocities, rad/s, they are these over `EDGE_TIMING_S`. `off` and `speed_off`: how far from the truth a good
+    sample may be, rad and rad/s.
+    """
+
+    resolution: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, robot: RobotConfig) -> Encoders:
+        """Return those of a `[robot]` table."""
+        joints, sensors = len(robot.joints), robot.sensors
+        return cls(np.broadcast_to(sensors.resolution, joints), np.broadcast_to(sensors.noise, joints))
+
+    @property
+    def exact(self) -> bool:
+        """Whether samples are the truth."""
+        return not (self.resolution.any() or self.noise.any())
+
+    @property
+    def off(self) -> NDArray[np.float64]:
+        """Largest error of a good position, (joints,), rad."""
+        return np.asarray(0.5 * self.resolution + SIGMAS * self.noise)
+
+    @property
+    def speed_off(self) -> NDArray[np.float64]:
+        """Largest error of a good velocity, (joints,), rad/s."""
+        return self.off / EDGE_TIMING_S
+
+
 def joint_bounds(
     model: mujoco.MjModel, joints: NDArray[np.int_], robot: RobotConfig, torque: NDArray[np.float64]
 ) -> Bounds:

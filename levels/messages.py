@@ -44,6 +44,7 @@ class Error(IntEnum):
     BLOCKED = 12  # something stays in the way: as often replanned as permitted
     OVERLOAD = 13  # more than motors or gripper can carry
     STALLED = 14  # nothing has moved for the time that the task permits
+    MOTORS = 15  # a motor that did not give its torque however often it was tried
 
 
 class Verb(IntEnum):
@@ -235,7 +236,7 @@ SERVO_PLAN = MessageType(
 
 SERVO_STATUS = status(
     "servo_status",
-    3,
+    4,
     *ANSWER,
     Field("position", "f8", "rad", "joint positions, measured; while sensors lie, as far as known", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
@@ -251,23 +252,29 @@ SERVO_STATUS = status(
     Field("demand", "u1", "Demand", "what the safety of the rack asks of the arm in this cycle"),
     Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),
     Field("touches", "u4", "1", "contacts that no task means, counted at every substep"),
-    Field("violations", "u4", "1", "substeps in which a position, velocity or torque was beyond its limit"),
+    Field("violations", "u4", "1", "substeps in which the arm drove a position, velocity or torque beyond its limit"),
+    Field("pushed", "u4", "1", "substeps in which what struck the arm pushed a joint beyond a limit"),
 )
 
 ARM_STATE = MessageType(
     "arm_state",
-    2,
+    3,
     (
         Field("tick", "i8", "tick", "tick that the state belongs to"),
         Field("clipped", "u4", "1", "cycles in which the limit gate cut a command"),
         Field("touches", "u4", "1", "contacts that no task means"),
-        Field("violations", "u4", "1", "substeps in which a limit was broken"),
+        Field("violations", "u4", "1", "substeps in which the arm broke a limit"),
+        Field("pushed", "u4", "1", "substeps in which what struck the arm pushed a joint beyond a limit"),
+        Field("struck", "i4", "tick", "ticks for which the arm still moves on from what struck it"),
         Field("waited", "i4", "tick", "ticks since the last command"),
         Field("braked", "u1", "1", "1: the brakes are closed"),
         Field("rest", "f8", "rad", "where closed brakes hold the joints", ("joints",)),
         Field("position", "f8", "rad", "joint positions as the servo level trusts them", ("joints",)),
         Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
         Field("doubt", "f8", "rad", "how far from the truth those positions may be", ("joints",)),
+        Field("kept", "i8", "tick", "ticks for which faults have kept the arm from its set points, see ServoParams"),
+        Field("error", "u2", "Error", "fault that is latched; 0: none is"),
+        Field("reason", "S120", "ASCII", "that fault, readable"),
         Field("state", "f8", "", "mjSTATE_INTEGRATION of the simulated cell", ("state",)),
     ),
 )

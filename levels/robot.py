@@ -17,6 +17,23 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class SensorConfig(Table):
+    """What the joints' encoders resolve: one value for all joints, or a list with one a joint; 0: exact.
+
+    Drives time the encoder's edges for velocities: these have a tenth of a second's worth of both, see `Encoders`.
+    """
+
+    resolution: NotNegative | tuple[NotNegative, ...] = Field(
+        0.0, description="step of a joint position as sensed, rad"
+    )
+    noise: NotNegative | tuple[NotNegative, ...] = Field(
+        0.0, description="standard deviation of a joint position as sensed, rad"
+    )
+
+
 class GripperConfig(Table):
     """A gripper driven by one actuator along one joint."""
 
@@ -46,6 +63,7 @@ class RobotConfig(Table):
         None, description="position limits, rad; without it the model's joint ranges hold"
     )
     gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
+    sensors: SensorConfig = Field(SensorConfig(), description="resolution and noise of the joints' encoders")
     substeps: int = Field(5, ge=1, le=50, description="MuJoCo steps in one servo cycle")
     min_armature: Finite = Field(
         0.05, ge=0, description="drive inertia that every joint has at least, kg m2: light wrists need it"

@@ -27,3 +27,17 @@ def _sizes(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[tuple
     from levels.cell import build_cell, sizes  # MuJoCo takes half a second to import: only who has an arm pays
 
     return tuple(sizes(build_cell(robot, scene, clock_ns)).items())
+
+
+def geom_name(robot: RobotConfig, scene: SceneConfig, clock_ns: int, geom: int) -> str:
+    """Return the name of a geom of the cell."""
+    return _geom_names(robot, scene, clock_ns)[geom]
+
+
+@lru_cache(maxsize=4)
+def _geom_names(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[str, ...]:
+    from levels import touches
+    from levels.cell import build_cell  # likewise
+
+    model = build_cell(robot, scene, clock_ns).model
+    return tuple(touches.geom_name(model, geom) for geom in range(model.ngeom))

@@ -143,6 +143,10 @@ def _robot(config: RackConfig) -> Iterator[Mistake]:
         if values is not None and len(values) != len(robot.joints):
             why = f"{len(values)} values; one a joint makes {len(robot.joints)}"
             yield Mistake(f"robot.{key}", list(values), why)
+    for key, values in robot.sensors:
+        if isinstance(values, tuple) and len(values) != len(robot.joints):
+            why = f"{len(values)} values; permitted: one for all joints, or one a joint: {len(robot.joints)}"
+            yield Mistake(f"robot.sensors.{key}", list(values), why)
     yield from _repeated("robot.joints", robot.joints)
 
 

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class Sensed(NamedTuple):
-    """What the arm's sensors say: joints (joints,), rad and rad/s; gripper, m and m/s, 0 without one.
+    """What the arm's sensors say, as coarse as they are: joints (joints,), rad and rad/s; gripper, m and m/s, 0 without one.
 
     `tick` is that of the sample.
     """
@@ -60,6 +60,13 @@ class Arm(Link, Protocol):
         """Whether the brakes are closed."""
 
     @property
+    def contact(self) -> tuple[int, int] | None:
+        """The geoms of an unintended contact of the arm, or of what it holds, since the last `step` began."""
+
+    def named(self, contact: tuple[int, int]) -> str:
+        """Return what touches what."""
+
+    @property
     def touches(self) -> int:
         """Contacts that no task means."""
 
@@ -69,7 +76,11 @@ class Arm(Link, Protocol):
 
     @property
     def violations(self) -> int:
-        """Steps of the simulation in which a limit was broken."""
+        """Steps of the simulation in which the arm's own drives broke a limit."""
+
+    @property
+    def pushed(self) -> int:
+        """Steps in which what struck the arm pushed a joint beyond a limit of position or velocity."""
 
     @property
     def first_violation(self) -> str:

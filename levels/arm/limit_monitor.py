@@ -16,7 +16,9 @@ WHAT = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
 class LimitMonitor:
     """Records position, velocity and torque, of motor and brake together, step by step; judges once a tick.
 
-    `count` is the number of steps that broke a limit; `first` says which one the first of them broke.
+    `count` is the number of steps that broke a limit; `first` says which one the first of them broke. Steps in which
+    something struck pushes joints beyond limits of position or velocity, and no torque is beyond its own, are counted in
+    `pushed`: physics that no drive can prevent.
     """
 
     def __init__(self, cell: Cell, data: mujoco.MjData, substeps: int) -> None:
@@ -33,6 +35,7 @@ class LimitMonitor:
         self._low[self._columns] = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
         self._high[self._columns] = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
         self.count = 0
+        self.pushed = 0
         self.first = ""
 
     def look(self, substep: int) -> None:
@@ -43,16 +46,27 @@ class LimitMonitor:
         velocity[:] = qd
         np.add(motors, brakes, out=torque)
 
-    def judge(self, time_s: float) -> None:
-        """Judge the steps of one tick that began at simulated `time_s`."""
+    def judge(self, time_s: float, struck: bool) -> bool:
+        """Judge the steps of one tick that began at simulated `time_s`; say whether one broke a limit.
+
+        `struck`: the arm has been struck, and moves on from that.
+        """
         # What is no number is not within limits either. (To count is five times as fast as to ask for all.)
         within = np.count_nonzero(self._seen >= self._low) + np.count_nonzero(self._seen <= self._high)
-        if within < 2 * self._seen.size:
-            self._count(time_s)
+        if within == 2 * self._seen.size:
+            return False
+        self._count(time_s, struck)
+        return True
 
-    def _count(self, time_s: float) -> None:
+    def _count(self, time_s: float, struck: bool) -> None:
         wrong = ~((self._seen >= self._low) & (self._seen <= self._high))
         steps = wrong.any(axis=1)
+        if struck:
+            pushed = steps & ~wrong[:, self._columns[2]].any(axis=1) & np.isfinite(self._seen).all(axis=1)
+            self.pushed += int(pushed.sum())
+            steps &= ~pushed
+            if not steps.any():
+                return
         self.count += int(steps.sum())
         if self.first:
             return

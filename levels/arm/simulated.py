@@ -12,6 +12,7 @@ from backplane.alarms import Alarm
 from backplane.message import Message
 from levels.arm.arm import Sensed
 from levels.arm.brake import Brake
+from levels.arm.coarse_sensors import CoarseSensors
 from levels.arm.contact_monitor import ContactMonitor
 from levels.arm.limit_monitor import LimitMonitor
 from levels.arm.limits import LimitGate
@@ -29,14 +30,20 @@ FARTHEST = 1.001
 """Multiple of a torque limit beyond which a command is none that a servo level gives: it keeps the limits itself."""
 
 
+STRUCK_TICKS = 40
+"""Ticks behind a contact, or behind the last limit broken after it, for which the arm moves on from the blow."""
+
+
 class SimulatedArm:
     """Implements `Arm`: `substeps` MuJoCo steps a tick; simulated time is tick times period, always.
+
+    Samples are as coarse and noisy as the cell's encoders; brakes and limit gate are the drives' own and see the truth.
 
     A command is for one torque cycle, `every` ticks. It passes the limit gate in every tick, also in those that the
     servo level missed.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1) -> None:
+    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
         self._cell, self._model = cell, cell.model
         self._data = cell.start()
         self._clock_ns = clock_ns
@@ -56,7 +63,9 @@ class SimulatedArm:
             (mocap, ObstacleMotion(cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name)))
             for mocap, body, name in zip(cell.mocap, obstacles, names, strict=True)
         ]
-        self._sensed = (np.zeros(len(cell.qpos)), np.zeros(len(cell.qpos)))
+        self._true = (np.zeros(len(cell.qpos)), np.zeros(len(cell.qpos)))
+        self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
+        self._struck = 0  # ticks for which the arm still moves on from a blow
         self._sound = np.zeros(mujoco.mj_stateSize(cell.model, STATE))
         self._command: Array = np.zeros(len(cell.qpos))
         self._given = False  # for the coming tick
@@ -75,6 +84,15 @@ class SimulatedArm:
         return self._brake.closed
 
     @property
+    def contact(self) -> tuple[int, int] | None:
+        """The geoms of an unintended contact of the arm, or of what it holds, in the last `step`."""
+        return self._contacts.struck
+
+    def named(self, contact: tuple[int, int]) -> str:
+        """Return what touches what."""
+        return self._contacts.named(contact)
+
+    @property
     def touches(self) -> int:
         """Contacts that no task means, summed over all steps."""
         return self._contacts.count
@@ -86,8 +104,13 @@ class SimulatedArm:
 
     @property
     def violations(self) -> int:
-        """Steps of the simulation in which a limit was broken."""
+        """Steps of the simulation in which the arm's own drives broke a limit."""
         return self._limits.count
+
+    @property
+    def pushed(self) -> int:
+        """Steps in which what struck the arm pushed a joint beyond a limit of position or velocity."""
+        return self._limits.pushed
 
     @property
     def first_violation(self) -> str:
@@ -97,13 +120,20 @@ class SimulatedArm:
     def sense(self) -> Sensed:
         """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
         d, cell = self._data, self._cell
-        position, velocity = self._sensed
-        np.take(d.qpos, cell.qpos, out=position)
-        np.take(d.qvel, cell.dof, out=velocity)
+        position, velocity = self._state()
+        if self._coarse is not None:
+            position, velocity = self._coarse.sample(position, velocity, self.tick)
         if cell.gripper_qpos is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
         opening, speed = float(d.qpos[cell.gripper_qpos]), float(d.qvel[cell.gripper_dof])
         return Sensed(position, velocity, opening, speed, self.tick)
+
+    def _state(self) -> tuple[Array, Array]:
+        """Return joint positions and velocities, rad, rad/s, as they are. Valid until the next call."""
+        position, velocity = self._true
+        np.take(self._data.qpos, self._cell.qpos, out=position)
+        np.take(self._data.qvel, self._cell.dof, out=velocity)
+        return position, velocity
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Open the brakes and give torques and gripper force for the coming torque cycle.
@@ -125,7 +155,7 @@ class SimulatedArm:
 
     def brake(self) -> None:
         """Close the brakes; the motors give nothing, the gripper keeps its force."""
-        self._brake.close(self.sense().position)
+        self._brake.close(self._state()[0])
         self._give()
 
     def weaken(self, most: Array | None) -> None:
@@ -134,9 +164,10 @@ class SimulatedArm:
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time goes on."""
+        self._contacts.struck = None
         for _ in range(ticks):
             if self.waited >= self._patience:
-                self._brake.close(self.sense().position)
+                self._brake.close(self._state()[0])
             if not self._given:
                 self._give()
             self._given = False
@@ -160,7 +191,7 @@ class SimulatedArm:
         """Fill an `ARM_STATE`."""
         mujoco.mj_getState(self._model, self._data, state.state, STATE)
         state.tick, state.clipped, state.touches = self.tick, self.clipped, self.touches
-        state.violations = self.violations
+        state.violations, state.pushed, state.struck = self.violations, self.pushed, self._struck
         state.waited, state.braked, state.rest = self.waited, self.braked, self._brake.rest
 
     def restore(self, state: Message) -> None:
@@ -168,7 +199,7 @@ class SimulatedArm:
         d, cell = self._data, self._cell
         mujoco.mj_setState(self._model, d, state.state, STATE)
         self.tick, self.clipped, self._contacts.count = state.tick, state.clipped, state.touches
-        self._limits.count = state.violations
+        self._limits.count, self._limits.pushed, self._struck = state.violations, state.pushed, state.struck
         self._brake.closed, self.waited = bool(state.braked), state.waited
         np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
@@ -192,7 +223,7 @@ class SimulatedArm:
     def _give(self) -> None:
         """Pass the command to the motors, or the brakes' torque to the joints, through the limit gate."""
         d, cell = self._data, self._cell
-        q, qd, _, _, _ = self.sense()
+        q, qd = self._state()
         closed = self._brake.closed
         passed, cut = self._gate.admit(self._brake.torque(q, qd) if closed else self._command, q, qd)
         self.clipped += cut
@@ -209,11 +240,16 @@ class SimulatedArm:
         mujoco.mj_getState(m, d, self._sound, STATE)
         for mocap, motion in self._motions:
             d.mocap_pos[mocap] = motion.position(self._now_s)
+        touches = self._contacts.count
         for substep in range(self._substeps):
             mujoco.mj_step(m, d)
             self._contacts.look(d, d.time)
             self._limits.look(substep)
-        self._limits.judge(self._now_s)
+        if self._contacts.count > touches and self._contacts.struck is not None:
+            self._struck = STRUCK_TICKS
+        broken = self._limits.judge(self._now_s, self._struck > 0)
+        if self._struck:
+            self._struck = STRUCK_TICKS if broken else self._struck - 1
         self.fault = self._broken()
         if self.fault:
             mujoco.mj_setState(m, d, self._sound, STATE)

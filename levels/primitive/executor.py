@@ -100,6 +100,8 @@ class PrimitiveExecutor(Executor):
             self._go_on(read, serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._rules.cycles(self._params.silent):
             self._fault = Fault(Error.BELOW, f"no status from below for {self._tracking.silent_cycles} cycles")
+        if read.status.is_there and read.status.value.state == State.ERROR:
+            self._fault = Fault(Error(read.status.value.error), read.status.value.reason)
         self._write_set_point(write.command, tick)
         self._write_status(read, write.status, serials, tick)
         self._answer(write, read.command.value.operator)

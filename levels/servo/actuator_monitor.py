@@ -41,7 +41,9 @@ class ActuatorMonitor:
         self._limits, self._dry = cell.bounds.torque, np.array(cell.model.dof_frictionloss[cell.dof])
         self._following, self._period_s = following, period_s
         self._fastest = TOO_FAST * cell.bounds.velocity
-        self._noise = NOISE * self._limits
+        self._least, self._speed_off = NOISE * self._limits, cell.encoders.speed_off
+        self._exact, self._off = cell.encoders.exact, cell.encoders.off
+        self._noise = self._least
         joints = len(self._dry)
         self._inertia, self._twice_inertia = np.zeros((joints, joints)), np.zeros((joints, joints))
         self._bias, self._velocity, self._torque = np.zeros((3, joints))
@@ -66,11 +68,14 @@ class ActuatorMonitor:
         """Judge the cycle that ends now, at `velocity`, rad/s, and `astray`, rad, from the set points."""
         if not self._begun:
             return None
-        far = np.abs(astray)
+        far = np.abs(astray) - self._off
         if np.count_nonzero(far > self._following):
             joint = int(far.argmax())
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
         left = self._left_over(velocity, terms)
+        if not self._exact:
+            # What encoders may make of a gain in velocity that there is not.
+            self._noise = self._least + np.abs(terms.inertia) @ (2.0 * self._speed_off / self._period_s)
         if not np.count_nonzero(np.abs(left) > self._noise):
             self._cycles = 0
             return None
@@ -100,8 +105,9 @@ class ActuatorMonitor:
         lacks = left * np.sign(self._torque)
         explained = (lacks >= -self._noise) & (lacks <= told + self._noise)
         share = lacks / self._limits
-        joint = self._joint if self._cycles and share[self._joint] > LACKING else int(share.argmax())
-        if not explained.all() or share[joint] <= LACKING:
+        least = np.maximum(LACKING, self._noise / self._limits)
+        joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
+        if not explained.all() or share[joint] <= least[joint]:
             self._cycles = 0
             return None
         if self._cycles == 0 or joint != self._joint:

@@ -52,15 +52,17 @@ class ServoExecutor(Executor):
         super().__init__(context)
         params, every = read_params(ServoParams, context.params), context.every
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self.arm: Arm = SimulatedArm(cell, context.scene, context.clock_ns, every)
+        self.arm: Arm = SimulatedArm(cell, context.scene, context.clock_ns, every, context.seed)
         self._faulty = FaultyLink(self.arm, cell, every, self.acted)
         self._link: Link = self.arm
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._loop = ComputedTorque(cell, params)
         braking = cell.limits.acceleration
-        self.sensors = SensorMonitor(cell.bounds, braking, cell.home, context.tick_s, every, params.good_cycles)
+        self.sensors = SensorMonitor(
+            cell.bounds, cell.encoders, braking, cell.home, context.tick_s, every, params.good_cycles
+        )
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
-        self.stopping = Stopping(params, round(params.retry / context.tick_s), every)
+        self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
         self.standing = Standing(self.commands, context.robot.joints, cell.limits.position)
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
@@ -68,7 +70,6 @@ class ServoExecutor(Executor):
         self._wanted = Motion(cell.home, self._rest, self._rest)
         self._started = False
         self._left = False  # the set points in the last cycle: the arm was braked
-        self._refused: Alarm | None = None  # the torques of the last cycle, and why
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Take over the faults between this level and the arm."""
@@ -80,9 +81,11 @@ class ServoExecutor(Executor):
         missed = self._catch_up(read.before.value if read.before.is_there else None, tick)
         sensed, sensors = self._link.sense(), self.sensors
         sensors.look(sensed, tick, None if missed or self._left else self._wanted.velocity)
-        self._take_findings()
         self.standing.take(read.operator)
+        if self.arm.contact is not None:
+            self.stopping.struck(self.arm.contact, self.arm.named(self.arm.contact), tick)
         reaction = self.stopping.decide(self.demand, sensors, tick)
+        self._take_findings()
         if reaction is Reaction.BRAKE:
             self._brake()
         elif sensors.fresh:
@@ -94,6 +97,7 @@ class ServoExecutor(Executor):
         self.standing.orders.report(write.status, read.command.value.operator)
         self.arm.save(write.state)
         sensors.remember(write.state)
+        self.stopping.remember(write.state)
         self.arm.look(write.scene)
 
     def _catch_up(self, before: Message | None, tick: int) -> bool:
@@ -113,6 +117,7 @@ class ServoExecutor(Executor):
         if before is not None:
             self.arm.restore(before)
             self.sensors.recall(before)
+            self.stopping.recall(before)
             if self._grip is not None:
                 self._grip.keep(self.arm.grip_force)
         if self.arm.braked:
@@ -122,9 +127,10 @@ class ServoExecutor(Executor):
         self._started = self._left = True
 
     def _take_findings(self) -> None:
-        if self.sensors.findings:
-            self.findings += self.sensors.findings
-            self.sensors.findings.clear()
+        for findings in (self.sensors.findings, self.stopping.findings):
+            if findings:
+                self.findings += findings
+                findings.clear()
 
     def _brake(self) -> None:
         """Brake, and let the set points go."""
@@ -150,7 +156,7 @@ class ServoExecutor(Executor):
         refused = self._link.drive(torque, grip_force)
         if refused is not None:
             return self._refuse(refused)
-        self._wanted, self._left, self._refused = wanted, False, None
+        self._wanted, self._left, self.stopping.refused = wanted, False, None
         return self.motors.begin(velocity, terms, self.arm.torque)
 
     def _next_motion(self, command: Message, reaction: Reaction, missed: bool, tick: int) -> Motion:
@@ -167,13 +173,14 @@ class ServoExecutor(Executor):
     def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
         if not self.stopping.trying:
             self.findings.append(finding)
-        return self.stopping.motor_fails(self.context.robot.joints[finding.subject], tick)
+        return self.stopping.motor_fails(finding.subject, finding.value, tick)
 
     def _refuse(self, finding: Finding) -> None:
         """Take in that the arm did not let a torque through and has closed its brakes."""
-        if finding.alarm is not self._refused:
+        refused = self.stopping.refused
+        if refused is None or finding.alarm is not refused.alarm:
             self.findings.append(finding)
-        self._refused = finding.alarm
+        self.stopping.refused = finding
         self._brake()
 
     def _report(self, status: Message, command: Message, sensed: Sensed, reaction: Reaction) -> None:
@@ -188,13 +195,14 @@ class ServoExecutor(Executor):
         status.stopped = self._left or reaction is not Reaction.NONE or self.standing.stands
         status.demand = self.demand
         status.clipped = arm.clipped + self.reference.refused + self._loop.cut
-        status.touches, status.violations = arm.touches, arm.violations
-        status.state = State.IDLE if holding else State.EXECUTING
+        status.touches, status.violations, status.pushed = arm.touches, arm.violations, arm.pushed
+        kept = self.stopping.reason or self.standing.reason
         if arm.fault:
             status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, arm.fault
-        elif arm.violations and status.error in (Error.NONE, Error.TOUCHED):
-            status.error, status.reason = Error.LIMIT, arm.first_violation
-        elif arm.touches and status.error == Error.NONE:
-            status.error, status.reason = Error.TOUCHED, arm.first_touch
-        elif status.error == Error.NONE:
-            status.reason = self.stopping.reason
+        elif self.stopping.error:
+            status.state, status.error, status.reason = State.ERROR, self.stopping.error, kept
+        else:
+            resting = State.IDLE if holding else State.EXECUTING
+            status.state = State.HOLDING if kept and command.id else resting
+            status.error = Error.LIMIT if arm.violations else Error.TOUCHED if arm.touches else Error.NONE
+            status.reason = kept or (arm.first_violation if arm.violations else arm.first_touch)

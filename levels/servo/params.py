@@ -24,4 +24,9 @@ class ServoParams(Table):
     )
     on_actuator_fault: Reacting = Field("brake", description="ramp to rest and hold, or ramp and brake, or brake")
     good_cycles: int = Field(20, ge=1, le=10_000, description="good cycles in a row after which a fault is over")
-    retry: Positive = Field(0.5, description="time after which a motor that did not do its torque is tried again, s")
+    retry: Positive = Field(
+        0.5, description="time after which a motor that gave too little is tried again, or a struck arm goes on, s"
+    )
+    patience: Positive = Field(
+        5.0, description="time for which faults may keep the arm from its set points; then they are latched, s"
+    )

@@ -10,6 +10,7 @@ from backplane.message import Message
 from levels.arm import Sensed
 from levels.cell import Bounds
 from levels.level import Finding
+from levels.limits import Encoders
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,6 +25,10 @@ UNDER_WAY = 0.002
 """Velocity of the set point, rad/s, from which on a joint is under way."""
 STUCK_RAD = 0.01
 """How far a joint may have come until it is noticed that its sensor does not tell."""
+STUCK_STEPS = 3.0
+"""Way, in multiples of what a good sample may be off both ways, after which an encoder that shows none is stuck."""
+UNSEEN_S = 0.05
+"""Time for which a joint may have moved off while its sensor, unnoticed, did not."""
 BRAKE_TAIL_S2 = 1e-3
 """What a joint needs beyond v^2 / 2 a until the brake has stopped it, for every rad/s2 of its braking."""
 SILENT_CYCLES = 2
@@ -35,26 +40,38 @@ class SensorMonitor:
 
     `position`, `velocity` (joints,), rad, rad/s, are the sample's if it is good. Where it is not, they go on with the
     sensed velocity or, without one, as the brakes stop the arm; `doubt` (joints,), rad, is how far off that may be.
-    A joint is good again where what it says fits to that. `fresh`: there is a sample of this cycle. `faulty`: not yet
+    A joint is good again where what it says fits to that, and from sample to sample to itself: an offset that is
+    greater than the doubt is never taken for the truth. `blamed`: joint, what it reads, rad, and how far that is off,
+    rad; -1 and the age, ticks, of a sample that does not come. `fresh`: there is a sample of this cycle. `faulty`: not yet
     `good_cycles` in a row were good. `drivable`: velocities are known, so the arm could still be driven.
     """
 
     def __init__(
-        self, bounds: Bounds, braking: Array, home: Array, tick_s: float, every: int, good_cycles: int
+        self,
+        bounds: Bounds,
+        encoders: Encoders,
+        braking: Array,
+        home: Array,
+        tick_s: float,
+        every: int,
+        good_cycles: int,
     ) -> None:
         """Judge joints that brake with `braking`, rad/s2, and start at `home`, rad, in cycles of `every` ticks."""
+        self._room, self._speed_room = ROOM_RAD + 2.0 * encoders.off, encoders.speed_off
+        self._unshown = STUCK_STEPS * 2.0 * encoders.off
         self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
         self._fastest = BEYOND_SPEED * bounds.velocity
         self._braking, self._tick_s, self._every, self._good_cycles = braking, tick_s, every, good_cycles
         joints = len(home)
         self.position, self.velocity, self.doubt = home.copy(), np.zeros(joints), np.zeros(joints)
         self._raw = (home.copy(), np.zeros(joints))
-        self._still = np.zeros(joints, dtype=int)
+        self._still, self._still_way = np.zeros(joints, dtype=int), np.zeros(joints)
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
         self._tick: int | None = None
         self._streak = 0
         self._rung: set[Alarm] = set()
         self.findings: list[Finding] = []
+        self.blamed = (-1, 0.0, 0.0)
         self.fresh = self.drivable = True
         self.faulty = False
 
@@ -81,13 +98,14 @@ class SensorMonitor:
         q, qd = sensed.position, sensed.velocity
         change = qd - self.velocity
         way = (0.5 * passed_s) * (qd + self.velocity)
-        room = self.doubt + ROOM_RAD + passed_s * np.abs(change)
+        room = self._room + passed_s * (np.abs(change) + self._speed_room)
         if passed > self._every:
             # Driven on for a while, then braked: faster in between than at both ends.
             room += passed_s * 4.0 * self._every * self._tick_s * self._braking
-        fits = np.abs(q - self.position - way) <= room  # never true for what is no number
-        if self.faulty or np.count_nonzero(fits) < fits.size or not self._stirs(q, qd, change, wanted):
-            self._doubtful(q, qd, way, fits, passed_s)
+        # Never true for what is no number.
+        fits = np.abs(q - self.position - way) <= room + self.doubt
+        if self.faulty or np.count_nonzero(fits) < fits.size or not self._stirs(q, qd, change, wanted, passed_s):
+            self._doubtful(q, qd, way, fits, room, passed_s)
             return
         self._take(q, qd, change != 0.0)
 
@@ -100,37 +118,64 @@ class SensorMonitor:
         np.copyto(self._raw[0], q)
         np.copyto(self._raw[1], qd)
 
-    def _stirs(self, q: Array, qd: Array, change: Array, wanted: Array | None) -> bool:
+    def _stirs(self, q: Array, qd: Array, change: Array, wanted: Array | None, passed_s: float) -> bool:
         """Say whether no joint has been still for too long while it was under way."""
         if wanted is None or np.count_nonzero(change) == change.size:
             if np.count_nonzero(self._still):
                 self._still[:] = 0
+                self._still_way[:] = 0.0
             return True
         still = (change == 0.0) & (q == self._raw[0]) & (np.abs(wanted) > UNDER_WAY)
         self._still += 1
         self._still *= still
-        return bool((self._still < STILL_CYCLES).all())
+        self._still_way += passed_s * wanted
+        self._still_way *= still
+        return not self._is_still().any()
 
-    def _doubtful(self, q: Array, qd: Array, way: Array, fits: Mask, passed_s: float) -> None:
+    def _is_still(self) -> Mask:
+        return np.asarray((self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown))
+
+    def _doubtful(self, q: Array, qd: Array, way: Array, fits: Mask, room: Array, passed_s: float) -> None:
         """Name what is wrong with a sample, take what is right, and go on from what is known for the rest."""
         finite, inside = np.isfinite(q) & np.isfinite(qd), (q >= self._low) & (q <= self._high)
         inside &= np.abs(qd) <= self._fastest
-        frozen = (q == self._raw[0]) & (qd == self._raw[1]) & (np.abs(qd) * passed_s > ROOM_RAD)
-        still = self._still >= STILL_CYCLES
+        last_q, last_qd = self._raw
+        unchanged = (q == last_q) & (qd == last_qd)
+        frozen = unchanged & (np.abs(qd) * passed_s > self._room)
+        still = self._is_still()
+        room += passed_s * np.abs(qd - last_qd)
+        steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room
         self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
         self._name(Alarm.SENSOR_STUCK, frozen | still, self._still)
         self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, q - self.position - way)
-        good = fits & inside & ~still & ~frozen
+        good = fits & steady & inside & ~still & ~frozen
         self.drivable = bool((np.isfinite(qd) & ~frozen & ~still).all())
         self.doubt[still] += STUCK_RAD
+        # A sensor that shows no change beside one at fault may be stuck as well, since before that was found.
+        unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
+        np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged)
         self._still[still] = 0
+        self._blame(good, q, q - self.position - way)
         self._suspect |= ~good
         if self._settled(bool(good.all())):
+            self._tell_offsets(q - self.position - way)
             self._take(q, qd, (q != self._raw[0]) | (qd != self._raw[1]))
             return
         np.copyto(self._raw[0], q)
         np.copyto(self._raw[1], qd)
         self._estimate(q, qd, way, np.isfinite(qd) & ~frozen, passed_s)
+
+    def _blame(self, good: Mask, q: Array, off: Array) -> None:
+        """Keep the joint that is wrong by most."""
+        if not good.all():
+            amount = np.where(np.isfinite(off), np.abs(off), np.inf)
+            joint = int(np.where(good, -1.0, amount).argmax())
+            self.blamed = joint, float(q[joint]), float(off[joint])
+
+    def _tell_offsets(self, off: Array) -> None:
+        """Tell of joints that are taken over at another place than they were thought to be."""
+        for joint in np.flatnonzero(np.abs(off) > self._room):
+            self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
 
     def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
         """Let suspects go on, with their velocity where that is known; take the others as sensed.
@@ -150,6 +195,7 @@ class SensorMonitor:
             self._ring(Finding(Alarm.SENSOR_SILENT, -1, age))
             self.drivable = False
             self._suspect[:] = True
+            self.blamed = -1, float(age), 0.0
         self._streak = 0
         self._brake(self._everyone, passed_s)
 

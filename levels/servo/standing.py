@@ -45,6 +45,15 @@ class Standing:
             self.orders.under_way()
         self.stands = self.orders.standing is not What.NONE or bool(self._way)
 
+    @property
+    def reason(self) -> str:
+        """Say for whom the arm does not follow the level above; empty: it does."""
+        if not self.stands:
+            return ""
+        if self.orders.standing is What.NONE:
+            return "goes back to where the operator took over, then follows the level above"
+        return f"operator's {self.orders.standing.name.lower()}, until resume"
+
     def wanted(self, reference: Reference, tick: int) -> Motion:
         """Return the motion wanted at `tick`, while the level follows the operator."""
         goal = self._aim()

@@ -1,10 +1,16 @@
-"""Decides in every cycle whether the arm follows its set points, or what it does instead."""
+"""Decides in every cycle whether the arm follows its set points, or what it does instead, and for how long."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
+from typing import NamedTuple
 
+from backplane.alarms import Alarm
+from backplane.message import Message
 from backplane.words import Demand
+from levels.level import Finding
+from levels.messages import Error
 from levels.servo.params import ServoParams
 from levels.servo.sensor_monitor import SensorMonitor
 
@@ -21,49 +27,133 @@ class Reaction(IntEnum):
 DEMANDED = {Demand.NONE: Reaction.NONE, Demand.STOP: Reaction.STOP, Demand.BRAKE: Reaction.BRAKE}
 
 
+class Cause(NamedTuple):
+    """A fault that keeps the arm from its set points: what is wrong and what comes next, in words, joint and value."""
+
+    error: Error
+    text: str
+    joint: int = -1
+    value: float = 0.0
+    then: str = ""
+
+
 class Stopping:
-    """Weighs demands on the arm, faults of its sensors and faults of its motors: the strongest reaction wins.
+    """Weighs demands on the arm and faults of sensors, motors and torques, and blows: the strongest reaction wins.
 
     A motor at fault is tried again after a while: the arm holds with it, and follows when that went well for
-    `good_cycles`. Where it fails while the arm ramps or holds with it, the brakes close. `reason` says in one line why
-    the arm does not follow; empty: it does.
+    `good_cycles`. Where it fails while the arm ramps or holds with it, the brakes close. An arm that was struck stays
+    braked until nothing has touched it for as long.
+
+    Faults keep the arm from its set points for `patience` at most. That time runs while a fault does, and back while
+    the arm follows, so faults that come again and again use it up as well. Then the fault is latched: `error` is set,
+    and the brakes stay engaged. `reason` says in one line why the arm does not follow; empty: it does.
     """
 
-    def __init__(self, params: ServoParams, retry_ticks: int, every: int) -> None:
+    def __init__(self, params: ServoParams, joints: Sequence[str], tick_s: float, every: int) -> None:
+        self._joints, self._params, self._every = joints, params, every
         self._on_sensors = Reaction[params.on_sensor_fault.upper()]
         self._on_motors = Reaction[params.on_actuator_fault.upper()]
-        self._retry_ticks, self._good_ticks = retry_ticks, params.good_cycles * every
+        self._retry_ticks, self._good_ticks = round(params.retry / tick_s), params.good_cycles * every
+        self._most = max(round(params.patience / tick_s), every)
+        self._kept = 0
+        self._tick: int | None = None
         self._retry_at: int | None = None
         self._standing = self._on_motors
-        self._motors = ""
+        self._motor = self._blow = Cause(Error.NONE, "")
+        self._struck_until: int | None = None
+        self.refused: Finding | None = None
+        """The torque of the last cycle, if the arm did not let it through."""
+        self.error = Error.NONE
         self.reason = ""
+        self.findings: list[Finding] = []
+
+    def recall(self, state: Message) -> None:
+        """Go on from what an `ARM_STATE` says that the level knew."""
+        self._tick, self._kept = state.tick, state.kept
+        self.error, self.reason = Error(state.error), state.reason
+
+    def remember(self, state: Message) -> None:
+        """Fill in what `recall` wants to know."""
+        state.kept = self._kept
+        if self.error != state.error:
+            state.error, state.reason = self.error, self.reason
 
     @property
     def trying(self) -> bool:
         """Whether a motor is at fault, or not yet known to be sound again."""
         return self._retry_at is not None
 
-    def motor_fails(self, joint: str, tick: int) -> Reaction:
+    def motor_fails(self, joint: int, lacking: float, tick: int) -> Reaction:
         """Take in that a motor does not do what it is told; return the reaction."""
         self._standing = self._on_motors if self._retry_at is None else Reaction.BRAKE
         self._retry_at = tick + self._retry_ticks
-        self._motors = f"joint '{joint}': the motor does not give the torque it was told"
+        text = f"motor of '{self._joints[joint]}' does not give the torque commanded"
+        self._motor = Cause(Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}")
         return self._standing
+
+    def struck(self, contact: tuple[int, int], named: str, tick: int) -> None:
+        """Take in that something touches the arm."""
+        if self._struck_until is None:
+            self.findings.append(Finding(Alarm.COLLISION, *contact))
+        self._struck_until = tick + self._retry_ticks
+        self._blow = Cause(Error.TOUCHED, f"unintended contact: {named}")
 
     def decide(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
         """Return the reaction of this cycle."""
-        reaction = DEMANDED[demand]
-        self.reason = f"the safety of the rack demands: {demand.name.lower()}" if reaction else ""
+        passed = tick - self._tick if self._tick is not None else self._every
+        self._tick = tick
+        if self.error:
+            return Reaction.BRAKE
+        reaction, cause = self._weigh(sensors, tick)
+        if cause is None:
+            self._kept = max(self._kept - passed, 0)
+        elif not demand:
+            self._kept += passed
+            if self._kept >= self._most:
+                return self._latch(cause)
+        if demand:
+            self.reason = f"demand '{demand.name.lower()}' on the arm, until boards and emergency stop are in order"
+        else:
+            self.reason = ""
+            if cause is not None:
+                self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
+        return max(reaction, DEMANDED[demand])
+
+    def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
+        """Return what faults make the arm do, and the one to name."""
+        reaction, cause = Reaction.NONE, None if self.refused is None else self._about_torque(self.refused)
         if sensors.faulty:
-            reaction = max(reaction, self._on_sensors if sensors.drivable else Reaction.BRAKE)
-            self.reason = "the sensors of the arm are not to be trusted"
+            reaction = self._on_sensors if sensors.drivable else Reaction.BRAKE
+            cause = self._about_sensors(sensors)
         if self._retry_at is not None:
             reaction = max(reaction, self._about_motors(self._retry_at, tick))
-        return reaction
+            cause = self._motor if self._retry_at is not None else cause
+        if self._struck_until is not None:
+            if tick < self._struck_until:
+                return Reaction.BRAKE, self._blow
+            self._struck_until = None
+        return reaction, cause
+
+    def _about_sensors(self, sensors: SensorMonitor) -> Cause:
+        joint, read, off = sensors.blamed
+        if joint < 0:
+            return Cause(Error.SENSORS, "sensors give no new samples", joint, read)
+        text = f"sensor of '{self._joints[joint]}' reads {read:.4g} rad"
+        return Cause(Error.SENSORS, f"{text}, off by {off:.3g}" if off == off else text, joint, read)
+
+    def _about_torque(self, refused: Finding) -> Cause:
+        what = "not finite" if refused.alarm is Alarm.COMMAND_INVALID else f"{refused.value:.3g} N m"
+        text = f"rejected: torque of '{self._joints[refused.subject]}' is {what}"
+        return Cause(Error.LIMIT, text, refused.subject, refused.value)
 
     def _about_motors(self, retry_at: int, tick: int) -> Reaction:
         if tick >= retry_at + self._good_ticks:
             self._retry_at = None
             return Reaction.NONE
-        self.reason = self._motors
         return self._standing if tick < retry_at else Reaction.HOLD
+
+    def _latch(self, cause: Cause) -> Reaction:
+        """Brake for good."""
+        self.error, self.reason = cause.error, f"{cause.text}; not over within {self._params.patience:g} s"
+        self.findings.append(Finding(Alarm.LATCHED, cause.joint, cause.value))
+        return Reaction.BRAKE

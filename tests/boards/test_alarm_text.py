@@ -34,6 +34,8 @@ KINDS = {
     Alarm.DEMAND: "reaction",
     Alarm.BRAKES_CLOSED: "reaction",
     Alarm.BRAKES_OPENED: "recovery",
+    Alarm.RE_REFERENCED: "recovery",
+    Alarm.LATCHED: "reaction",
 }
 
 

@@ -85,7 +85,7 @@ def test_a_motor_off_at_top_speed_is_found_in_five_cycles_and_breaks_no_limit(
     assert found(rig)[0] - rig.acted[0] <= 5
     assert (rig.status.stopped, rig.status.braked) == (1, 1)
     assert (rig.status.violations, rig.servo.arm.first_violation) == (0, "")
-    assert rig.status.reason.startswith("joint '")
+    assert rig.status.reason.startswith("motor of '")
 
 
 @pytest.mark.parametrize(
