@@ -35,14 +35,24 @@ Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
+SHORTEST_MS = 0.01
+"""One tick, in real time and in simulated time, at least."""
+LONGEST_EVERY = 1_000_000
+"""Ticks from one cycle of a board to the next, at most."""
 
 
 class ClockConfig(Table):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
-    period_ms: float = Field(gt=0, le=1000, allow_inf_nan=False, description="one tick, ms, in whole ns")
+    period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False, description="one tick, ms, in whole ns")
     mode: Mode = Field("realtime", description="ticks by time, or lockstep: as soon as every task has finished")
-    speed: Positive = Field(1.0, description="real time runs this many times faster than simulated time")
+    speed: float = Field(
+        1.0,
+        ge=0.001,
+        le=1000,
+        allow_inf_nan=False,
+        description="real time runs this many times faster than simulated time",
+    )
     wake: Wake = Field("signal", description="how boards wait for their cycle: a semaphore each, or busy-waiting")
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
@@ -104,8 +114,10 @@ class BoardConfig(Table):
 
     slot: Slot = Field(description="slot in the crate, 2 to 21; slot 1 is the clock's")
     core: Core = Field(0, description="core that the board is pinned to; cores the machine lacks are shared out")
-    rate_hz: Positive | None = Field(None, description="rate of the executor, Hz; must divide the clock's")
-    every: int | None = Field(None, ge=1, description="instead of rate_hz: period of the executor, ticks")
+    rate_hz: Positive | None = Field(None, ge=1e-6, description="rate of the executor, Hz; must divide the clock's")
+    every: int | None = Field(
+        None, ge=1, le=LONGEST_EVERY, description="instead of rate_hz: period of the executor, ticks"
+    )
     priority: Priority = Field(0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling")
     wake: Wake | None = Field(None, description="how this board waits for its cycle; default: clock.wake")
     above: str | None = Field(None, description="board of the level above, whose commands are read")
@@ -136,7 +148,7 @@ class RackConfig(Table):
 
     name: RackName = Field(description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40")
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of everything random")
-    python_path: tuple[Path, ...] = Field(
+    python_path: tuple[Annotated[Path, Field(strict=False)], ...] = Field(
         (), description="folders of your own levels, for import; relative to the file"
     )
     clock: ClockConfig = Field(description="the system clock")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from pydantic import ValidationError
+
 from backplane.address_map import CLOCK
 from backplane.errors import MailboxError
 from backplane.layout import Layout, MailboxSpec, Protocol, TaskSpec, depth_for
@@ -16,6 +18,7 @@ from boards.config.fields import field_specs
 from boards.config.ports import TaskPorts, all_ports
 from boards.config.rules import mistakes_in
 from boards.config.schema import BoardConfig, RackConfig
+from boards.config.schema_mistakes import mistakes_of
 from boards.errors import ConfigError, Mistake
 from levels.errors import ProgramError
 from levels.operator import OPERATOR_COMMAND
@@ -63,6 +66,7 @@ class Wiring:
         for ports in self._tasks:
             self._check_reads(ports)
         self._check_rest()
+        self._check_params()
         if "robot" not in broken and "scene" not in broken:
             self._check_program()
 
@@ -105,6 +109,17 @@ class Wiring:
         for name, board in self.config.board.items():
             if board.ends_run and name not in self._untold and f"{name}.status" not in self._writers:
                 self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
+
+    def _check_params(self) -> None:
+        """Check the parameters of a board against what its executor's and planner's classes declare."""
+        kinds = {(ports.board, ports.kind.params): None for ports in self._tasks}
+        for board, kind in kinds:
+            params = self.config.board[board].params
+            try:
+                if kind is not None:
+                    kind.model_validate(params)
+            except ValidationError as error:
+                self.mistakes += mistakes_of(error, kind, params, f"board.{board}.params")
 
     def _check_program(self) -> None:
         """Check the program of the project's own task level; a user's own reads its `[task]` itself."""

@@ -23,6 +23,12 @@ def _seconds(value: Any) -> Any:
     return float(found[1]) * (1e-3 if found[2] == "ms" else 1.0)
 
 
+def _number(value: Any) -> Any:
+    """Return a switch as 0 or 1: parameters are numbers, `random = true` is one."""
+    return float(value) if isinstance(value, bool) else value
+
+
+Parameter = Annotated[Finite, BeforeValidator(_number)]
 Seconds = Annotated[float, BeforeValidator(_seconds), Field(gt=0, le=1e6, allow_inf_nan=False)]
 
 
@@ -30,7 +36,7 @@ class FaultConfig(Table):
     """`[[fault]]`: one fault. Keys that are not named here are parameters of its kind, numbers."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
-    __pydantic_extra__: dict[str, Finite]
+    __pydantic_extra__: dict[str, Parameter]
 
     kind: str = Field(description="what goes wrong; 'rack inject --help' lists the kinds")
     board: str = Field(description="task concerned: a board, as in servo, its planner, as in servo.planner, or clock")
