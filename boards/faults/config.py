@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from levels.robot import Finite, Table
 
@@ -61,12 +60,3 @@ class FaultConfig(Table):
     def parameters(self) -> dict[str, float]:
         """The parameters given, by name; whether the kind takes them is not known here."""
         return dict(self.__pydantic_extra__ or {})
-
-
-def readable(tables: Any) -> Iterator[tuple[str, FaultConfig]]:
-    """Yield place and fault for the tables of a list that are faults; the others' mistakes are told by the schema."""
-    for at, table in enumerate(tables if isinstance(tables, list) else []):
-        try:
-            yield f"fault[{at}]", FaultConfig.model_validate(table)
-        except ValidationError:
-            continue
