@@ -12,7 +12,7 @@ from pydantic import Field, StringConstraints
 
 from backplane.clock import ticks_of
 from backplane.layout import Protocol
-from boards.config.text import to_toml
+from boards.config.text import portable, to_toml
 from boards.faults.config import FaultConfig
 from boards.operating.config import CommandConfig
 from levels.robot import Positive, RobotConfig, Table
@@ -62,6 +62,12 @@ class TimingConfig(Table):
     """`[timing]`: what the timing model is told of the processors."""
 
     context_switch_ms: Milliseconds = Field(0.1, description="one switch between tasks, t_cs, ms; 0.1 is the paper's")
+    response_ms: float | None = Field(
+        None,
+        ge=SHORTEST_MS,
+        le=1e9,
+        description="goal: the system responds within R_s (eqs 3.2, 3.3), simulated ms; R_max is then R_s / n",
+    )
     clock_ms: Milliseconds = Field(0.0, description="processor time of the system clock's board in one tick, ms")
     small_share: float = Field(
         0.1, gt=0, le=1, description="part of a cycle that counts as much smaller than it (eq. 3.10)"
@@ -176,4 +182,7 @@ class RackConfig(Table):
 
     def text(self) -> str:
         """Return the config as TOML that loads again with the same meaning, by itself."""
-        return to_toml(self.model_dump(mode="json", exclude_none=True, by_alias=True))
+        tables = self.model_dump(mode="json", exclude_none=True, by_alias=True)
+        if self.robot is not None:
+            tables["robot"]["model"] = portable(self.robot.model)
+        return to_toml(tables)
