@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 LONGEST_VALUE = 80
+LONGEST_PLACE = 120
+LONGEST_REASON = 1000
 
 
 class BoardError(Exception):
@@ -33,7 +35,8 @@ class Mistake:
 
     def __str__(self) -> str:
         """Return the mistake as one line."""
-        return f"{self.place}: {self.why}" if self.value is None else f"{self.place} = {shown(self.value)}: {self.why}"
+        value = "" if self.value is None else f" = {shown(self.value)}"
+        return f"{one_line(self.place, LONGEST_PLACE)}{value}: {one_line(self.why, LONGEST_REASON)}"
 
 
 class ConfigError(BoardError):
@@ -46,6 +49,15 @@ class ConfigError(BoardError):
 
 def shown(value: Any) -> str:
     """Return a config value as TOML would have it, cut to one short line."""
-    text = str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
-    text = " ".join(text.split())
-    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+    value = list(value) if isinstance(value, tuple) else value
+    try:
+        text = str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
+    except ValueError:  # Python writes no integer of thousands of digits
+        text = f"an integer of {value.bit_length()} bits"
+    return one_line(text, LONGEST_VALUE)
+
+
+def one_line(text: str, longest: int) -> str:
+    """Return text as one line of at most that many characters, without what a terminal would obey."""
+    text = "".join(c if c.isprintable() else "?" for c in " ".join(text[: 2 * longest].split()))
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from levels.errors import RobotError
+from levels.mjcf import compile_spec, load_spec
 from levels.motors import listed
 from levels.robot import RobotConfig
+from levels.scene import SceneConfig
 from levels.touches import below, geoms_of
 
 NOUNS = {
@@ -27,6 +31,25 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
     count = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom, "joint": model.njnt}[NOUNS[kind]]
     have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
     raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
+
+
+def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
+    """Yield a line for every name in the config that the model does not have. Raises `RobotError`, of the model."""
+    model = compile_spec(load_spec(robot.model), robot.model)
+    kind = mujoco.mjtObj
+    wanted = [(kind.mjOBJ_JOINT, name, "robot.joints") for name in robot.joints]
+    if mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) < 0:
+        wanted.append((kind.mjOBJ_SITE, robot.tool, "robot.tool"))
+    if robot.gripper is not None:
+        wanted.append((kind.mjOBJ_JOINT, robot.gripper.joint, "robot.gripper.joint"))
+    wanted += [(kind.mjOBJ_BODY, name, "scene.objects") for name in scene.objects]
+    wanted += [(kind.mjOBJ_BODY, name, "scene.obstacles") for name in scene.obstacles]
+    wanted += [(kind.mjOBJ_GEOM, name, "scene.supports") for name in scene.supports]
+    for what, name, place in wanted:
+        try:
+            find(model, what, name, place)
+        except RobotError as error:
+            yield str(error)
 
 
 def find_all(model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str) -> NDArray[np.int_]:

@@ -17,7 +17,7 @@ from backplane.mailbox import Reading, Verdict
 from backplane.message import Message, MessageType
 from backplane.words import Demand
 from levels.operator import Commands
-from levels.robot import RobotConfig
+from levels.robot import RobotConfig, Table
 from levels.scene import SceneConfig
 
 __all__ = [
@@ -123,6 +123,8 @@ class Executor(ABC):
     """Kinds of faults that can be injected into what the level drives."""
     commands: ClassVar[Commands] = {}
     """What an operator may tell the level, and how goals are given: of one that reads "own.operator"."""
+    params: ClassVar[type[Table] | None] = None
+    """What `[board.<name>.params]` may hold, checked before the launch; None: whatever the level reads by itself."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
@@ -152,6 +154,8 @@ class Planner(ABC):
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     output: ClassVar[MessageType]
+    params: ClassVar[type[Table] | None] = None
+    """As the executor's: one table is for both."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+# No quantity of an arm in SI units, nor of its time, is beyond these: sums and squares of them stay finite.
+Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 
 
 class Table(BaseModel):
-    """Base of every config table: unknown keys are errors, values do not change."""
+    """Base of every config table: unknown keys are errors, values do not change, nor does `true` pass for 1."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_tuples(cls, table: Any) -> Any:
+        """TOML has lists for what does not change here."""
+        return {key: _tuple(value) for key, value in table.items()} if isinstance(table, dict) else table
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
 
 
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -49,7 +60,7 @@ class GripperConfig(Table):
 class RobotConfig(Table):
     """An arm: its MJCF file and what the model does not say. Lists have one value a joint."""
 
-    model: Path = Field(description="MJCF file of the arm and its cell; relative to the config")
+    model: Path = Field(strict=False, description="MJCF file of the arm and its cell; relative to the config")
     joints: tuple[str, ...] = Field(min_length=1, max_length=16, description="MJCF joints of the arm, base to tool")
     tool: str = Field(description="MJCF site whose pose is the tool's; for a model without one, its last body")
     home: tuple[Finite, ...] = Field(description="joint positions at the start, rad")

@@ -36,6 +36,7 @@ class WorldModel(Executor):
 
     inputs = {"scene": Input(SCENE, "servo.scene"), "last": Input(WORLD_MODEL, "own.model")}
     outputs = {"model": WORLD_MODEL}
+    params = WorldParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -8,9 +8,33 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from boards.errors import one_line
+
+LONGEST_LINE = 1300
+"""Characters of one line of a refusal, at most."""
+
+
+def configs(start: str) -> list[str]:
+    """Return the project's configs that begin so, for a shell to complete."""
+    from boards.config import names
+
+    return [name for name in names() if name.startswith(start)]
+
+
+def running(start: str) -> list[str]:
+    """Return the racks in shared memory that begin so, for a shell to complete."""
+    from backplane.segment import racks
+
+    return [name for name in racks() if name.startswith(start)]
+
+
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout, and nothing else")]
-ConfigName = Annotated[str, typer.Argument(metavar="CONFIG", help="config by name, or a path to a .toml file")]
-RackName = Annotated[str, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it")]
+ConfigName = Annotated[
+    str, typer.Argument(metavar="CONFIG", help="config by name, or a path to a .toml file", autocompletion=configs)
+]
+RackName = Annotated[
+    str, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", autocompletion=running)
+]
 Settings = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")
 ]
@@ -35,7 +59,11 @@ def print_json(document: Any) -> None:
 
 def fail(reason: str, status: int) -> NoReturn:
     """End the command: the reason on stderr, on stdout too, as JSON, when that was asked for."""
-    print(reason, file=sys.stderr)
+    lines = [
+        line if line.isprintable() and len(line) <= LONGEST_LINE else one_line(line, LONGEST_LINE)
+        for line in reason.splitlines()
+    ]
+    print(*lines, sep="\n", file=sys.stderr)
     if "--json" in sys.argv[1:]:
-        print_json({"error": reason.splitlines()})
+        print_json({"error": lines})
     sys.exit(status)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 
 import typer
 
+from boards.errors import shown
 from tools.analyze import analyze
 from tools.answer import Failure, fail
 from tools.bench.command import bench
@@ -25,9 +27,13 @@ from tools.run import run
 from tools.status import status
 from tools.stop import stop
 
+LONGEST_ARGUMENT = 4096
+"""Characters, as in the longest path; what a config holds beyond that belongs into a file."""
+USAGE = (errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ELOOP, errno.EACCES)
+"""What the system says of a path that a user should not have given."""
+
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
@@ -56,14 +62,30 @@ def main() -> None:
     if sys.platform != "linux":
         sys.exit(f"rack runs on Linux alone, not on {sys.platform}: it needs /dev/shm, pidfds and SCHED_FIFO")
     try:
+        _look_over(sys.argv[1:])
         app(prog_name="rack")
     except Failure as failure:
         fail(str(failure), failure.status)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        fail(f"{shown(str(error.filename))}: {error.strerror}", 2 if error.errno in USAGE else 1)
     except Exception as error:
         status_of_error = _status(error)
         if status_of_error is None:
             raise
         fail(str(error), status_of_error)
+
+
+def _look_over(arguments: list[str]) -> None:
+    """Refuse what no command can use, before any sees it. Raises `Failure`."""
+    for at, argument in enumerate(arguments, 1):
+        if len(argument) > LONGEST_ARGUMENT:
+            raise Failure(
+                f"argument {at} = {shown(argument)}: {len(argument)} characters; at most {LONGEST_ARGUMENT}", 2
+            )
+        if any("\ud800" <= c <= "\udfff" for c in argument):
+            raise Failure(f"argument {at} = {shown(argument)}: is no UTF-8", 2)
 
 
 def _status(error: Exception) -> int | None:

@@ -11,15 +11,34 @@ from levels.robot import RobotConfig
 from levels.scene import SceneConfig
 
 
-def cell_sizes(config: RackConfig, mistakes: list[Mistake]) -> dict[str, int]:
-    """Return the symbolic sizes by name, none without an arm; add what is wrong with the cell to `mistakes`."""
+def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = True) -> dict[str, int]:
+    """Return the symbolic sizes by name, none without an arm; add what is wrong with the cell to `mistakes`.
+
+    Of a cell that is not whole, as [robot] or [scene] have mistakes of their own, only names are looked up.
+    """
     if config.robot is None:
         return {}
+    found: list[str] = []
     try:
-        return dict(_sizes(config.robot, config.scene, config.clock_ns))
+        if is_whole:
+            return dict(_sizes(config.robot, config.scene, config.clock_ns))
     except RobotError as error:
-        mistakes.append(Mistake("robot", None, str(error)))
-        return {}
+        found = [str(error)]
+    for line in _unknown_names(config.robot, config.scene) or found:
+        place, colon, why = line.partition(": ")
+        is_key = colon and place.startswith(("robot", "scene"))
+        mistakes.append(Mistake(place, None, why) if is_key else Mistake("robot", None, line))
+    return {}
+
+
+def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
+    """Return a line for every name that the model does not have; none of a model that cannot be read."""
+    from levels.cell_index import unknown_names
+
+    try:
+        return tuple(unknown_names(robot, scene))
+    except RobotError:
+        return ()
 
 
 @lru_cache(maxsize=4)

@@ -22,7 +22,7 @@ def find_class(reference: str, base: type[T]) -> type[T]:
     module_name, _, name = reference.partition(":")
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:  # a user's module may raise anything while it is imported
+    except (Exception, SystemExit) as error:  # a user's module may raise anything while it is imported
         raise LookupError(f"cannot import '{module_name}': {type(error).__name__}: {error}") from error
     found = getattr(module, name, None)
     if not isinstance(found, type) or not issubclass(found, base):

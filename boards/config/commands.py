@@ -13,6 +13,7 @@ from boards.config.classes import find_class
 from boards.config.schema import RackConfig
 from boards.errors import Mistake
 from boards.operating.config import CommandConfig
+from levels.errors import RobotError
 from levels.level import Executor
 from levels.operator import Commands, Goal, goal_names, listed
 from levels.robot import RobotConfig
@@ -35,10 +36,16 @@ def commandable(config: RackConfig) -> dict[str, Commands]:
     return found
 
 
-def command_mistakes(commands: Iterable[tuple[str, CommandConfig]], config: RackConfig) -> list[Mistake]:
-    """Return everything wrong with commands, given with their places in a config; empty for one given live."""
+def command_mistakes(
+    commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, untold: frozenset[str] = frozenset()
+) -> list[Mistake]:
+    """Return everything wrong with commands, given with their places in a config; empty for one given live.
+
+    `untold` are boards whose own mistakes are told already.
+    """
     told = list(commands)
-    found = [mistake for place, command in told for mistake in _mistakes(place, command, config)]
+    known = [(place, command) for place, command in told if command.level not in untold]
+    found = [mistake for place, command in known for mistake in _mistakes(place, command, config)]
     if len(told) > OPERATOR_ENTRIES:
         found.append(Mistake("command", len(told), f"more than can wait at once; permitted: {OPERATOR_ENTRIES}"))
     return found
@@ -110,7 +117,11 @@ def _key(goal: Goal) -> str:
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:
-    robot, ranges = config.robot, joint_ranges(config)
+    try:
+        robot, ranges = config.robot, joint_ranges(config)
+    except RobotError:
+        # That the cell cannot be built is a mistake of its own, and told.
+        return
     if robot is None or ranges is None:
         yield Mistake(place, list(joints), "the rack has no arm")
     elif len(joints) != len(robot.joints):

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import ValidationError
 
 from boards.config.classes import extend_path
-from boards.config.faults import fault_mistakes
 from boards.config.files import CONFIGS, Tables, anchor, parse, read, with_faults
 from boards.config.overrides import override
 from boards.config.rules import mistakes_in
-from boards.config.schema import RackConfig
+from boards.config.schema import LAST_SLOT, RackConfig
 from boards.config.schema_mistakes import mistakes_of
-from boards.config.wiring import Wiring
+from boards.config.wiring import judged
 from boards.errors import ConfigError, Mistake
-from boards.faults.config import readable
+from boards.faults.config import FaultConfig
+from boards.operating.config import CommandConfig
+from levels.robot import Table
+
+T = TypeVar("T", bound=Table)
 
 
 def load(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None) -> RackConfig:
@@ -38,25 +43,26 @@ def loads(text: str) -> RackConfig:
 
 def resolve(tables: Tables) -> RackConfig:
     """Return the config that plain tables hold; its levels can be imported. Raises `ConfigError` with every mistake."""
+    found: list[Mistake] = []
+    broken: frozenset[str] = frozenset()
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
-        broken = _broken(error)
-        intact = _intact(tables, broken)
-        rest = _mistakes(intact, broken, tables.get("fault")) if intact is not None else []
-        raise ConfigError([*mistakes_of(error, RackConfig, tables), *rest]) from None
-    if mistakes_in(config):
-        raise ConfigError(_mistakes(config, frozenset(), tables.get("fault")))
+        found, broken = mistakes_of(error, RackConfig, tables), _broken(error)
+        config = _intact(tables, broken)
     extend_path(config.python_path)
+    if broken or mistakes_in(config):
+        faults, commands = _readable(tables, "fault", FaultConfig), _readable(tables, "command", CommandConfig)
+        raise ConfigError([*found, *judged(config, faults, commands, broken)[0]])
     return config
 
 
-def _mistakes(config: RackConfig, broken: frozenset[str], faults: object) -> list[Mistake]:
-    """Return everything wrong with a config, its wiring too: one run of a command shows every mistake there is."""
-    extend_path(config.python_path)
-    untold = frozenset(place.removeprefix("board.") for place in broken if place.startswith("board."))
-    of_faults = fault_mistakes(readable(faults), config, untold=untold)
-    return [*mistakes_in(config, broken), *Wiring(config, broken).mistakes, *of_faults]
+def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
+    """Yield place and table for those of a list that are whole; the others' mistakes are known."""
+    entries = tables.get(key)
+    for at, entry in enumerate(entries if isinstance(entries, list) else []):
+        with suppress(ValidationError):
+            yield f"{key}[{at}]", kind.model_validate(entry)
 
 
 def _broken(error: ValidationError) -> frozenset[str]:
@@ -65,13 +71,12 @@ def _broken(error: ValidationError) -> frozenset[str]:
     return frozenset(".".join(keys[:2] if keys[0] == "board" else keys[:1]) for keys in places)
 
 
-def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig | None:
-    """Return a config of the tables without mistakes, or None when no board is left."""
+def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
+    """Return a config of the tables without mistakes."""
     kept = {key: value for key, value in tables.items() if key in RackConfig.model_fields and key not in broken}
     boards = {name: table for name, table in kept.get("board", {}).items() if f"board.{name}" not in broken}
     # Stand-ins for required tables; what depends on a broken table is not looked at.
-    return (
-        RackConfig.model_validate({"name": "unnamed", "clock": {"period_ms": 1}, **kept, "board": boards})
-        if boards
-        else None
-    )
+    spare = {"name": "unnamed", "clock": {"period_ms": 1}}
+    none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
+    config = RackConfig.model_validate({**spare, **kept, "board": boards or none})
+    return config if boards else config.model_copy(update={"board": {}})

@@ -11,7 +11,8 @@ from collections import Counter
 from collections.abc import Iterator
 
 from backplane.errors import ClockError
-from boards.config.schema import BoardConfig, RackConfig
+from boards.config.files import file_at
+from boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, RackConfig
 from boards.errors import Mistake
 
 RESERVED = ("clock", "above", "below", "own")
@@ -27,6 +28,7 @@ def mistakes_in(config: RackConfig, broken: frozenset[str] = frozenset()) -> lis
     known = [*config.board, *(place.removeprefix("board.") for place in broken if place.startswith("board."))]
     found = [
         *(mistake for name, board in boards for mistake in _board(name, board, known)),
+        *_circles(config),
         *_slots(config),
         *_ends(config),
         *(_scene(config) if "scene" not in broken else ()),
@@ -46,6 +48,27 @@ def _board(name: str, board: BoardConfig, known: list[str]) -> Iterator[Mistake]
         if other is not None and (other == name or other not in known):
             yield Mistake(f"{place}.{key}", other, f"no other board is called so; boards: {_others(known, name)}")
     yield from _planner(place, board)
+
+
+def _circles(config: RackConfig) -> Iterator[Mistake]:
+    """Levels that are above themselves, by way of others: what walks from level to level would not end."""
+    for key in ("below", "above"):
+        links = {name: getattr(board, key) for name, board in config.board.items()}
+        seen: set[str] = set()
+        for name in links:
+            walk: list[str] = []
+            at: str | None = name
+            while at in links and at not in seen:
+                seen.add(at)
+                walk.append(at)
+                at = links[at]
+            circle = walk[walk.index(at) :] if at in walk else []
+            if len(circle) > 1:
+                way = " -> ".join([*circle, circle[0]])
+                why = (
+                    f"the levels go round in a circle, {way}; the {'lowest' if key == 'below' else 'highest'} has none"
+                )
+                yield Mistake(f"board.{circle[-1]}.{key}", circle[0], why)
 
 
 def _others(known: list[str], name: str) -> str:
@@ -101,6 +124,11 @@ def _clock(config: RackConfig) -> Iterator[Mistake]:
         yield Mistake("clock.period_ms", clock.period_ms, "is no whole number of ns")
     if clock.mode == "lockstep" and clock.speed != 1.0:
         yield Mistake("clock.speed", clock.speed, 'lockstep runs as fast as it can; a speed needs mode = "realtime"')
+    if clock.period_ms / clock.speed < SHORTEST_MS:
+        why = (
+            f"makes a tick of {clock.period_ms / clock.speed:g} ms in real time; permitted: {SHORTEST_MS:g} ms or more"
+        )
+        yield Mistake("clock.speed", clock.speed, why)
 
 
 def _rates(config: RackConfig) -> Iterator[Mistake]:
@@ -111,9 +139,12 @@ def _rates(config: RackConfig) -> Iterator[Mistake]:
             yield Mistake(place, board.rate_hz, why)
             continue
         try:
-            config.every(name)
+            every = config.every(name)
         except ClockError as error:
             yield Mistake(place, None, str(error))
+        else:
+            if every > LONGEST_EVERY:
+                yield Mistake(place, board.rate_hz, f"makes a cycle of {every} ticks; permitted: {LONGEST_EVERY}")
 
 
 def _polling(config: RackConfig) -> Iterator[Mistake]:
@@ -136,7 +167,7 @@ def _robot(config: RackConfig) -> Iterator[Mistake]:
     robot = config.robot
     if robot is None:
         return
-    if not robot.model.is_file():
+    if file_at(robot.model) is None:
         yield Mistake("robot.model", str(robot.model), "no such file")
     for key in ("home", "velocity", "acceleration", "jerk", "torque", "position"):
         values = getattr(robot, key)

@@ -12,7 +12,7 @@ from pydantic import Field, StringConstraints
 
 from backplane.clock import ticks_of
 from backplane.layout import Protocol
-from boards.config.text import to_toml
+from boards.config.text import portable, to_toml
 from boards.faults.config import FaultConfig
 from boards.operating.config import CommandConfig
 from levels.robot import Positive, RobotConfig, Table
@@ -35,14 +35,24 @@ Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
+SHORTEST_MS = 0.01
+"""One tick, in real time and in simulated time, at least."""
+LONGEST_EVERY = 1_000_000
+"""Ticks from one cycle of a board to the next, at most."""
 
 
 class ClockConfig(Table):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
-    period_ms: float = Field(gt=0, le=1000, allow_inf_nan=False, description="one tick, ms, in whole ns")
+    period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False, description="one tick, ms, in whole ns")
     mode: Mode = Field("realtime", description="ticks by time, or lockstep: as soon as every task has finished")
-    speed: Positive = Field(1.0, description="real time runs this many times faster than simulated time")
+    speed: float = Field(
+        1.0,
+        ge=0.001,
+        le=1000,
+        allow_inf_nan=False,
+        description="real time runs this many times faster than simulated time",
+    )
     wake: Wake = Field("signal", description="how boards wait for their cycle: a semaphore each, or busy-waiting")
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
@@ -52,6 +62,12 @@ class TimingConfig(Table):
     """`[timing]`: what the timing model is told of the processors."""
 
     context_switch_ms: Milliseconds = Field(0.1, description="one switch between tasks, t_cs, ms; 0.1 is the paper's")
+    response_ms: float | None = Field(
+        None,
+        ge=SHORTEST_MS,
+        le=1e9,
+        description="goal: the system responds within R_s (eqs 3.2, 3.3), simulated ms; R_max is then R_s / n",
+    )
     clock_ms: Milliseconds = Field(0.0, description="processor time of the system clock's board in one tick, ms")
     small_share: float = Field(
         0.1, gt=0, le=1, description="part of a cycle that counts as much smaller than it (eq. 3.10)"
@@ -104,8 +120,10 @@ class BoardConfig(Table):
 
     slot: Slot = Field(description="slot in the crate, 2 to 21; slot 1 is the clock's")
     core: Core = Field(0, description="core that the board is pinned to; cores the machine lacks are shared out")
-    rate_hz: Positive | None = Field(None, description="rate of the executor, Hz; must divide the clock's")
-    every: int | None = Field(None, ge=1, description="instead of rate_hz: period of the executor, ticks")
+    rate_hz: Positive | None = Field(None, ge=1e-6, description="rate of the executor, Hz; must divide the clock's")
+    every: int | None = Field(
+        None, ge=1, le=LONGEST_EVERY, description="instead of rate_hz: period of the executor, ticks"
+    )
     priority: Priority = Field(0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling")
     wake: Wake | None = Field(None, description="how this board waits for its cycle; default: clock.wake")
     above: str | None = Field(None, description="board of the level above, whose commands are read")
@@ -136,7 +154,7 @@ class RackConfig(Table):
 
     name: RackName = Field(description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40")
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of everything random")
-    python_path: tuple[Path, ...] = Field(
+    python_path: tuple[Annotated[Path, Field(strict=False)], ...] = Field(
         (), description="folders of your own levels, for import; relative to the file"
     )
     clock: ClockConfig = Field(description="the system clock")
@@ -164,4 +182,7 @@ class RackConfig(Table):
 
     def text(self) -> str:
         """Return the config as TOML that loads again with the same meaning, by itself."""
-        return to_toml(self.model_dump(mode="json", exclude_none=True, by_alias=True))
+        tables = self.model_dump(mode="json", exclude_none=True, by_alias=True)
+        if self.robot is not None:
+            tables["robot"]["model"] = portable(self.robot.model)
+        return to_toml(tables)

@@ -11,10 +11,15 @@ from pydantic_core import ErrorDetails
 
 from boards.errors import Mistake
 
+ALONE = {"robot": "; a [robot] that names its model is another arm, and takes nothing from a file that it extends"}
+"""What to know of a table that misses something, by its key."""
+
 
 def mistakes_of(error: ValidationError, model: type[BaseModel], tables: Any, place: str = "") -> list[Mistake]:
     """Return the mistakes of `tables`, which stand at `place` in the config and failed as a `model`."""
-    return [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
+    found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
+    # A value that may be of several kinds is none of them by one mistake each: the first will do.
+    return list({mistake.place: mistake for mistake in reversed(found)}.values())[::-1]
 
 
 def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
@@ -23,10 +28,10 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
     owner, field = _declared(model, keys)
     meaning = f"; {field.description}" if field is not None and field.description else ""
     if entry["type"] == "missing":
-        return Mistake(where, None, f"missing{meaning}")
+        return Mistake(where, None, f"missing{meaning}{ALONE.get(str(keys[0]), '')}")
     if entry["type"] == "extra_forbidden":
         return Mistake(where, entry["input"], _unknown(str(keys[-1]), owner))
-    text = entry["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    text = entry["msg"].removeprefix("Value error, ").removeprefix("Input ").replace("valid tuple", "list")
     return Mistake(where, entry["input"], f"{text}{meaning}")
 
 

@@ -14,15 +14,13 @@ BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
-    """Return config tables as TOML: empty tables left out, a bundled model named as in configs/."""
-    if "robot" in tables:
-        tables = {**tables, "robot": {**tables["robot"], "model": _portable(tables["robot"]["model"])}}
+    """Return tables as TOML, empty ones left out."""
     return "\n".join(_lines(tables, ())).lstrip("\n") + "\n"
 
 
-def _portable(model: str) -> str:
-    path = Path(model)
-    return path.relative_to(CONFIGS).as_posix() if path.is_relative_to(CONFIGS) else model
+def portable(model: Path) -> str:
+    """Return a model as a config names it: a bundled one as in configs/."""
+    return model.relative_to(CONFIGS).as_posix() if model.is_relative_to(CONFIGS) else str(model)
 
 
 def _lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from backplane.address_map import CLOCK
+from pydantic import ValidationError
+
+from backplane.address_map import CLOCK, AddressMap
 from backplane.errors import MailboxError
 from backplane.layout import Layout, MailboxSpec, Protocol, TaskSpec, depth_for
 from backplane.message import MessageType
@@ -16,31 +18,63 @@ from boards.config.fields import field_specs
 from boards.config.ports import TaskPorts, all_ports
 from boards.config.rules import mistakes_in
 from boards.config.schema import BoardConfig, RackConfig
+from boards.config.schema_mistakes import mistakes_of
 from boards.errors import ConfigError, Mistake
+from boards.faults.config import FaultConfig
+from boards.operating.config import CommandConfig
 from levels.errors import ProgramError
 from levels.operator import OPERATOR_COMMAND
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox: commands come now and then."""
+LARGEST_BYTES = 2**30
+"""Size of a rack's segment, at most."""
 HISTORY_S = 2.0
 """Simulated time that mailboxes and trace rings keep for a recorder: real-time boards may starve it for 1 s."""
 
 
 def wire(config: RackConfig) -> Layout:
     """Return the layout of a rack. Raises `ConfigError` with every mistake."""
-    mistakes = mistakes_in(config)
-    wiring = Wiring(config)
-    mistakes += wiring.mistakes
-    sizes = {} if mistakes else cell_sizes(config, mistakes)
-    if not mistakes:
-        mistakes += wiring.check_sizes(sizes)
-    layout = None if mistakes else wiring.layout(sizes)
-    mistakes += fault_mistakes(places(config), config, layout)
-    # Joints are looked at in the cell: one that cannot be built is a mistake already.
-    mistakes += command_mistakes(command_places(config), config) if layout is not None else []
+    mistakes, layout = judged(config, places(config), command_places(config))
     if layout is None or mistakes:
         raise ConfigError(mistakes)
     return layout
+
+
+def judged(
+    config: RackConfig,
+    faults: Iterable[tuple[str, FaultConfig]],
+    commands: Iterable[tuple[str, CommandConfig]],
+    broken: frozenset[str] = frozenset(),
+) -> tuple[list[Mistake], Layout | None]:
+    """Return every mistake of a config, its wiring and its cell, and the layout where there is none.
+
+    `broken` names tables that the config lacks, as their mistakes are known: nothing that depends on them is judged.
+    """
+    mistakes = mistakes_in(config, broken)
+    tables = {mistake.place.partition(".")[0] for mistake in mistakes} | broken
+    wiring = Wiring(config, broken)
+    mistakes += wiring.mistakes
+    sizes = cell_sizes(config, mistakes, is_whole=not tables & {"robot", "scene"})
+    if not mistakes and not broken:
+        mistakes += wiring.check_sizes(sizes)
+    layout = None if mistakes or broken else wiring.layout(sizes)
+    if layout is not None:
+        mistakes += too_large(layout)
+    untold = frozenset(place.removeprefix("board.") for place in broken if place.startswith("board."))
+    mistakes += fault_mistakes(faults, config, layout if not mistakes else None, untold)
+    mistakes += command_mistakes(commands, config, untold)
+    return mistakes, layout
+
+
+def too_large(layout: Layout) -> list[Mistake]:
+    """Return a mistake for the largest part of a segment that no machine should be asked for."""
+    whole = AddressMap(layout).size
+    if whole <= LARGEST_BYTES:
+        return []
+    box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
+    why = f"keeps {box.depth} messages for its slowest reader, and the segment has {whole} bytes; "
+    return [Mistake(f"mailbox {box.name}", None, f"{why}permitted: {LARGEST_BYTES}; shorten cycles or within_cycles")]
 
 
 class Wiring:
@@ -63,6 +97,7 @@ class Wiring:
         for ports in self._tasks:
             self._check_reads(ports)
         self._check_rest()
+        self._check_params()
         if "robot" not in broken and "scene" not in broken:
             self._check_program()
 
@@ -105,6 +140,17 @@ class Wiring:
         for name, board in self.config.board.items():
             if board.ends_run and name not in self._untold and f"{name}.status" not in self._writers:
                 self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
+
+    def _check_params(self) -> None:
+        """Check the parameters of a board against what its executor's and planner's classes declare."""
+        kinds = {(ports.board, ports.kind.params): None for ports in self._tasks}
+        for board, kind in kinds:
+            params = self.config.board[board].params
+            try:
+                if kind is not None:
+                    kind.model_validate(params)
+            except ValidationError as error:
+                self.mistakes += mistakes_of(error, kind, params, f"board.{board}.params")
 
     def _check_program(self) -> None:
         """Check the program of the project's own task level; a user's own reads its `[task]` itself."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from levels.robot import Finite, Table
 
@@ -23,6 +22,12 @@ def _seconds(value: Any) -> Any:
     return float(found[1]) * (1e-3 if found[2] == "ms" else 1.0)
 
 
+def _number(value: Any) -> Any:
+    """Return a switch as 0 or 1: parameters are numbers, `random = true` is one."""
+    return float(value) if isinstance(value, bool) else value
+
+
+Parameter = Annotated[Finite, BeforeValidator(_number)]
 Seconds = Annotated[float, BeforeValidator(_seconds), Field(gt=0, le=1e6, allow_inf_nan=False)]
 
 
@@ -30,7 +35,7 @@ class FaultConfig(Table):
     """`[[fault]]`: one fault. Keys that are not named here are parameters of its kind, numbers."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
-    __pydantic_extra__: dict[str, Finite]
+    __pydantic_extra__: dict[str, Parameter]
 
     kind: str = Field(description="what goes wrong; 'rack inject --help' lists the kinds")
     board: str = Field(description="task concerned: a board, as in servo, its planner, as in servo.planner, or clock")
@@ -55,12 +60,3 @@ class FaultConfig(Table):
     def parameters(self) -> dict[str, float]:
         """The parameters given, by name; whether the kind takes them is not known here."""
         return dict(self.__pydantic_extra__ or {})
-
-
-def readable(tables: Any) -> Iterator[tuple[str, FaultConfig]]:
-    """Yield place and fault for the tables of a list that are faults; the others' mistakes are told by the schema."""
-    for at, table in enumerate(tables if isinstance(tables, list) else []):
-        try:
-            yield f"fault[{at}]", FaultConfig.model_validate(table)
-        except ValidationError:
-            continue

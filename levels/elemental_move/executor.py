@@ -45,6 +45,7 @@ class ElementalMoveExecutor(Executor):
     # The status first: killed between the two, the board finds a window whose done moves it only takes out again.
     outputs: ClassVar[Mapping[str, MessageType]] = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
     commands: ClassVar[Commands] = {What.HOLD: (), What.RESUME: ()}
+    params = ElementalMoveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -55,6 +55,7 @@ class ElementalMovePlanner(Planner):
         "world": Input(WORLD_MODEL, "world.model"),
     }
     output: ClassVar[MessageType] = MOVE_PLAN
+    params = ElementalMoveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -17,6 +17,7 @@ class FigureExecutor(Executor):
 
     inputs = {"plan": Input(FIGURE_PLAN, "own.plan")}
     outputs = {"status": FIGURE_STATUS}
+    params = FigureParams
 
     def __init__(self, context: LevelContext) -> None:
         """Raise `LevelError` for a parameter that is not one."""

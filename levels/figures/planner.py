@@ -17,6 +17,7 @@ class FigurePlanner(Planner):
 
     inputs = {"status": Input(FIGURE_STATUS, "own.status")}
     output = FIGURE_PLAN
+    params = FigureParams
 
     def __init__(self, context: LevelContext) -> None:
         """Raise `LevelError` for a parameter that is not one."""

@@ -60,6 +60,7 @@ class PrimitiveExecutor(Executor):
     }
     outputs = {"command": JOINT_SET_POINT, "status": PRIMITIVE_STATUS}
     commands = {What.HOLD: (), What.RESUME: ()}
+    params = PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

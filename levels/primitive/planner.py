@@ -25,6 +25,7 @@ class PrimitivePlanner(Planner):
         "status": Input(PRIMITIVE_STATUS, "own.status"),
     }
     output = TRAJECTORY
+    params = PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -47,6 +47,7 @@ class ServoExecutor(Executor):
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
     faults = KINDS
     commands = {What.HOLD: (), What.RESUME: (), What.SETPOINT: (Goal.JOINTS,)}
+    params = ServoParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -35,6 +35,7 @@ class TaskPlanner(Planner):
         "world": Input(WORLD_MODEL, "world.model"),
     }
     output: ClassVar[MessageType] = TASK_PLAN
+    params = TaskParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

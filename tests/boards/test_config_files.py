@@ -112,6 +112,6 @@ def test_every_override_that_cannot_be_is_told(small: Path) -> None:
         load(small, ["clock", "name.low=1", ".=2"])
     assert lines(error) == [
         '--set = "clock": must be key=value, as in clock.speed=2',
-        "--set = \"name.low=1\": 'low' would stand in 'small', which is no table",
+        '--set = "name.low=1": "low" would stand in "small", which is no table',
         '--set = ".=2": must be key=value, as in clock.speed=2',
     ]

@@ -7,20 +7,22 @@ from dataclasses import dataclass
 from backplane.layout import Layout, TaskSpec
 from boards.config.schema import RackConfig
 from boards.config.timing import NS_PER_MS, is_critical, tick_ns
-from tools.timing.prediction import hierarchy
+from tools.timing.prediction import hierarchy, longest_cycles
 
 
 @dataclass(frozen=True)
 class Model:
     """A rack as the equations see it. `tick_ns` is one tick of the wall clock; in lockstep, of simulated time.
 
-    `levels` are the boards of the hierarchy. Of boards with a planner `tight` are those that share their processor
-    with it, and `critical` those of them that it may keep waiting while it updates the plan.
+    `levels` are the boards of the hierarchy; `cycles` and `longest_cycles` (R_max) are ticks. Of boards with a planner
+    `tight` are those that share their processor with it, and `critical` those of them that it may keep waiting while
+    it updates the plan.
     """
 
     is_lockstep: bool
     tick_ns: int
     cycles: dict[str, int]
+    longest_cycles: dict[str, float]
     levels: tuple[str, ...]
     tight: frozenset[str]
     critical: frozenset[str]
@@ -35,6 +37,7 @@ class Model:
             is_lockstep=config.clock.mode == "lockstep",
             tick_ns=tick_ns(config),
             cycles={name: layout.task(name).every for name in config.board},
+            longest_cycles=longest_cycles(config),
             levels=hierarchy(config),
             tight=tight,
             critical=frozenset(name for name in tight if is_critical(config, layout, name)),
@@ -51,6 +54,5 @@ class Model:
         return task.every * task.within_cycles * self.tick_ns
 
     def longest_cycle_ns(self, task: TaskSpec) -> int:
-        """R_max of eq. 3.4: the longest cycle of the hierarchy; a board outside it has its own."""
-        longest = max((self.cycles[name] for name in self.levels), default=0)
-        return (longest if task.board in self.levels else self.cycles[task.board]) * self.tick_ns
+        """R_max of eq. 3.4."""
+        return round(self.longest_cycles[task.board] * self.tick_ns)

@@ -11,14 +11,14 @@ from boards.config.schema import BoardConfig, Coupling, RackConfig
 from boards.config.timing import tick_ns
 from levels.timing.budget import Budget
 from levels.timing.equations import communication_ns, residual_ns
-from tools.timing.prediction import hierarchy
+from tools.timing.prediction import longest_cycles
 
 
 @dataclass(frozen=True)
 class LevelTiming:
     """One level in the worst case, ns of the wall clock.
 
-    `cycle_ns` is R_i and `longest_cycle_ns` R_max: the longest cycle in the hierarchy; a board outside it has its own.
+    `cycle_ns` is R_i and `longest_cycle_ns` R_max, see `longest_cycles`.
     `exchange_ns` (C) and `update_ns` (U) are what executor and planner spend on passing the plan. `within_cycles` is
     d; it and `plan_ns` (P) are None where there is no planner, or none whose plans the budget tells. `plan_within_ns`
     is what the config asks for: a new plan within that time.
@@ -76,10 +76,9 @@ class LevelTiming:
 def level_timings(config: RackConfig, layout: Layout, budgets: Mapping[str, Budget]) -> tuple[LevelTiming, ...]:
     """Return the timing of every level that has a budget, in the order of the config."""
     cycles = {name: layout.task(name).every * tick_ns(config) for name in config.board}
-    levels = hierarchy(config)
-    longest = max((cycles[name] for name in levels), default=0)
+    longest = {name: round(ticks * tick_ns(config)) for name, ticks in longest_cycles(config).items()}
     return tuple(
-        _timing(name, board, budgets[name], cycles[name], longest if name in levels else cycles[name])
+        _timing(name, board, budgets[name], cycles[name], longest[name])
         for name, board in config.board.items()
         if name in budgets
     )

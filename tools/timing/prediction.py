@@ -38,13 +38,38 @@ class Prediction:
             yield f"plan of {level}: used {plan_ms:g} ms after its planner's release"
 
 
-def hierarchy(config: RackConfig) -> tuple[str, ...]:
-    """Return the boards from the highest level to the lowest; empty when no board has one above it."""
+def chains(config: RackConfig) -> tuple[tuple[str, ...], ...]:
+    """Return every way from a highest board to a lowest: with a board a joint there is one for every joint."""
     lowest = [name for name, board in config.board.items() if board.above is not None and board.below is None]
-    chain = lowest[:1]
-    while chain and (above := config.board[chain[0]].above) is not None and above not in chain:
+    return tuple(_chain(config, name) for name in lowest)
+
+
+def _chain(config: RackConfig, lowest: str) -> tuple[str, ...]:
+    chain = [lowest]
+    while (above := config.board[chain[0]].above) is not None and above not in chain:
         chain.insert(0, above)
     return tuple(chain)
+
+
+def hierarchy(config: RackConfig) -> tuple[str, ...]:
+    """Return the boards of the chain that responds last, from the highest to the lowest; empty when there is none."""
+    return max(chains(config), key=lambda chain: response_ticks([config.every(name) for name in chain]), default=())
+
+
+def longest_cycles(config: RackConfig) -> dict[str, float]:
+    """Return R_max by board, in ticks: the longest cycle that a level may have.
+
+    With a goal for the response it is R_s / n (eq. 3.2); without one the longest cycle of all that are in one hierarchy
+    with the board. A board outside of all has its own.
+    """
+    found = {name: float(config.every(name)) for name in config.board}
+    ways, goal_ms = chains(config), config.timing.response_ms
+    for chain in ways if goal_ms is None else ():
+        together = {name for other in ways if other[0] == chain[0] for name in other}
+        found |= dict.fromkeys(chain, float(max(config.every(name) for name in together)))
+    for chain in sorted(ways, key=len) if goal_ms is not None else ():
+        found |= dict.fromkeys(chain, goal_ms / config.clock.period_ms / len(chain))
+    return found
 
 
 def response_ticks(cycles: list[int]) -> int:

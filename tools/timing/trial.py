@@ -16,7 +16,6 @@ from levels.timing.budget import Budget
 from levels.timing.response_time import load_of
 from levels.timing.tasks import TimedTask
 from tools.timing.level_timing import LevelTiming, level_timings
-from tools.timing.prediction import hierarchy
 from tools.timing.verdict import Verdict
 from tools.timing.verdicts import LOAD, context_switch_ns, level_verdicts, system_verdicts, verdicts
 
@@ -94,12 +93,10 @@ class Trial:
         That is quickly told; what it does to others on its core is not.
         """
         config, clock_ns = self.config, tick_ns(self.config)
-        cycles = [self.layout.task(name).every for name in hierarchy(config) if name != level.board]
-        if level.board in hierarchy(config):
-            cycles.insert(hierarchy(config).index(level.board), level.cycle_ns // clock_ns)
+        cycles = {task.name: task.every for task in self.layout.tasks} | {level.board: level.cycle_ns // clock_ns}
         old = {_key(verdict) for verdict in self.failing}
         own = level_verdicts(level, clock_ns, context_switch_ns(config), config.timing.small_share)
-        system = (verdict for verdict in system_verdicts(cycles, clock_ns) if _key(verdict) not in old)
+        system = (verdict for verdict in system_verdicts(config, cycles) if _key(verdict) not in old)
         return all(verdict.holds for verdict in chain(own, system))
 
     @property

@@ -12,14 +12,14 @@ from math import inf
 
 from backplane.layout import Layout
 from boards.config.schema import RackConfig
-from boards.config.timing import tick_ns, timed_tasks
+from boards.config.timing import NS_PER_MS, tick_ns, timed_tasks
 from levels.timing import equations
 from levels.timing.budget import Budget
 from levels.timing.relation import Relation
 from levels.timing.response_time import load_of, response_times
 from levels.timing.tasks import TimedTask
 from tools.timing.level_timing import LevelTiming, level_timings
-from tools.timing.prediction import hierarchy, response_ticks
+from tools.timing.prediction import chains, longest_cycles, response_ticks
 from tools.timing.verdict import Verdict
 
 SYSTEM = "system"
@@ -42,7 +42,7 @@ def verdicts(config: RackConfig, layout: Layout, budgets: Mapping[str, Budget]) 
     tasks = timed_tasks(config, layout, budgets)
     levels = level_timings(config, layout, budgets)
     found = chain(
-        system_verdicts([layout.task(name).every for name in hierarchy(config)], tick_ns(config)),
+        system_verdicts(config, {task.name: task.every for task in layout.tasks}),
         *(level_verdicts(level, tick_ns(config), switch_ns, small) for level in levels),
         _of_tasks(tasks, switch_ns),
         _of_cores(tasks, switch_ns),
@@ -57,16 +57,30 @@ def level_verdicts(level: LevelTiming, clock_ns: int, switch_ns: int, small: flo
     yield from _of_planner(level, switch_ns, small)
 
 
-def system_verdicts(cycles: Sequence[int], clock_ns: int) -> Iterator[Verdict]:
-    """Yield the verdicts on the system's response: `cycles` are those of its levels, highest first, in ticks."""
-    if not cycles:
-        return
-    cycles_ns = [cycle * clock_ns for cycle in cycles]
-    total = equations.system_responds(equations.system_response_ns((), cycles_ns), cycles_ns)
-    yield _judged("3.3", SYSTEM, total, "R_s = sum of R_i <= n R_max")
-    for way, order in (("command", cycles), ("status", cycles[::-1])):
-        relation = equations.system_responds(response_ticks(list(order)) * clock_ns, cycles_ns)
-        yield _judged("3.2", SYSTEM, relation, f"R_s of a {way} with its waits for the grid <= n R_max")
+def system_verdicts(config: RackConfig, cycles: Mapping[str, int]) -> Iterator[Verdict]:
+    """Yield the verdicts on the system's response: `cycles` are those of its boards, by name, in ticks."""
+    clock_ns, ways, goal_ms = tick_ns(config), chains(config), config.timing.response_ms
+    goal_ns = None if goal_ms is None else goal_ms * NS_PER_MS / config.clock.speed
+    for way in ways:
+        subject = SYSTEM if len(ways) == 1 else f"{SYSTEM}, {way[-1]}"
+        yield from _of_chain(subject, [cycles[name] * clock_ns for name in way], clock_ns, goal_ns)
+    if goal_ns is not None:
+        longest = longest_cycles(config)
+        for name in dict.fromkeys(chain(*ways)):
+            within = Relation(cycles[name] * clock_ns, "<=", round(longest[name] * clock_ns))
+            yield _judged("3.1", name, within, "R_i <= R_max = R_s / n")
+
+
+def _of_chain(subject: str, cycles_ns: Sequence[int], clock_ns: int, goal_ns: float | None) -> Iterator[Verdict]:
+    bound, meant = goal_ns, "timing.response_ms"
+    if bound is None:
+        bound, meant = equations.system_response_bound_ns(cycles_ns), "n R_max"
+    total = equations.system_response_ns((), cycles_ns)
+    yield _judged("3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {meant}")
+    for way, order in (("command", 1), ("status", -1)):
+        ticks = response_ticks([cycle // clock_ns for cycle in cycles_ns[::order]])
+        relation = Relation(ticks * clock_ns, "<=", bound)
+        yield _judged("3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {meant}")
 
 
 def context_switch_ns(config: RackConfig) -> int:
