@@ -81,9 +81,10 @@ def inject(
     """
     from tools.injecting.kinds import kinds_document, kinds_text
     from tools.injecting.live import LiveRack
+    from tools.live_table import terminal_width
 
     if is_list and rack is None:
-        print_json(kinds_document()) if as_json else print("\n".join(kinds_text()))
+        print_json(kinds_document()) if as_json else print("\n".join(kinds_text(terminal_width())))
         return
     needs_fault = not is_list and withdraw is None
     if rack is None or (needs_fault and (board is None or kind is None)):
@@ -92,7 +93,7 @@ def inject(
         raise Failure("--timeout is the bound of --wait; give both, or neither", 2)
     live = LiveRack(rack)
     if is_list:
-        print_json(live.faults()) if as_json else print("\n".join(live.text()))
+        print_json(live.faults()) if as_json else print("\n".join(live.text(terminal_width())))
         return
     if withdraw is not None:
         answer = live.withdraw(withdraw)

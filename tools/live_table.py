@@ -142,3 +142,15 @@ def _bar(progress: Progress, width: int) -> RenderableType:
     bar = ProgressBar(total=max(progress.moves, 1), completed=progress.moves_done, width=max(4, min(BAR, left)))
     row.add_row("task", bar, done, progress.state)
     return row
+
+
+def terminal_width() -> int | None:
+    """Return how many columns of characters stdout has; None where it is no terminal."""
+    found = Console()
+    return found.width if found.is_terminal else None
+
+
+def print_wrapped(text: str) -> None:
+    """Print text, on a terminal with long lines wrapped between words."""
+    terminal = console()
+    terminal.print(text, highlight=False, markup=False) if terminal.is_terminal else print(text)

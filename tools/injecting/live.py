@@ -85,8 +85,8 @@ class LiveRack:
         injected = self._table.staged((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
         return [self._document(entry) for entry in injected]
 
-    def text(self) -> Iterator[str]:
-        """Yield the faults that were injected so far, as a table."""
+    def text(self, width: int | None = None) -> Iterator[str]:
+        """Yield the faults that were injected so far, as a table that fits into `width`."""
         rows = [
             [
                 str(f["fault"]),
@@ -97,7 +97,7 @@ class LiveRack:
             ]
             for f in self.faults()
         ]
-        yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"], rows)
+        yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"], rows, width)
 
     def _fault(self, given: dict[str, Any]) -> FaultConfig:
         """Return the fault asked for, and fit for a rack that runs. Raises `ConfigError`, `Failure`."""

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from tools.holds import resume_command
 from tools.reporting.misses import counted
-from tools.text_table import fitting, is_number
+from tools.text_table import table
 
 Report = dict[str, Any]
 
@@ -46,17 +45,6 @@ class Grid:
         yield "|" + "|".join("-" * (width + 2) for width in widths) + "|"
         yield from (_row(row, widths) for row in self.rows)
 
-    def fitted(self, width: int) -> Table:
-        """Return it for a terminal of that width."""
-        kept = fitting(self.head, self.rows, width, self.dropped)
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        for at in kept:
-            is_right = all(is_number(row[at]) for row in self.rows)
-            table.add_column(self.head[at], justify="right" if is_right else "left", overflow="fold")
-        for row in self.rows:
-            table.add_row(*(row[at] for at in kept))
-        return table
-
 
 def markdown(report: Report) -> str:
     """Return report.md of a report."""
@@ -68,7 +56,8 @@ def show(report: Report, terminal: Console) -> None:
     """Print on a terminal as much of a report as its width permits."""
     for block in _blocks(report):
         if isinstance(block, Grid):
-            terminal.print(block.fitted(terminal.width), highlight=False, markup=False)
+            for line in table(block.head, block.rows, terminal.width, block.dropped):
+                terminal.print(line, highlight=False, markup=False)
         else:
             style = "bold" if block.startswith("#") else ""
             terminal.print(block.lstrip("# "), style=style, highlight=False, markup=False)
