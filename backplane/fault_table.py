@@ -125,6 +125,19 @@ class FaultTable:
             lock.close()
         return entry
 
+    def disarm(self, entry: FaultEntry) -> None:
+        """Have a fault that waits never come due; at the next tick the clock has seen it, and `free` may follow."""
+        # In this order: with no condition and a tick that has passed it would begin at once.
+        entry.words[Entry.FROM] = NEVER
+        entry.words[Entry.WHEN_BOX] = -1
+
+    def free(self, entry: FaultEntry) -> bool:
+        """Give the entry of a disarmed fault back; False when the clock had begun it before."""
+        if entry.stage != Stage.WAITING:
+            return False
+        entry.words[Entry.STAGE] = Stage.FREE
+        return True
+
     def active(self, task: str) -> list[FaultEntry]:
         """Return the active faults of a task; "clock" is the clock."""
         index = self._tasks[task]

@@ -20,6 +20,7 @@ EventKind = Literal[
     "miss",
     "reaction",
     "recovery",
+    "held",
 ]
 
 
@@ -29,7 +30,8 @@ class Event:
 
     What faults, detections, reactions and recoveries say to programs: `code`, an alarm's name in lower case, "begins"
     or "ends"; `fault`, its entry in the fault table (-1: none); `subject`, the mailbox, joint or task
-    concerned; `value`; `since`, the tick since which it holds. Of an operator's command `code` is what it says,
+    concerned; `value`; `since`, the tick since which it holds. Of a rack that is held and stands still `subject` is
+    the level. Of an operator's command `code` is what it says,
     `subject` the level and `value` the serial.
     """
 

@@ -48,6 +48,7 @@ def analyze(
     from tools.analysis.plot import plot
     from tools.analysis.text import text
     from tools.charting.progress import part_for
+    from tools.live_table import print_wrapped, terminal_width
     from tools.recording import Recording
 
     if response:
@@ -62,5 +63,8 @@ def analyze(
         told(0.9)
         (folder / "analysis.json").write_text(json.dumps(found, indent=2) + "\n")
         plot(analysis, folder / "residuals")
-    print_json(found) if as_json else print(f"{text(analysis)}\n\n{folder}/analysis.json, residuals.png, residuals.svg")
+    if as_json:
+        print_json(found)
+    else:
+        print_wrapped(f"{text(analysis, terminal_width())}\n\n{folder}/analysis.json, residuals.png, residuals.svg")
     sys.exit(0 if analysis.holds else 1)

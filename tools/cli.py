@@ -14,9 +14,11 @@ from tools.bench.command import bench
 from tools.campaign.command import campaign
 from tools.check import check
 from tools.clean import clean
-from tools.command import EXAMPLES, command
+from tools.command import EXAMPLES as COMMANDING
+from tools.command import command
 from tools.estop import estop
 from tools.gantt import gantt
+from tools.inject import EXAMPLES as INJECTING
 from tools.inject import inject
 from tools.injecting.kinds import KindsCommand
 from tools.list import list_racks
@@ -45,8 +47,8 @@ app.command("list")(list_racks)
 app.command()(status)
 app.command()(stop)
 app.command()(clean)
-app.command(epilog=EXAMPLES)(command)
-app.command(cls=KindsCommand)(inject)
+app.command(epilog=COMMANDING)(command)
+app.command(cls=KindsCommand, epilog=INJECTING)(inject)
 app.command()(estop)
 app.command()(record)
 app.command()(replay)

@@ -27,8 +27,30 @@ When = Annotated[
 ]
 Phase = Annotated[str | None, typer.Option(metavar="X", help="when in its first tick it strikes, 0 to below 1")]
 Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of what is random in it")]
-Wait = Annotated[bool, typer.Option("--wait", help="wait until it is over")]
+Wait = Annotated[bool, typer.Option("--wait", help="wait until it is over, or the run is")]
+Timeout = Annotated[
+    float | None, typer.Option(metavar="S", min=0.0, help="with --wait: wall-clock seconds, then exit status 1")
+]
+Withdraw = Annotated[
+    int | None, typer.Option(metavar="NO", help="take back a fault that still waits; --list shows its number")
+]
 List = Annotated[bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")]
+
+EXAMPLES = """\b
+Examples:
+
+  rack inject nasrem servo kill
+
+  rack inject nasrem servo sensor-bias joint=2 size=0.05 --for 0.2s
+
+  rack inject nasrem primitive mute --when "task.status.action == 2" --for 1s
+
+  rack inject nasrem servo drop --tick 4000 --cycles 40 --wait --timeout 60
+
+  rack inject nasrem --list
+
+  rack inject nasrem --withdraw 0
+"""
 
 
 def inject(
@@ -44,28 +66,41 @@ def inject(
     phase: Phase = None,
     seed: Seed = None,
     wait: Wait = False,
+    timeout: Timeout = None,
+    withdraw: Withdraw = None,
     is_list: List = False,
     as_json: Json = False,
 ) -> None:
     """Inject a fault into a running rack.
 
-    It begins at the next tick, and lasts until the end of the run where nothing else is said.
+    It begins at the next tick and lasts to the end of the run, unless --tick, --when, --for or --cycles say otherwise.
+    With --tick or --when the command arms the fault and returns at once; with --wait it returns when the fault is over.
+
+    Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or --timeout has passed;
+    2 usage.
     """
     from tools.injecting.kinds import kinds_document, kinds_text
     from tools.injecting.live import LiveRack
+    from tools.live_table import terminal_width
 
     if is_list and rack is None:
-        print_json(kinds_document()) if as_json else print("\n".join(kinds_text()))
+        print_json(kinds_document()) if as_json else print("\n".join(kinds_text(terminal_width())))
         return
-    if rack is None or (not is_list and (board is None or kind is None)):
+    needs_fault = not is_list and withdraw is None
+    if rack is None or (needs_fault and (board is None or kind is None)):
         raise Failure("RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list", 2)
+    if timeout is not None and not wait:
+        raise Failure("--timeout is the bound of --wait; give both, or neither", 2)
     live = LiveRack(rack)
     if is_list:
-        print_json(live.faults()) if as_json else print("\n".join(live.text()))
+        print_json(live.faults()) if as_json else print("\n".join(live.text(terminal_width())))
         return
-    given: dict[str, Any] = {"board": board, "kind": kind, "for": lasts, "cycles": cycles, "mailbox": mailbox}
-    given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
-    answer = live.inject({**given, **_named(parameters or [])}, wait)
+    if withdraw is not None:
+        answer = live.withdraw(withdraw)
+    else:
+        given: dict[str, Any] = {"board": board, "kind": kind, "for": lasts, "cycles": cycles, "mailbox": mailbox}
+        given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
+        answer = live.inject({**given, **_named(parameters or [])}, wait, timeout)
     print_json(answer) if as_json else print(answer["told"])
 
 

@@ -1,41 +1,82 @@
-"""A snapshot as a table: one line a board, and a progress bar of the task."""
+"""A snapshot as a table that fits the terminal: one line a task, what holds the rack, and a progress bar."""
 
 from __future__ import annotations
 
-from rich.console import Console, Group, RenderableType
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from tools.snapshot import LOST, Progress, Snapshot, TaskRow
+from tools.text_table import fitting
 
-COLUMNS = (
-    *("slot", "task", "core", "sched", "Hz", "tick", "cycles", "missed", "skipped", "restarts"),
-    *("exec ms", "late ms", "state"),
-)
-"""Headings; `exec` and `late` are the longest since the last look."""
+COLUMNS: dict[str, Callable[[TaskRow], str]] = {
+    "slot": lambda row: str(row.slot),
+    "task": lambda row: row.task,
+    "core": lambda row: str(row.core),
+    "sched": lambda row: f"FIFO {row.priority}" if row.priority else "other",
+    "Hz": lambda row: f"{row.rate_hz:g}",
+    "tick": lambda row: str(row.tick),
+    "cycles": lambda row: str(row.cycles),
+    "missed": lambda row: str(row.missed),
+    "skipped": lambda row: str(row.skipped),
+    "restarts": lambda row: str(row.restarts),
+    "exec ms": lambda row: _ms(row.exec_ms),
+    "late ms": lambda row: _ms(row.lateness_ms),
+    "state": lambda row: row.state,
+}
+"""Columns by heading; `exec` and `late` are the longest since the last look."""
+DROPPED = ("tick", "sched", "slot", "cycles", "Hz", "restarts", "core", "exec ms", "late ms", "skipped")
+"""Columns that a narrow terminal does without, the first first."""
 TEXTS = ("task", "sched", "state")
-STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green"}
+STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green", "holding": "yellow"}
+COUNTED = {"missed": "red", "skipped": "red", "restarts": "yellow"}
+"""Colours of counts that are not 0."""
+HELD = "bold yellow"
 NOTHING = "none"
 """The demand on an arm that is free to move."""
-NARROWEST = 120
-"""Columns of characters that the table takes where no terminal says otherwise."""
+PIPE_WIDTH = 120
+"""Columns of characters where no terminal says otherwise."""
+BAR = 40
+"""Columns of characters of the progress bar, at most."""
 
 
-def table_of(snapshot: Snapshot) -> RenderableType:
-    """Return the whole view of a rack: head line, boards, what they complain of, active faults, progress."""
-    reasons = [Text(f"{row.task}: {row.reason}", style="red") for row in snapshot.tasks if row.reason]
-    faults = [Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults]
-    parts: list[RenderableType] = [_head(snapshot), _boards(snapshot.tasks), *reasons, *faults]
-    if snapshot.progress is not None:
-        parts.append(_bar(snapshot.progress))
-    return Group(*parts)
+@dataclass(frozen=True)
+class _View:
+    """A snapshot that knows its width only when it is drawn."""
+
+    snapshot: Snapshot
+
+    def __rich_console__(self, terminal: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
+        """Yield what rich draws, as wide as the terminal permits."""
+        snapshot = self.snapshot
+        yield _head(snapshot)
+        yield _tasks(snapshot.tasks, options.max_width)
+        yield from (Text(line, style="red") for line in _reasons(snapshot))
+        yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
+        for hold in snapshot.holds:
+            lines = (
+                [hold.line]
+                if len(hold.line) <= options.max_width
+                else [hold.parts[0], *map("  {}".format, hold.parts[1:])]
+            )
+            yield Text("\n".join(lines), style=HELD)
+        if snapshot.progress is not None:
+            yield _bar(snapshot.progress, options.max_width)
+
+
+def table_of(snapshot: Snapshot) -> ConsoleRenderable:
+    """Return the whole view of a rack: head line, tasks, what they complain of, active faults, holds, progress."""
+    return _View(snapshot)
 
 
 def console() -> Console:
     """Return the console for tables on stdout."""
     found = Console()
-    return found if found.is_terminal else Console(width=NARROWEST)
+    return found if found.is_terminal else Console(width=PIPE_WIDTH)
 
 
 def line_of(snapshot: Snapshot) -> str:
@@ -47,14 +88,14 @@ def line_of(snapshot: Snapshot) -> str:
     if at is not None:
         line += f"  task {at.state}, action {at.actions_done}/{at.actions}, move {at.moves_done}/{at.moves}"
     lost = [f"{row.task} {LOST}" for row in snapshot.tasks if row.state == LOST]
-    reasons = [f"{row.task}: {row.reason}" for row in snapshot.tasks if row.reason]
-    return "  ".join([line, *snapshot.lines, *_demanded(snapshot), *lost, *reasons])
+    holds = [hold.line for hold in snapshot.holds]
+    return "  ".join([line, *snapshot.lines, *_demanded(snapshot), *lost, *_reasons(snapshot), *holds])
 
 
 def _head(snapshot: Snapshot) -> Text:
     line = Text(f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}")
     if snapshot.clock_skipped:
-        line.append(f", clock left out {snapshot.clock_skipped}", style="yellow")
+        line.append(f", clock skipped {snapshot.clock_skipped} ticks", style="yellow")
     for name in [*snapshot.lines, *_demanded(snapshot)]:
         line.append(f"  {name}", style="bold red")
     return line
@@ -65,40 +106,51 @@ def _demanded(snapshot: Snapshot) -> list[str]:
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NOTHING else []
 
 
-def _boards(rows: tuple[TaskRow, ...]) -> Table:
+def _reasons(snapshot: Snapshot) -> list[str]:
+    """Return what tasks complain of; a hold gives its reason itself."""
+    held = {hold.level for hold in snapshot.holds}
+    rows = [row for row in snapshot.tasks if row.reason and not (row.state == "holding" and row.task in held)]
+    return [f"{row.task}: {row.reason}" for row in rows]
+
+
+def _tasks(rows: tuple[TaskRow, ...], width: int) -> Table:
+    head = list(COLUMNS)
+    cells = [[cell(row) for cell in COLUMNS.values()] for row in rows]
+    kept = fitting(head, cells, width, DROPPED)
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in COLUMNS:
-        table.add_column(name, justify="left" if name in TEXTS else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*_cells(row))
+    for at in kept:
+        table.add_column(head[at], justify="left" if head[at] in TEXTS else "right", no_wrap=True)
+    for texts in cells:
+        table.add_row(*(Text(texts[at], style=_style(head[at], texts[at])) for at in kept))
     return table
 
 
-def _cells(row: TaskRow) -> list[str | Text]:
-    return [
-        str(row.slot),
-        row.task,
-        str(row.core),
-        f"FIFO {row.priority}" if row.priority else "other",
-        f"{row.rate_hz:g}",
-        str(row.tick),
-        str(row.cycles),
-        Text(str(row.missed), style="red" if row.missed else ""),
-        Text(str(row.skipped), style="red" if row.skipped else ""),
-        Text(str(row.restarts), style="yellow" if row.restarts else ""),
-        _ms(row.exec_ms),
-        _ms(row.lateness_ms),
-        Text(row.state, style=STATES.get(row.state, "")),
-    ]
+def _style(column: str, text: str) -> str:
+    if column == "state":
+        return STATES.get(text, "")
+    return COUNTED.get(column, "") if text != "0" else ""
 
 
 def _ms(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _bar(progress: Progress) -> RenderableType:
-    row = Table.grid(padding=(0, 1))
-    bar = ProgressBar(total=max(progress.moves, 1), completed=progress.moves_done, width=40)
+def _bar(progress: Progress, width: int) -> RenderableType:
     done = f"action {progress.actions_done}/{progress.actions}, move {progress.moves_done}/{progress.moves}"
+    left = width - len(f"task  {done} {progress.state}") - 1
+    row = Table.grid(padding=(0, 1))
+    bar = ProgressBar(total=max(progress.moves, 1), completed=progress.moves_done, width=max(4, min(BAR, left)))
     row.add_row("task", bar, done, progress.state)
     return row
+
+
+def terminal_width() -> int | None:
+    """Return how many columns of characters stdout has; None where it is no terminal."""
+    found = Console()
+    return found.width if found.is_terminal else None
+
+
+def print_wrapped(text: str) -> None:
+    """Print text, on a terminal with long lines wrapped between words."""
+    terminal = console()
+    terminal.print(text, highlight=False, markup=False) if terminal.is_terminal else print(text)

@@ -98,6 +98,11 @@ class Recording:
             return np.empty((0, *shape))
         return np.concatenate(values).reshape(-1, *shape)
 
+    def fields(self, mailbox: str) -> set[str]:
+        """Return the fields of a mailbox's messages."""
+        names = [name for name in self._signals.schema_arrow.names if name.startswith(f"{mailbox}.")]
+        return {name.removeprefix(f"{mailbox}.") for name in names}
+
     @cached_property
     def mailboxes(self) -> list[str]:
         """The mailboxes that were written to."""

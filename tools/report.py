@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -26,5 +26,18 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
     from tools.reporting.report import write_report
 
     data, text = write_report(run, against)
-    print_json(data) if as_json else print(text)
+    print_report(data, text, as_json)
     sys.exit(0 if against is None or data["against"]["explained"] else 1)
+
+
+def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print a report as one JSON document; on a terminal what fits its width; elsewhere all of report.md."""
+    from tools.live_table import console
+    from tools.reporting.markdown import show
+
+    if as_json:
+        print_json(data)
+    elif (terminal := console()).is_terminal:
+        show(data, terminal)
+    else:
+        print(text)

@@ -41,6 +41,7 @@ def run(
     from boards.config import load
     from tools.display import display_for
     from tools.folders import folder_of
+    from tools.report import print_report
     from tools.running import run_rack
 
     if view and no_record:
@@ -52,13 +53,14 @@ def run(
     folder = None if no_record else folder_of(out, found.name)
     with display_for(silent=as_json) as display:
         result = run_rack(found, seconds, folder, display, view)
-    if folder is None:
-        report, text = result.document(), result.text()
-    else:
-        from tools.reporting.report import write_report
+    from tools.reporting.report import unrecorded, write_report
 
-        report, text = write_report(folder)
-    print_json(report) if as_json else print(text)
+    if folder is not None:
+        print_report(*write_report(folder), as_json)
+    elif as_json:
+        print_json(unrecorded(found, result.document()))
+    else:
+        print(result.text())
     if not result.worked:
         # Last, and by itself: whoever looks only at the end, or only at stderr, sees why.
         print(result.failure(), file=sys.stderr)

@@ -21,6 +21,7 @@ from tools.answer import Failure
 from tools.campaign.ending import Strike, strikes
 from tools.display import Display
 from tools.event_log import EventLog
+from tools.holds import Standstill
 from tools.recorder.process import RecorderProcess
 from tools.snapshot import Viewer
 from tools.viewer.window import Window, free_port, url
@@ -92,7 +93,7 @@ def run_rack(
                     raise Failure(recorder.finish())
                 sources = [recorder.told, *([] if port is None else [_window(port)])]
             started = time.monotonic()
-            outcome = _watch(rack, seconds, display, lambda: _hear(sources, rack.segment, log))
+            outcome = _watch(rack, seconds, display, log, lambda: _hear(sources, rack.segment, log))
             wall_s, segment = time.monotonic() - started, rack.segment
         recording = recorder.finish() if recorder is not None else "none"
         _hear(sources, segment, log)
@@ -111,12 +112,14 @@ def run_rack(
     return result
 
 
-def _watch(rack: Rack, seconds: float | None, display: Display, hear: Callable[[], None]) -> Outcome:
+def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, hear: Callable[[], None]) -> Outcome:
     with _stopped_by_signals(rack):
         rack.start(seconds)
-        viewer = Viewer(rack.segment)
+        viewer, standstill = Viewer(rack.segment), Standstill(rack.segment)
         while rack.watch(display.period_s):
-            display.show(viewer.look())
+            display.show(seen := viewer.look())
+            for event in standstill.look(seen.holds):
+                log.add(event)
             hear()
         display.show(viewer.look())
     if rack.outcome is None:

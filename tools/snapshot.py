@@ -14,6 +14,7 @@ from backplane.segment import Segment
 from backplane.trace import trace_ring
 from backplane.words import Block, Box, Demand, Run, System, TaskState
 from boards.faults.text import describe
+from tools.holds import Hold, Holds
 
 LOST = "lost"
 """State of a task that is dead or hangs, until its new process has rejoined."""
@@ -61,7 +62,8 @@ class Progress:
 class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines that are asserted.
 
-    `demand` is what the safety of the rack asks of the arm, "none" as a rule; `faults` are those that are active.
+    `demand` is what the safety of the rack asks of the arm, "none" as a rule; `faults` are those that are active;
+    `holds` is what keeps levels, or the arm, from their work.
     """
 
     rack: str
@@ -74,6 +76,7 @@ class Snapshot:
     faults: tuple[str, ...]
     tasks: tuple[TaskRow, ...]
     progress: Progress | None
+    holds: tuple[Hold, ...] = ()
 
 
 class Viewer:
@@ -83,6 +86,7 @@ class Viewer:
         self._segment = segment
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
+        self._holds = Holds(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
@@ -110,6 +114,7 @@ class Viewer:
             faults=tuple(describe(fault, layout, self._joints) for fault in self._faults.staged((Stage.ACTIVE,))),
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
+            holds=self._holds.look(),
         )
 
     def _asserted(self) -> list[str]:

@@ -29,6 +29,14 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
     return mailboxes[mailbox.name], _field(found[2], mailbox), _value(found[3], _fields(mailbox)[found[2]])
 
 
+def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
+    """Return a condition as it is written: the inverse of `condition`."""
+    mailbox = layout.mailboxes[when[0]]
+    field = mailbox.fields[when[1]]
+    names = {int(item): item.name.lower() for item in ENUMS.get(field.unit, ())}
+    return f"{mailbox.name}.{field.name} == {names.get(when[2], when[2])}"
+
+
 def _field(name: str, mailbox: MailboxSpec) -> int:
     fields = _fields(mailbox)
     if name not in fields:

@@ -84,6 +84,15 @@ def test_run_prints_one_json_document_and_nothing_else(small: Path, rack_name: s
     ]
     again = rack("report", tmp_path / "run", "--json")
     assert json.loads(again.stdout) == report
+    # The same document without a recording: what only a recording knows is null.
+    bare = rack("run", small, "--seconds", 1, "--set", f"name={rack_name}", "--no-record", "--json")
+    unrecorded = json.loads(bare.stdout)
+    assert (bare.returncode, bare.stderr) == (0, "")
+    assert unrecorded.keys() == report.keys()
+    for key in ("rack", "mode", "clock_ms", "worked", "outcome", "digest", "simulated_s", "missed", "skipped"):
+        assert unrecorded[key] == report[key], key
+    assert (unrecorded["folder"], unrecorded["misses"], unrecorded["recording"]) == (None, None, "none")
+    assert unrecorded["tasks"]["lower"].keys() <= report["tasks"]["lower"].keys()
 
 
 def test_a_config_with_mistakes_is_refused_before_anything_starts(small: Path, rack_name: str, tmp_path: Path) -> None:

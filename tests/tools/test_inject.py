@@ -87,6 +87,34 @@ def test_a_fault_can_wait_for_a_tick_and_for_a_condition(running: str) -> None:
     assert rack("inject", running, "wave", "drop", "--when", condition, "--for", "5ms").returncode == 0
 
 
+NEVER = ("watch", "mute", "--when", "watch.status.state == error")
+
+
+def test_a_fault_with_a_condition_is_armed_and_can_be_withdrawn(running: str) -> None:
+    done = rack("inject", running, *NEVER, "--json")
+    answer = json.loads(done.stdout)
+    assert (done.returncode, answer["stage"]) == (0, "waiting")
+    number = answer["fault"]
+    assert answer["waits_for"] == "watch.status.state == error"
+    armed = f"armed, waits for {answer['waits_for']}; to withdraw it: rack inject {running} --withdraw {number}"
+    assert answer["told"] == f"mute of watch: {armed}"
+    entry = FaultTable(Segment.attach(running)).entries[number]
+    assert rack("inject", running, "--withdraw", str(number)).stdout == "mute of watch: withdrawn\n"
+    assert entry.stage == Stage.FREE
+    again = rack("inject", running, "--withdraw", str(number))
+    assert again.returncode == 2
+    assert again.stderr.startswith(f"fault {number} is not waiting; waiting: ")
+
+
+def test_waiting_ends_at_its_time_out_and_says_for_what_it_was(running: str) -> None:
+    done = rack("inject", running, *NEVER, "--wait", "--timeout", "0.2")
+    assert (done.returncode, done.stdout) == (1, "")
+    at_once, ended = done.stderr.splitlines()
+    assert at_once.startswith("mute of watch: armed, waits for watch.status.state == error; to withdraw it: ")
+    assert ended == f"timed out after 0.2 s: {at_once}"
+    rack("inject", running, "--withdraw", at_once.split()[-1])
+
+
 def test_the_faults_of_a_rack_are_listed(running: str) -> None:
     rack("inject", running, "wave", "babble", "--for", "20ms", "writes=5")
     listed = json.loads(rack("inject", running, "--list", "--json").stdout)
@@ -102,6 +130,7 @@ def test_the_faults_of_a_rack_are_listed(running: str) -> None:
         (["wave", "kil"], f'kind = "kil": no such kind; kinds: {", ".join(kind.name for kind in KINDS)}'),
         (["wave", "drop", "size=1"], "size = 1: drop has no such parameter; parameters: probability"),
         (["wave", "drop", "probability"], "'probability': a parameter must be key=value, as in size=0.05"),
+        (["wave", "kill", "--timeout", "1"], "--timeout is the bound of --wait; give both, or neither"),
         (["wave"], "RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list"),
     ],
     ids=lambda given: " ".join(given) if isinstance(given, list) else "",

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from backplane.layout import TaskSpec
 from backplane.trace import RECORD
-from boards.config import load
+from boards.config import load, loads
+from tests.boards.told_racks import TOLD, commands
+from tests.conftest import SMALL
 from tools.display import SilentDisplay
-from tools.reporting.report import write_report
+from tools.recording import Recording
+from tools.reporting.markdown import markdown, show
+from tools.reporting.report import report_of, write_report
+from tools.reporting.response import system_response
 from tools.reporting.timing import plan_age_ms, task_times
 from tools.running import run_rack
 from tools.timing.prediction import response_ticks
 
 TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
 MS = 1_000_000
+PARTS = ("min", "p50", "p99", "p99_9", "max")
 
 
 def cycle(tick: int, late: float, read: float, process: float, write: float) -> tuple[int, ...]:
@@ -65,10 +75,18 @@ def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(cycles:
     assert response_ticks(cycles) == ticks
 
 
-def test_measured_response_of_a_run_meets_its_prediction(small: Path, rack_name: str, tmp_path: Path) -> None:
-    config = load(small, [f"name={rack_name}", "board.upper.rate_hz=10", "board.lower.rate_hz=80"])
-    result = run_rack(config, 5.0, tmp_path / "run", SilentDisplay())
-    report, text = write_report(tmp_path / "run")
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in lockstep of two levels, of 40 and 5 ticks."""
+    path = tmp_path_factory.mktemp("response")
+    (path / "small.toml").write_text(SMALL)
+    settings = [f"name=test-response-{os.getpid()}", "board.upper.rate_hz=10", "board.lower.rate_hz=80"]
+    run_rack(load(path / "small.toml", settings), 5.0, path / "run", SilentDisplay())
+    return path / "run"
+
+
+def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:
+    report, text = write_report(folder)
     response = report["system_response"]
     assert response["levels"] == ["upper", "lower"]
     # 40 and 5 ticks: a command takes both cycles, a status waits for up to 35 ticks more.
@@ -76,7 +94,105 @@ def test_measured_response_of_a_run_meets_its_prediction(small: Path, rack_name:
     assert response["command"]["measured_ms"]["max"] == 45 * 2.5
     assert response["status"]["bound_ms"] == 80 * 2.5
     assert response["status"]["measured_ms"]["max"] == 80 * 2.5
-    assert report["digest"] == result.outcome.digest
+    assert [response[way]["holds"] for way in ("command", "status")] == [True, True]
+    assert report["digest"] in text
     assert report["tasks"]["lower"]["cycles"] == 400
-    assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
-    assert result.outcome.digest in text
+    assert json.loads((folder / "report.json").read_text()) == report
+
+
+class Cut(Recording):
+    """A recording without ten of the commands; `lost` says whether it is known to lack them."""
+
+    lost: ClassVar[dict[str, int]] = {"upper.command": 10}
+
+    def signal(self, mailbox: str, field: str) -> np.ndarray:
+        values = super().signal(mailbox, field)
+        return np.delete(values, slice(20, 30), axis=0) if mailbox == "upper.command" else values
+
+
+class Silent(Cut):
+    """A run in which those commands were never written."""
+
+    lost: ClassVar[dict[str, int]] = {}
+
+
+def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(folder: Path) -> None:
+    way = report_of(Cut(folder))["system_response"]["command"]
+    assert (way["holds"], way["beyond"], way["unseen"]) == (True, [], 1)
+    assert way["measured_ms"]["max"] == way["bound_ms"]
+
+
+def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path) -> None:
+    recording = Silent(folder)
+    recording.ended["faults"] = [{"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}]
+    response = system_response(recording, loads(recording.config), recording.layout)
+    assert response is not None
+    (beyond,) = response["command"]["beyond"]
+    assert response["command"]["holds"] is False
+    assert beyond == {"tick": 19 * 40, "ms": (45 + 10 * 40) * 2.5, "delayed_by": ["fault: mute of upper"]}
+    text = markdown(write_report(folder)[0] | {"system_response": response})
+    assert "FAILS" in next(line for line in text.splitlines() if line.startswith("| command, down"))
+    assert "- 1112.5 ms from tick 760: fault: mute of upper" in text.splitlines()
+
+
+def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -> None:
+    report, text = write_report(folder)
+    for task in report["tasks"].values():
+        times = ("lateness_ms", "residual_ms", "alpha_ms", "deviation_ms", "largest_gap_ms")
+        assert {task[name] for name in times} == {None}
+        assert task["execution_ms"]["max"] > 0
+    assert "there are no deadlines" in text
+    assert not {"late", "alpha", "residual min"} & set(text.replace("|", " ").split())
+    realtime = markdown({**report, "mode": "realtime"})
+    assert "| residual min |" in realtime
+
+
+def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folder: Path) -> None:
+    late = {"task": "lower", "tick": 5, "what": "late", "count": 1, "started_ms": 0.1, "took_ms": 3.0}
+    skipped = {"task": "lower", "tick": 10, "what": "skipped", "count": 3}
+    report = write_report(folder)[0] | {"misses": [late, skipped], "missed": 1, "skipped": 3}
+    lines = markdown(report).splitlines()
+    assert "## Missed and skipped cycles: 1 and 3" in lines
+    assert "The tasks counted" not in markdown(report)
+    fewer = markdown({**report, "missed": 2, "skipped": 7})
+    assert "The tasks counted 2 and 7; the recording holds no more than these." in fewer
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: int) -> None:
+    report = {**write_report(folder)[0], "mode": "realtime"}
+    task = {**report["tasks"]["lower"], **dict.fromkeys(("lateness_ms", "residual_ms"), dict.fromkeys(PARTS, 1234.567))}
+    report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
+    terminal = Console(width=width, record=True, file=io.StringIO())
+    show(report, terminal)
+    lines = terminal.export_text().splitlines()
+    assert max(map(len, lines)) <= width
+    rows = [line.split() for line in lines if line.startswith("elemental_move.planner")]
+    head = next(line for line in lines if line.startswith("task ") and "missed" in line)
+    assert len(rows) == 1
+    assert "residual min" in head
+    assert lines[-1] == f"all columns: {folder}/report.md; all data: report.json" or width == 80
+    assert max(map(len, markdown(report).splitlines())) > 120
+
+
+def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, tmp_path: Path) -> None:
+    (tmp_path / "told.toml").write_text(TOLD)
+    told = commands(
+        "level='upper', what='hold', tick=101",
+        "level='upper', what='resume', tick=203",
+        "level='lower', what='hold', tick=301",
+    )
+    run_rack(load(tmp_path / "told.toml", [f"name={rack_name}", told]), 1.0, tmp_path / "run", SilentDisplay())
+    report, text = write_report(tmp_path / "run")
+    assert report["holds"] == [
+        {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
+        {"level": "lower", "by": "operator", "why": "hold", "since_s": 0.755, "until_s": None, "lasted_s": 0.2425},
+    ]
+    assert "## Held: 2 times" in text.splitlines()
+    assert f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it." in text.splitlines()
+
+
+def test_the_reason_that_ended_a_run_is_its_headline(folder: Path) -> None:
+    why = "nothing has moved for 30 s: elemental_move holds"
+    outcome = {"cause": "task refused", "reason": why, "faults": []}
+    assert markdown(write_report(folder)[0] | {"outcome": outcome}).splitlines()[0].endswith(f": task refused: {why}")

@@ -9,13 +9,18 @@ from rich.console import Console
 
 from boards.events import Event
 from tools.display import PlainDisplay
-from tools.live_table import line_of, table_of
+from tools.holds import Hold
+from tools.live_table import COLUMNS, line_of, table_of
 from tools.snapshot import Progress, Snapshot, TaskRow
 
 ROW = TaskRow("servo", 2, 1, 80, 400.0, "executing", 1200, 1201, 0, 3, 4, 1, 0.25, None, "")
 PLANNER = replace(ROW, task="servo.planner", priority=0, missed=0, skipped=0, lateness_ms=1.5)
 PROGRESS = Progress(5, 25, 1, 4, "executing", "")
 SNAPSHOT = Snapshot("demo", "running", 1200, 3.0, 0, (), "none", (), (ROW, PLANNER), PROGRESS)
+
+
+MOVE = replace(PLANNER, task="elemental_move.planner", exec_ms=1027.97, lateness_ms=1969.67, state="executing")
+HOLD = Hold("task", 15268, 38.17, "diverted by the operator (goto home)", "rack command a-rack-of-mine task resume")
 
 
 def shown(snapshot: Snapshot, width: int) -> str:
@@ -68,3 +73,30 @@ def test_a_display_tells_the_course_of_a_fault_and_leaves_misses_to_the_table(
     display.tell(Event(0, 8, "miss", "clock", "'servo' has not finished", "late"))
     display.tell(Event(0, -1, "printed", "", "hello"))
     assert capsys.readouterr().out == "tick 7 fault: servo: kill begins\nprinted: hello\n"
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 120, 200])
+def test_the_table_has_as_many_columns_as_fit_and_cuts_none(width: int) -> None:
+    lines = shown(replace(SNAPSHOT, tasks=(ROW, PLANNER, MOVE)), width).splitlines()
+    assert max(map(len, lines)) <= width
+    assert "\N{HORIZONTAL ELLIPSIS}" not in "".join(lines)
+    head = next(line for line in lines if "task " in line and "state" in line)
+    assert {"task", "missed", "state"} <= set(head.split())
+    assert next(line for line in lines if MOVE.task in line).split()[-1] == "executing"
+    assert lines[-1].endswith("action 1/4, move 5/25 executing")
+    if width >= 120:
+        assert head.split() == " ".join(COLUMNS).split()
+
+
+def test_what_holds_the_rack_is_shown_with_a_command_that_is_not_torn() -> None:
+    snapshot = replace(SNAPSHOT, holds=(HOLD,))
+    narrow, wide = shown(snapshot, 80).splitlines(), shown(snapshot, 160).splitlines()
+    assert "  to release: rack command a-rack-of-mine task resume" in (line.rstrip() for line in narrow)
+    assert HOLD.line in (line.rstrip() for line in wide)
+    assert line_of(snapshot).endswith(HOLD.line)
+
+
+def test_a_reason_that_a_hold_gives_is_not_given_twice() -> None:
+    row = replace(ROW, task="task", state="holding", reason="held by the operator")
+    assert shown(replace(SNAPSHOT, tasks=(row,), holds=(HOLD,)), 160).count("by the operator") == 1
+    assert "task: held by the operator" in shown(replace(SNAPSHOT, tasks=(row,)), 160)

@@ -20,35 +20,41 @@ SHOWN = 10
 """Cycles that broke an equation which the text shows; the document has them all."""
 MS = 1e-6
 LEVELS = ["level", "", "R_i", "t_exec", "C", "R", "W", "t_comm", "t_residual", "t_plan", "d"]
-TASKS = [
-    *("task", "cycles", "missed", "skipped", "deviation", "beside", "late p50", "p99", "p99.9", "max"),
-    *("response p99", "max", "of", "largest gap"),
+BY_THE_CLOCK = [
+    *("late p50", "late p99", "late p99.9", "late max", "response p99", "response max", "of", "largest gap"),
 ]
+TASKS = ["task", "cycles", "missed", "skipped", "deviation", "overhead", *BY_THE_CLOCK]
+TASKS_DROPPED = ("late p99.9", "overhead", "late p50", "deviation", "largest gap", "cycles", "response p99", "late p99")
+"""Columns that a narrow terminal does without, the first first."""
+EQUATIONS = ["eq.", "of", "predicted", "holds", "measured", "margin", "held", "", "meaning"]
+EQUATIONS_DROPPED = ("meaning", "margin", "predicted", "holds")
 
 
-def text(analysis: Analysis) -> str:
-    """Return everything that fits on a screen or two."""
-    return "\n".join(_lines(analysis))
+def text(analysis: Analysis, width: int | None = None) -> str:
+    """Return everything that fits on a screen or two, its tables into `width`."""
+    return "\n".join(_lines(analysis, width))
 
 
-def _lines(analysis: Analysis) -> Iterator[str]:
+def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
     yield from _head(analysis)
     yield from (
         "",
         f"Levels, processor time in ms, {worst_words(analysis.percentile)}; t_residual is alpha of eq. 3.6:",
     )
-    yield from table(LEVELS, list(_level_rows(analysis)))
+    yield from table(LEVELS, list(_level_rows(analysis)), width, ("C", "R", "W", "d"))
     yield ""
     yield from (f"{name}: {summary(analysis, name)}" for name in analysis.config.board)
     yield ""
-    yield "Tasks, wall clock in ms. Deviation: standard deviation of the residual from cycle to cycle. Beside: what a"
-    yield "cycle takes of the processor beside its parts, for waking up and closing it; 2 t_cs stand for that:"
-    yield from table(TASKS, [_task_row(name, cycles, analysis) for name, cycles in analysis.cycles.items()])
-    yield from ("", "Equations, in ms, predicted from the budgets and measured:")
-    yield from table(
-        ["eq.", "of", "predicted", "holds", "measured", "margin", "holds", "", "meaning"],
-        list(map(_pair_row, analysis.pairs)),
+    yield (
+        "Tasks, wall clock in ms. Deviation: standard deviation of the residual from cycle to cycle. Overhead: "
+        "processor time that a cycle takes besides its parts, to wake up and to close it; 2 t_cs stand for that:"
     )
+    rows = [_task_row(name, cycles, analysis) for name, cycles in analysis.cycles.items()]
+    # In lockstep nothing is late, and nothing answers within a time.
+    shown = len(TASKS) - len(BY_THE_CLOCK) if analysis.model.is_lockstep else len(TASKS)
+    yield from table(TASKS[:shown], [row[:shown] for row in rows], width, TASKS_DROPPED)
+    yield from ("", "Equations, in ms, predicted from the budgets and measured:")
+    yield from table(EQUATIONS, list(map(_pair_row, analysis.pairs)), width, EQUATIONS_DROPPED)
     yield from _broken_cycles(analysis)
 
 

@@ -16,15 +16,17 @@ class KindsCommand(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
-        return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text()])
+        from tools.live_table import terminal_width
+
+        return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text(terminal_width())])
 
 
-def kinds_text() -> Iterator[str]:
-    """Yield the kinds as a table, and their parameters as another."""
+def kinds_text(width: int | None = None) -> Iterator[str]:
+    """Yield the kinds as a table, and their parameters as another; with a width they fit into it."""
     from boards.faults.kinds import KINDS
 
     rows = [[kind.name, kind.means, kind.bound, _remarks(kind.realtime, kind.once)] for kind in KINDS]
-    yield from table(["kind", "what happens", "found within", ""], rows)
+    yield from table(["kind", "what happens", "found within", ""], rows, width)
     yield ""
     numbers = [
         [
@@ -38,7 +40,7 @@ def kinds_text() -> Iterator[str]:
         for kind in KINDS
         for p in kind.parameters
     ]
-    yield from table(["kind", "parameter", "unit", "default", "range", "meaning"], numbers)
+    yield from table(["kind", "parameter", "unit", "default", "range", "meaning"], numbers, width)
 
 
 def _remarks(realtime: bool, once: bool) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -14,6 +16,7 @@ from backplane.words import Run, System
 from boards.config import loads
 from boards.config.schema_mistakes import mistakes_of
 from boards.errors import ConfigError, Mistake
+from boards.faults.condition import condition_text
 from boards.faults.config import FaultConfig
 from boards.faults.hog import run_hog
 from boards.faults.request import injection
@@ -37,10 +40,13 @@ class LiveRack:
         self._table = FaultTable(self._segment)
         self._joints = self._config.robot.joints if self._config.robot is not None else ()
 
-    def inject(self, given: Mapping[str, Any], wait: bool) -> dict[str, Any]:
-        """Inject a fault and wait until it has begun, with `wait` until it is over; return it as plain data.
+    def inject(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> dict[str, Any]:
+        """Inject a fault; return it as plain data.
 
-        Raises `ConfigError` with every mistake, and `Failure` when it does not begin.
+        One that is to begin at once has begun, one with a tick or a condition is armed. With `wait` it is over,
+        within `timeout_s` of wall-clock time where that is given.
+
+        Raises `ConfigError` with every mistake, and `Failure` when it does not begin, or is not over in time.
         """
         if self._is_over:
             raise Failure(f"rack '{self._segment.rack}': its run is over")
@@ -48,25 +54,50 @@ class LiveRack:
         entry = self._table.add(injection(fault, self._config, self._segment.layout))
         if fault.kind == "hog":
             # This very process takes the core.
+            if entry.stage == Stage.WAITING:
+                print(self._told(entry), file=sys.stderr, flush=True)
             run_hog(self._segment, entry)
-        else:
-            self._await_begin(entry, at_once=fault.tick is None and fault.when is None)
-        while wait and entry.stage != Stage.OVER and not self._is_over:
+        elif fault.tick is None and fault.when is None:
+            self._await_begin(entry)
+        if wait:
+            self._await_end(entry, timeout_s)
+        return {**self._document(entry), "told": self._told(entry)}
+
+    def withdraw(self, number: int) -> dict[str, Any]:
+        """Take a fault back that waits for its tick or its condition; return it as plain data. Raises `Failure`."""
+        waiting = {entry.index: entry for entry in self._table.staged((Stage.WAITING,))}
+        if number not in waiting:
+            known = ", ".join(map(str, waiting)) or "none"
+            raise Failure(f"fault {number} is not waiting; waiting: {known}", 2)
+        entry = waiting[number]
+        answer = self._document(entry)
+        self._table.disarm(entry)
+        words, deadline = self._segment.words, time.monotonic() + BEGIN_S
+        tick = words[System.TICK]
+        while words[System.TICK] <= tick + 1 and not self._is_over and time.monotonic() < deadline:
             time.sleep(LOOK_S)
-        return {**document(entry, self._segment.layout, self._joints), "told": self._told(entry)}
+        if not self._table.free(entry):
+            raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
+        return {**answer, "stage": "free", "told": f"{answer['text']}: withdrawn"}
 
     def faults(self) -> list[dict[str, Any]]:
         """Return the faults that were injected so far, as plain data."""
         injected = self._table.staged((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
-        return [document(entry, self._segment.layout, self._joints) for entry in injected]
+        return [self._document(entry) for entry in injected]
 
-    def text(self) -> Iterator[str]:
-        """Yield the faults that were injected so far, as a table."""
+    def text(self, width: int | None = None) -> Iterator[str]:
+        """Yield the faults that were injected so far, as a table that fits into `width`."""
         rows = [
-            [str(f["fault"]), f["text"], f["stage"], *("-" if n is None or n < 0 else str(n) for n in _numbers(f))]
+            [
+                str(f["fault"]),
+                f["text"],
+                f["stage"],
+                *("-" if n is None or n < 0 else str(n) for n in _numbers(f)),
+                f["waits_for"],
+            ]
             for f in self.faults()
         ]
-        yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted"], rows)
+        yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"], rows, width)
 
     def _fault(self, given: dict[str, Any]) -> FaultConfig:
         """Return the fault asked for, and fit for a rack that runs. Raises `ConfigError`, `Failure`."""
@@ -86,23 +117,49 @@ class LiveRack:
             _check_hog(fault)
         return fault
 
-    def _await_begin(self, entry: FaultEntry, at_once: bool) -> None:
+    def _await_begin(self, entry: FaultEntry) -> None:
         deadline = time.monotonic() + BEGIN_S
         while entry.stage == Stage.WAITING:
             if self._is_over:
                 raise Failure(f"{self._described(entry)}: the run ended before it began")
-            if at_once and time.monotonic() > deadline:
+            if time.monotonic() > deadline:
                 raise Failure(f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s")
             time.sleep(LOOK_S)
+
+    def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
+        """Wait until a fault is over, or the run. Raises `Failure` after `timeout_s`, or where it never began."""
+        if entry.stage == Stage.WAITING:
+            print(self._told(entry), file=sys.stderr, flush=True)
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while entry.stage != Stage.OVER and not self._is_over:
+            if time.monotonic() > deadline:
+                raise Failure(f"timed out after {timeout_s:g} s: {self._told(entry)}")
+            time.sleep(LOOK_S)
+        if entry.stage == Stage.WAITING:
+            raise Failure(f"{self._described(entry)}: the run ended before it began")
 
     def _told(self, entry: FaultEntry) -> str:
         begun, until = entry[Entry.FROM], entry[Entry.UNTIL]
         if entry.stage == Stage.WAITING:
-            return f"{self._described(entry)}: the run ended before it began"
+            back = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
+            return f"{self._described(entry)}: armed, waits for {self._awaited(entry)}; {back}"
         if entry.stage == Stage.OVER:
             return f"{self._described(entry)}: ticks {begun} to {until - 1}, acted {entry[Entry.COUNT]} time(s)"
         end = "to the end of the run" if until == NEVER else f"to tick {until - 1}"
         return f"{self._described(entry)}: from tick {begun} {end}"
+
+    def _awaited(self, entry: FaultEntry) -> str:
+        """Return what a waiting fault waits for."""
+        if entry[Entry.WHEN_BOX] < 0:
+            now = self._segment.words[System.TICK]
+            return f"tick {entry[Entry.FROM]}; the rack is at tick {now}" if entry[Entry.FROM] > 0 else "the next tick"
+        when = (entry[Entry.WHEN_BOX], entry[Entry.WHEN_FIELD], entry[Entry.WHEN_VALUE])
+        return condition_text(when, self._segment.layout)
+
+    def _document(self, entry: FaultEntry) -> dict[str, Any]:
+        """Return a fault as plain data; `waits_for` is empty once it has begun."""
+        waits_for = self._awaited(entry) if entry.stage == Stage.WAITING else ""
+        return {**document(entry, self._segment.layout, self._joints), "waits_for": waits_for}
 
     def _described(self, entry: FaultEntry) -> str:
         return describe(entry, self._segment.layout, self._joints)

@@ -1,28 +1,70 @@
-"""A report as text for people."""
+"""A report as text for people: report.md, with every column, and what a terminal shows of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
+
+from rich.console import Console
+
+from tools.holds import resume_command
+from tools.reporting.misses import counted
+from tools.text_table import table
 
 Report = dict[str, Any]
 
 SHOWN = 10
-"""Misses that the text shows; report.json has them all."""
+"""Misses, holds and long responses that the text shows; report.json has them all."""
 
-FAULTS = ["fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after"]
-TIMES = [
-    *("task", "R", "cycles", "missed", "skipped", "late p50", "p99", "max", "exec p50", "p99", "max"),
-    *("comm p99", "proc p99", "residual min", "deviation", "alpha", "plan age max"),
-]
+FAULTS = ("fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after")
+COUNTS = ("task", "R", "cycles", "missed", "skipped")
+BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation", "alpha")
+"""Times that are held against a release or a time slice: they mean nothing in lockstep."""
+USED = ("exec p50", "exec p99", "exec max", "comm p99", "proc p99", "plan age max")
+JUDGED = {True: "ok", False: "FAILS", None: "-"}
+DROPPED = (
+    *("deviation", "comm p99", "proc p99", "late p50", "exec p50", "alpha", "late p99", "exec p99"),
+    *("plan age max", "R", "cycles"),
+)
+"""Columns of times that a narrow terminal does without, the first first."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table; `dropped` are columns that a narrow terminal does without, the first first."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    dropped: Sequence[str] = ()
+
+    def markdown(self) -> Iterator[str]:
+        """Yield its lines with every column."""
+        widths = [max(map(len, column)) for column in zip(self.head, *self.rows, strict=True)]
+        yield _row(self.head, widths)
+        yield "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+        yield from (_row(row, widths) for row in self.rows)
 
 
 def markdown(report: Report) -> str:
     """Return report.md of a report."""
-    return "\n".join(_lines(report)) + "\n"
+    blocks = (block.markdown() if isinstance(block, Grid) else (block,) for block in _blocks(report))
+    return "\n".join(line for lines in blocks for line in lines) + "\n"
 
 
-def _lines(report: Report) -> Iterator[str]:
+def show(report: Report, terminal: Console) -> None:
+    """Print on a terminal as much of a report as its width permits."""
+    for block in _blocks(report):
+        if isinstance(block, Grid):
+            for line in table(block.head, block.rows, terminal.width, block.dropped):
+                terminal.print(line, highlight=False, markup=False)
+        else:
+            style = "bold" if block.startswith("#") else ""
+            terminal.print(block.lstrip("# "), style=style, highlight=False, markup=False)
+    terminal.print(f"\nall columns: {report['folder']}/report.md; all data: report.json", highlight=False, markup=False)
+
+
+def _blocks(report: Report) -> Iterator[str | Grid]:
     outcome = report["outcome"] or {"cause": "no outcome recorded", "reason": "", "faults": []}
     yield f"# {report['rack']}: {outcome['cause']}{': ' + outcome['reason'] if outcome['reason'] else ''}"
     yield ""
@@ -38,13 +80,47 @@ def _lines(report: Report) -> Iterator[str]:
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])
-    yield from ("", "## Cycles, ms", "")
-    if report["mode"] == "lockstep":
-        yield from ("In lockstep there are no deadlines: a tick lasts as long as its tasks take.", "")
-    yield from _table(TIMES, [_times_row(name, task) for name, task in report["tasks"].items()])
+    yield from _holds(report)
+    yield from _times(report)
     yield from _faults(report)
-    yield from _misses(report["misses"])
+    yield from _misses(report)
     yield from _response(report["system_response"])
+
+
+def _times(report: Report) -> Iterator[str | Grid]:
+    is_lockstep = report["mode"] == "lockstep"
+    yield from ("", "## Cycles, ms", "")
+    if is_lockstep:
+        yield "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no lateness, no residuals."
+        yield ""
+    head = (*COUNTS, *(() if is_lockstep else BY_THE_CLOCK), *USED)
+    cells = [_times_row(name, task) for name, task in report["tasks"].items()]
+    yield Grid(head, [[row[name] for name in head] for row in cells], DROPPED)
+
+
+def _holds(report: Report) -> Iterator[str | Grid]:
+    holds = report["holds"]
+    if not holds:
+        return
+    yield from ("", f"## Held: {len(holds)} times{_first(holds, 'longest')}", "")
+    longest = sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
+    rows = [
+        [
+            hold["level"],
+            f"{'operator: ' if hold['by'] == 'operator' else ''}{hold['why']}",
+            f"{hold['since_s']:.2f}",
+            "the end" if hold["until_s"] is None else f"{hold['until_s']:.2f}",
+            f"{hold['lasted_s']:.2f}",
+        ]
+        for hold in longest
+    ]
+    yield Grid(("level", "by", "since, s", "until, s", "lasted, s"), rows)
+    for level in (hold["level"] for hold in holds if hold["until_s"] is None and hold["by"] == "operator"):
+        yield from ("", f"Still held at the end: {level}; `{resume_command(report['rack'], level)}` releases it.")
+
+
+def _first(rows: Sequence[Any], which: str) -> str:
+    return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
 
 
 def _against(against: Report | None) -> Iterator[str]:
@@ -59,17 +135,17 @@ def _against(against: Report | None) -> Iterator[str]:
     yield f"- parts from {against['folder']} at tick {parting['tick']}, in {parting['mailbox']}; {why}"
 
 
-def _faults(report: Report) -> Iterator[str]:
+def _faults(report: Report) -> Iterator[str | Grid]:
     faults, unexplained, restarts = report["faults"], report["unexplained"], report["restarts"]
     if faults:
         yield from ("", f"## Faults: {len(faults)}", "")
-        yield from _table(FAULTS, [_fault_row(fault) for fault in faults])
+        yield Grid(FAULTS, [_fault_row(fault) for fault in faults])
     if restarts:
         yield from ("", f"Restarts: {', '.join(f'{task} {count}' for task, count in restarts.items())}.")
     if unexplained:
-        yield from ("", f"## Detections that no fault of this run explains: {len(unexplained)}", "")
+        yield from ("", f"## Unexplained detections: {len(unexplained)}", "")
         rows = [[str(found["tick"]), found["board"], found["code"], found["text"]] for found in unexplained]
-        yield from _table(["tick", "found by", "as", "what"], rows)
+        yield Grid(("tick", "found by", "as", "what"), rows)
 
 
 def _fault_row(fault: Report) -> list[str]:
@@ -89,15 +165,25 @@ def _fault_row(fault: Report) -> list[str]:
     ]
 
 
-def _misses(misses: list[Report]) -> Iterator[str]:
+def _misses(report: Report) -> Iterator[str | Grid]:
+    misses = report["misses"]
     if not misses:
         return
-    yield from ("", f"## Misses: {len(misses)}, the first {min(SHOWN, len(misses))}", "")
+    late, skipped = counted(misses)
+    yield from ("", f"## Missed and skipped cycles: {late} and {skipped}{_first(misses, 'first')}", "")
+    if (late, skipped) != (report["missed"], report["skipped"]):
+        of_all = f"{report['missed']} and {report['skipped']}"
+        yield from (f"The tasks counted {of_all}; the recording holds no more than these.", "")
     rows = [
-        [str(miss["tick"]), miss["task"], miss["what"], *(_given(miss, key) for key in ("started_ms", "took_ms"))]
+        [
+            str(miss["tick"]),
+            miss["task"],
+            miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
+            *(_given(miss, key) for key in ("started_ms", "took_ms")),
+        ]
         for miss in misses[:SHOWN]
     ]
-    yield from _table(["tick", "task", "what", "started late, ms", "took, ms"], rows)
+    yield Grid(("tick", "task", "what", "started late, ms", "took, ms"), rows)
 
 
 def _given(miss: Report, key: str) -> str:
@@ -118,47 +204,47 @@ def _motion(motion: Report | None) -> Iterator[str]:
         )
 
 
-def _times_row(name: str, task: Report) -> list[str]:
-    counts = [str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")]
-    late, execution = task["lateness_ms"], task["execution_ms"]
-    return [
-        name,
-        f"{task['slice_ms']:g}",
-        *counts,
-        *(_ms(late, key) for key in ("p50", "p99", "max")),
-        *(_ms(execution, key) for key in ("p50", "p99", "max")),
-        _ms(task["communication_ms"], "p99"),
-        _ms(task["processor_ms"], "p99"),
-        _ms(task["residual_ms"], "min"),
-        *("-" if task[key] is None else f"{task[key]:.3f}" for key in ("deviation_ms", "alpha_ms")),
-        _ms(task.get("plan_age_ms"), "max"),
-    ]
+def _times_row(name: str, task: Report) -> dict[str, str]:
+    row = {"task": name, "R": f"{task['slice_ms']:g}"}
+    row |= {key: str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")}
+    for title, key in (("late", "lateness_ms"), ("exec", "execution_ms")):
+        row |= {f"{title} {part}": _ms(task[key], part) for part in ("p50", "p99", "max")}
+    row |= {key: "-" if task[f"{key}_ms"] is None else f"{task[f'{key}_ms']:.3f}" for key in ("deviation", "alpha")}
+    row |= {"comm p99": _ms(task["communication_ms"], "p99"), "proc p99": _ms(task["processor_ms"], "p99")}
+    return row | {"residual min": _ms(task["residual_ms"], "min"), "plan age max": _ms(task.get("plan_age_ms"), "max")}
 
 
 def _ms(distribution: Report | None, key: str) -> str:
     return "-" if distribution is None else f"{distribution[key]:.3f}"
 
 
-def _response(response: Report | None) -> Iterator[str]:
+def _response(response: Report | None) -> Iterator[str | Grid]:
     if response is None:
         return
     yield from ("", "## System response, ms of simulated time", "")
     bounds = f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
     yield f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its cycle."
     yield ""
+    ways = {"command, down": response["command"], "status, up": response["status"]}
     rows = [
-        [way, _ms(found["measured_ms"], "p50"), _ms(found["measured_ms"], "max"), f"{found['bound_ms']:g}"]
-        for way, found in (("command, down", response["command"]), ("status, up", response["status"]))
+        [
+            way,
+            *(_ms(found["measured_ms"], key) for key in ("p50", "max")),
+            f"{found['bound_ms']:g}",
+            JUDGED[found["holds"]],
+        ]
+        for way, found in ways.items()
     ]
-    yield from _table(["way", "measured p50", "measured max", "bound"], rows)
+    yield Grid(("way", "measured p50", "measured max", "bound", ""), rows)
+    for way, found in ways.items():
+        if found["beyond"]:
+            yield from ("", f"{way}: {len(found['beyond'])} beyond the bound{_first(found['beyond'], 'longest')}:")
+        for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
+            why = "; ".join(each["delayed_by"]) or "nothing in the recording says why"
+            yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
+        if found["unseen"]:
+            yield from ("", f"{way}: {found['unseen']} not measured, messages are missing in the recording.")
 
 
-def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    yield _row(head, widths)
-    yield "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    yield from (_row(row, widths) for row in rows)
-
-
-def _row(cells: list[str], widths: list[int]) -> str:
+def _row(cells: Sequence[str], widths: Sequence[int]) -> str:
     return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from tools.recording import Recording
 
 
 def misses(recording: Recording, layout: Layout) -> list[dict[str, Any]]:
-    """Return every miss in the trace, earliest first: task, tick, whether it ended late or was skipped, and times.
+    """Return every miss in the trace, earliest first: task, tick, what ("late" or "skipped"), how many, and times.
 
     A skipped release leaves no record of its own: the next one tells how many there were.
     """
@@ -28,10 +29,16 @@ def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
         cycle = cycles[index]
         if skipped := int(cycle["flags"]) >> SKIPPED_SHIFT:
             first = int(cycle["tick"]) - skipped * task.every
-            found.append({"task": task.name, "tick": first, "what": f"{skipped} skipped"})
+            found.append({"task": task.name, "tick": first, "what": "skipped", "count": skipped})
         if cycle["flags"] & Flag.MISSED:
             late_ms = float(cycle["start_ns"] - cycle["release_ns"]) * 1e-6
             took_ms = float(cycle["end_ns"] - cycle["start_ns"]) * 1e-6
-            entry = {"task": task.name, "tick": int(cycle["tick"]), "what": "late"}
+            entry = {"task": task.name, "tick": int(cycle["tick"]), "what": "late", "count": 1}
             found.append({**entry, "started_ms": round(late_ms, 6), "took_ms": round(took_ms, 6)})
     return found
+
+
+def counted(misses: Sequence[dict[str, Any]]) -> tuple[int, int]:
+    """Return how many cycles ended late, and how many were skipped."""
+    late, skipped = (sum(miss["count"] for miss in misses if miss["what"] == what) for what in ("late", "skipped"))
+    return late, skipped

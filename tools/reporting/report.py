@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from backplane.layout import Layout, TaskSpec
 from backplane.message import State
-from boards.config import RackConfig, loads
+from boards.config import RackConfig, loads, wire
 from tools.recording import Recording
 from tools.reporting.difference import first_difference
 from tools.reporting.faults import faults
+from tools.reporting.holds import holds
 from tools.reporting.markdown import markdown
-from tools.reporting.misses import misses
+from tools.reporting.misses import counted, misses
 from tools.reporting.motion import motion
 from tools.reporting.response import system_response
 from tools.reporting.timing import plan_age_ms, task_times
@@ -26,7 +28,7 @@ Report = dict[str, Any]
 def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
     """Make the report of the run in `folder`, write it there, and return it as data and as text.
 
-    With the folder of another run `against`, it tells where the two part.
+    With the folder of another run `against`, it says where the two diverge.
     """
     recording = Recording(folder)
     report = report_of(recording)
@@ -41,31 +43,53 @@ def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str
 def report_of(recording: Recording) -> Report:
     """Return the report of a recorded run as plain data."""
     config, layout = loads(recording.config), recording.layout
-    ended = next((event for event in recording.events if event["kind"] == "outcome"), {})
-    outcome = ended.get("outcome", {})
-    counted = ended.get("tasks", {})
+    ended, found = recording.ended, misses(recording, layout)
+    report = _head(config, ended, _last_tick(recording) + 1)
+    if not ended:
+        # A recording that did not see the end of its run has what it traced.
+        report["missed"], report["skipped"] = counted(found)
+    counters = ended.get("tasks", {})
+    return {
+        **report,
+        "folder": str(recording.folder),
+        "misses": found,
+        "holds": holds(recording, layout),
+        **faults(recording, layout),
+        "tasks": {task.name: _task(recording, config, layout, task, counters) for task in layout.tasks},
+        "system_response": system_response(recording, config, layout),
+        "task": _task_outcome(recording, layout),
+        "motion": motion(recording, layout),
+        "recording": ended.get("recording", "without the end of the run"),
+        "rows_lost": {name: count for name, count in recording.lost.items() if count},
+    }
+
+
+def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
+    """Return the report of a run that nobody recorded: the same keys; null is what only a recording knows."""
+    unknown = ("misses", "holds", "faults", "unexplained", "restarts", "system_response", "task", "motion", "rows_lost")
+    layout = wire(config)
+    tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
+    head = _head(config, ended, 0)
+    return {**head, **dict.fromkeys(unknown), "folder": None, "tasks": tasks, "recording": ended["recording"]}
+
+
+def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
+    """Return what is known of a run without its recording; `ticks` is its length where its end is not known."""
+    outcome, counters = ended.get("outcome", {}), ended.get("tasks", {}).values()
     return {
         "rack": config.name,
-        "folder": str(recording.folder),
+        "folder": None,
         "mode": config.clock.mode,
         "speed": config.clock.speed,
         "clock_ms": config.clock.period_ms,
         "worked": ended.get("worked", False),
         "outcome": outcome or None,
         "digest": outcome.get("digest"),
-        "simulated_s": round(outcome.get("ticks", _last_tick(recording) + 1) * layout.clock_ns * 1e-9, 6),
+        "simulated_s": round(outcome.get("ticks", ticks) * config.clock_ns * 1e-9, 6),
         "wall_s": round(ended.get("wall_s", 0.0), 6),
         "clock_skipped": ended.get("clock_skipped", 0),
-        "missed": sum(task.get("missed", 0) for task in counted.values()),
-        "skipped": sum(task.get("skipped", 0) for task in counted.values()),
-        "misses": misses(recording, layout),
-        **faults(recording, layout),
-        "tasks": {task.name: _task(recording, config, layout, task, counted) for task in layout.tasks},
-        "system_response": system_response(recording, config, layout),
-        "task": _task_outcome(recording, layout),
-        "motion": motion(recording, layout),
-        "recording": ended.get("recording", "without the end of the run"),
-        "rows_lost": {name: count for name, count in recording.lost.items() if count},
+        "missed": sum(task["missed"] for task in counters),
+        "skipped": sum(task["skipped"] for task in counters),
     }
 
 
@@ -81,22 +105,25 @@ def _compared(recording: Recording, other: Recording, found: list[Report]) -> Re
 
 
 def _task(
-    recording: Recording, config: RackConfig, layout: Layout, task: TaskSpec, counted: dict[str, dict[str, int]]
+    recording: Recording, config: RackConfig, layout: Layout, task: TaskSpec, counters: dict[str, dict[str, int]]
 ) -> Report:
-    period_ns = layout.clock_ns if config.clock.mode == "lockstep" else round(layout.clock_ns / config.clock.speed)
+    is_lockstep = config.clock.mode == "lockstep"
+    period_ns = layout.clock_ns if is_lockstep else round(layout.clock_ns / config.clock.speed)
     cycles = recording.cycles.get(task.name, recording.no_cycles)
     entry: Report = {
-        "role": task.role,
-        "slot": task.slot,
-        "rate_hz": 1e9 / (task.every * layout.clock_ns),
-        **counted.get(task.name, {}),
-        **task_times(task, cycles, period_ns),
+        **_about(task, layout),
+        **counters.get(task.name, {}),
+        **task_times(task, cycles, period_ns, is_lockstep),
     }
     plan = f"{task.board}.plan"
     if task.role == "executor" and plan in recording.mailboxes:
         made, visible_at = recording.signal(plan, "tick"), recording.signal(plan, "visible_at")
         entry["plan_age_ms"] = plan_age_ms(cycles["tick"], made, visible_at, layout.clock_ns * 1e-6)
     return entry
+
+
+def _about(task: TaskSpec, layout: Layout) -> Report:
+    return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
 
 
 def _last_tick(recording: Recording) -> int:

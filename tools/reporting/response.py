@@ -6,52 +6,89 @@ followed from the release of the highest level to the cycle of the lowest that a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from backplane.layout import Layout
+from backplane.trace import SKIPPED_SHIFT, Flag
 from boards.config.schema import RackConfig
 from tools.recording import Recording
-from tools.reporting.statistics import Distribution, distribution
+from tools.reporting.statistics import distribution
 from tools.timing.prediction import hierarchy, predict
+
+LOSSES = ("died", "hang")
+"""Codes of events that say that a board was lost."""
 
 
 def system_response(recording: Recording, config: RackConfig, layout: Layout) -> dict[str, Any] | None:
-    """Return the response down (commands) and up (statuses), in ticks and ms; None without a hierarchy."""
+    """Return the response down (commands) and up (statuses), in ticks and ms; None without a hierarchy.
+
+    `beyond` are the responses longer than their bound, each with what the run shows to have delayed it; `unseen`
+    counts those that cannot be measured because the recording lacks messages.
+    """
     levels = list(hierarchy(config))
     if len(levels) < 2:
         return None
-    cycles, predicted = {name: layout.task(name).every for name in levels}, predict(config, layout)
-    tick_ms = layout.clock_ns * 1e-6
+    predicted = predict(config, layout)
     return {
         "levels": levels,
         "bound_eq_3_2_ms": predicted.bound_eq_3_2_ms,
         "sum_eq_3_3_ms": predicted.sum_eq_3_3_ms,
-        "command": {
-            "measured_ms": _way(recording, levels, "command", cycles, tick_ms),
-            "bound_ms": predicted.command_ms,
-        },
-        "status": {
-            "measured_ms": _way(recording, levels[::-1], "status", cycles, tick_ms),
-            "bound_ms": predicted.status_ms,
-        },
+        "command": _way(recording, layout, levels, "command", predicted.command_ms),
+        "status": _way(recording, layout, levels[::-1], "status", predicted.status_ms),
     }
 
 
-def _way(
-    recording: Recording, levels: Sequence[str], port: str, cycles: dict[str, int], tick_ms: float
-) -> Distribution | None:
-    """Return the response along `levels`: from the first one's release to the end of the last one's cycle.
+def _way(recording: Recording, layout: Layout, levels: Sequence[str], port: str, bound_ms: float) -> dict[str, Any]:
+    """Judge the response along `levels`: from the first one's release to the end of the last one's cycle.
 
     Counted for what happens just after a release whose message went all the way: it waits for the next that does.
     """
-    first, last = cycles[levels[0]], cycles[levels[-1]]
-    mailbox = f"{levels[-2]}.{port}"
+    first, last = (layout.task(levels[at]).every for at in (0, -1))
+    mailbox, tick_ms = f"{levels[-2]}.{port}", layout.clock_ns * 1e-6
     basis, visible_at = recording.signal(mailbox, "basis"), recording.signal(mailbox, "visible_at")
     # Before the first one's messages have come along, the later levels' rest on their own ticks.
-    real = basis >= first
+    real = np.flatnonzero(basis >= first)
     arrived, at = np.unique(basis[real], return_index=True)
-    read = -(-visible_at[real][at] // last) * last
-    return distribution((read[1:] + last - arrived[:-1] - first) * tick_ms)
+    at = real[at]
+    acts = -(-visible_at[at[1:]] // last) * last + last
+    ms = (acts - arrived[:-1] - first) * tick_ms
+    seen = np.ones(len(ms), bool)
+    if recording.lost.get(mailbox):
+        # The message that brought the news may be one of those that the recorder lost.
+        gaps = np.cumsum(np.diff(recording.signal(mailbox, "serial"), prepend=0) > 1)
+        seen = gaps[at[1:]] == gaps[at[:-1]]
+    beyond = [
+        {
+            "tick": int(arrived[k]),
+            "ms": round(float(ms[k]), 6),
+            "delayed_by": list(_delays(recording, layout, levels, int(arrived[k]), int(acts[k]))),
+        }
+        for k in np.flatnonzero(seen & (ms > bound_ms + tick_ms / 2))
+    ]
+    return {
+        "measured_ms": distribution(ms[seen]),
+        "bound_ms": bound_ms,
+        "holds": not beyond if seen.any() else None,
+        "beyond": beyond,
+        "unseen": int(np.count_nonzero(~seen)),
+    }
+
+
+def _delays(recording: Recording, layout: Layout, levels: Sequence[str], since: int, until: int) -> Iterator[str]:
+    """Yield what happened between two ticks to the levels that an information passes through."""
+    for fault in recording.ended.get("faults", ()):
+        if 0 <= fault["began"] < until and not 0 <= fault["ends"] <= since:
+            yield f"fault: {fault['kind']} of {fault['board']}"
+    lost = [
+        e["subject"] or e["board"] for e in recording.events if e.get("code") in LOSSES and since <= e["tick"] < until
+    ]
+    yield from (f"{board} was lost" for board in dict.fromkeys(lost))
+    for name in levels:
+        rows = recording.cycles.get(name, recording.no_cycles)
+        flags = rows["flags"][(rows["tick"] >= since) & (rows["tick"] < until + layout.task(name).every)]
+        missed, skipped = np.count_nonzero(flags & Flag.MISSED), int((flags >> SKIPPED_SHIFT).sum())
+        if missed or skipped:
+            yield f"{name}: {missed} missed, {skipped} skipped"

@@ -11,26 +11,30 @@ from levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from tools.reporting.statistics import Distribution, distribution
 
 
-def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int) -> dict[str, Any]:
+def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: bool = False) -> dict[str, Any]:
     """Return the times of a task's traced cycles, ms of the wall clock.
 
     `processor_ms` is what a cycle and waking up for it took of the processor: waiting and being preempted do not count.
-    `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its R their time slice.
+    `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its R their time slice. In lockstep
+    a tick lasts as long as its tasks take: what is held against a release or a slice of time is None.
     """
     slice_ns = task.every * task.within_cycles * period_ns
     execution = cycles["process_ns"] - cycles["read_ns"]
     communication = cycles["read_ns"] - cycles["start_ns"] + cycles["end_ns"] - cycles["process_ns"]
     gaps = np.diff(cycles["start_ns"])
-    return {
-        "traced": len(cycles),
-        "slice_ms": slice_ns * 1e-6,
+    by_the_clock = {
         "lateness_ms": distribution((cycles["start_ns"] - cycles["release_ns"]) * 1e-6),
-        "execution_ms": distribution(execution * 1e-6),
-        "communication_ms": distribution(communication * 1e-6),
-        "processor_ms": distribution(cycles["processor_ns"] * 1e-6),
         "residual_ms": distribution((cycles["release_ns"] + slice_ns - cycles["end_ns"]) * 1e-6),
         "largest_gap_ms": round(float(gaps.max()) * 1e-6, 6) if len(gaps) else None,
         **_worst(slice_ns, execution.tolist(), communication.tolist()),
+    }
+    return {
+        "traced": len(cycles),
+        "slice_ms": slice_ns * 1e-6,
+        "execution_ms": distribution(execution * 1e-6),
+        "communication_ms": distribution(communication * 1e-6),
+        "processor_ms": distribution(cycles["processor_ns"] * 1e-6),
+        **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
     }
 
 

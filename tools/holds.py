@@ -1,0 +1,138 @@
+"""What keeps a rack from its work: which level, since when, what for, and the command that lets it go."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from backplane.layout import MailboxSpec
+from backplane.lines import UtilityLines
+from backplane.message import Message, State
+from backplane.protocols import open_observer
+from backplane.ring import mailbox_ring
+from backplane.segment import Segment
+from backplane.words import Block, Run, System
+from boards.events import Event
+from boards.operating.text import describe
+from levels.operator import Answer, What
+from tools.campaign.ending import arm_of
+
+STILL_S = 5.0
+"""Simulated time without motion after which a rack that is held says so as an event."""
+OPERATED = frozenset({"standing", "order", "answer"})
+"""Fields of a status by which a level that an operator commands is known."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """One level, or the arm, kept from its own work since a tick. `release` lets it go; empty: it ends by itself."""
+
+    level: str
+    since_tick: int
+    since_s: float
+    why: str
+    release: str
+
+    @property
+    def line(self) -> str:
+        """All of it for people."""
+        return "; ".join(self.parts)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The same as one or two lines: a command is not to be torn."""
+        how = (f"to release: {self.release}",) if self.release else ()
+        return (f"{self.level} {self.why}, since {self.since_s:.2f} s", *how)
+
+
+def resume_command(rack: str, level: str) -> str:
+    """Return the command that ends what an operator has a level do."""
+    return f"rack command {rack} {level} resume"
+
+
+class Holds:
+    """Finds what holds a rack that runs."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._lines = UtilityLines(segment)
+        tasks = {task.name for task in segment.layout.tasks}
+        boxes = [box for box in segment.layout.mailboxes if box.name.endswith(".status") and box.writer in tasks]
+        self._statuses = {box.writer: open_observer(segment, box.name) for box in boxes if "state" in _fields(box)}
+        self._operated = {box.writer for box in boxes if _fields(box) >= OPERATED}
+        self._arm = next((box.writer for box in boxes if "demand" in _fields(box)), None)
+
+    def look(self) -> tuple[Hold, ...]:
+        """Return what holds the rack now, the arm first; nothing once its run is over."""
+        if self._segment.words[System.STATE] == Run.STOPPED:
+            return ()
+        return (*self._stopped(), *(hold for level in self._statuses for hold in self._held(level)))
+
+    def _stopped(self) -> Iterator[Hold]:
+        if self._lines.emergency_stop:
+            since = self._segment.block(self._arm)[Block.LEVEL_SINCE] if self._arm is not None else 0
+            yield self._hold("arm", since, "braked: emergency stop", f"rack estop {self._segment.rack} --reset")
+
+    def _held(self, level: str) -> Iterator[Hold]:
+        status = self._statuses[level].peek()
+        if not status.is_there:
+            return
+        told = status.value
+        if level in self._operated and told.standing:
+            since, what = self._standing(level, told)
+            is_hold = told.standing == What.HOLD
+            done = ", done" if told.answer == Answer.DONE and not is_hold else ""
+            why = f"{'held' if is_hold else 'diverted'} by the operator ({what}{done})"
+            yield self._hold(level, since, why, resume_command(self._segment.rack, level))
+        elif told.state == State.HOLDING:
+            since = self._segment.block(level)[Block.LEVEL_SINCE]
+            yield self._hold(level, since, f"holding: {told.reason or 'no reason given'}", "")
+
+    def _standing(self, level: str, status: Message) -> tuple[int, str]:
+        """Return since which tick the standing command stands, and what it says."""
+        rows = mailbox_ring(self._segment, f"{level}.operator").drain().rows
+        # A newer command that was refused has left it standing.
+        mine = [
+            row for row in rows if row["message"]["what"] == status.standing and row["message"]["id"] <= status.order
+        ]
+        if status.answer == Answer.REFUSED and len(mine) > 1:
+            mine = [row for row in mine if row["message"]["id"] != status.order]
+        if not mine:
+            return self._segment.block(level)[Block.LEVEL_SINCE], What(status.standing).name.lower()
+        message = Message(rows["message"].dtype)
+        message.raw[:] = mine[-1]["message"].tobytes()
+        return int(mine[-1]["tick"]), describe(message)
+
+    def _hold(self, level: str, since: int, why: str, release: str) -> Hold:
+        return Hold(level, since, since * self._segment.layout.clock_ns * 1e-9, why, release)
+
+
+class Standstill:
+    """Makes an event, once, of a hold under which nothing has moved for a while: the run will not go on by itself."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._still_since: int | None = None
+        self._told: set[tuple[str, int]] = set()
+
+    def look(self, holds: tuple[Hold, ...]) -> Iterator[Event]:
+        """Yield an event for each hold that somebody must end, told of for the first time."""
+        tick = self._segment.words[System.TICK]
+        kept = [hold for hold in holds if hold.release]
+        if not kept or not arm_of(self._segment).is_at_rest:
+            self._still_since = None
+            return
+        self._still_since = tick if self._still_since is None else self._still_since
+        for hold in kept:
+            still = tick - max(self._still_since, hold.since_tick)
+            still_s = still * self._segment.layout.clock_ns * 1e-9
+            if still_s >= STILL_S and (hold.level, hold.since_tick) not in self._told:
+                self._told.add((hold.level, hold.since_tick))
+                text = f"nothing has moved for {still_s:.0f} s: {hold.line}"
+                code, since = "standstill", hold.since_tick
+                yield Event(time.time_ns(), tick, "held", "", text, code, subject=hold.level, since=since)
+
+
+def _fields(box: MailboxSpec) -> set[str]:
+    return {field.name for field in box.fields}
