@@ -105,6 +105,15 @@ def mailbox_size(mailbox: MailboxSpec) -> int:
     return MAILBOX_HEAD_SIZE + mailbox.depth * slot_stride(mailbox)
 
 
+def oldest_kept(head: int, depth: int) -> int:
+    """Return the number of the oldest record in a ring that its writer cannot have begun to overwrite.
+
+    The rule for whoever reads beside the writer, who is at most one record beyond its `head`: copy first, then ask this
+    with the head as it is by then. What was copied of an older record may be half another one, and proves nothing.
+    """
+    return head + 2 - depth
+
+
 def operator_entry_size(layout: Layout) -> int:
     """Return the bytes of one entry of the operator table: its head, and room for the largest of its messages."""
     return OPERATOR_HEAD_SIZE + _up(max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), LINE)

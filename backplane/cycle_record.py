@@ -6,7 +6,7 @@ comes later was held back. Age alone proves nothing: the machine may have taken 
 
 from __future__ import annotations
 
-from backplane.address_map import TRACE_RECORD_SIZE
+from backplane.address_map import TRACE_RECORD_SIZE, oldest_kept
 from backplane.segment import Segment
 from backplane.trace import FIELDS, Flag
 from backplane.words import Block
@@ -28,20 +28,26 @@ class CycleRecord:
 
     @property
     def finished(self) -> int:
-        """Newest release whose cycle has ended with every access done; -1: none, or one was cut off."""
+        """Newest release whose cycle has ended with every access done; -1: none, one was cut off, or not known."""
         count = self._block[_TRACE_HEAD]
         at = self._at(count)
-        return -1 if not count or self._words[at + _FLAGS] & _BUS_ERROR else self._words[at + _TICK]
+        flags, tick = self._words[at + _FLAGS], self._words[at + _TICK]
+        return tick if count and not flags & _BUS_ERROR and self._keeps(count) else -1
 
     def ended_ns(self, tick: int) -> int | None:
         """Return when the cycle released at `tick` ended, CLOCK_MONOTONIC; None when there is no record of it."""
         count = self._block[_TRACE_HEAD]
-        # The oldest records may be overwritten while one looks at them.
-        for number in range(count, max(0, count - self._depth // 2), -1):
+        for number in range(count, max(0, count - self._depth), -1):
             at = self._at(number)
-            if self._words[at + _TICK] <= tick:
-                return self._words[at + _END] if self._words[at + _TICK] == tick else None
+            found, ended_ns = self._words[at + _TICK], self._words[at + _END]
+            if not self._keeps(number) or found < tick:
+                return None
+            if found == tick:
+                return ended_ns
         return None
+
+    def _keeps(self, number: int) -> bool:
+        return number >= oldest_kept(self._block[_TRACE_HEAD], self._depth)
 
     def _at(self, number: int) -> int:
         return self._first + number % self._depth * _RECORD

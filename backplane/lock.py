@@ -59,7 +59,8 @@ class MailboxLock:
 
     def _look_at_holder(self) -> None:
         holder = self._box[_OWNER]
-        if holder and state_of(holder) in GONE + STOPPED:
+        # It may have given the lock back, and ended, since.
+        if holder and state_of(holder) in GONE + STOPPED and self._box[_OWNER] == holder:
             self.held_up += 1
 
     def release(self) -> None:

@@ -173,8 +173,8 @@ class Reader:
         if self._obtain(serial):
             return self._readings[Verdict.NEW]
         self.bad_reads += 1
-        # Overwritten meanwhile: the reader came later than the slots reach back.
-        if self._box[0] - serial >= self._fetched.mask:
+        # The reader came later than the slots reach back.
+        if not self._fetched.keeps(serial):
             return self._cut_off()
         self._blame(serial)
         return self._step_back(serial, tick)
@@ -207,6 +207,8 @@ class Reader:
     def _blame(self, serial: int) -> None:
         """Count what is wrong with the message that was fetched last. Another one in its place: it was lost."""
         fetched = self._fetched
+        if not fetched.keeps(serial):
+            return
         if not fetched.is_sound:
             # An empty slot, as at first.
             self.corrupt += fetched.serial != 0

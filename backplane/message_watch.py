@@ -1,13 +1,16 @@
 """Watching what comes through a mailbox: every message that has become visible since the last read, in serial order.
 
 A fault shows by evidence that no delay of the machine can make: a serial whose slot was never filled, a later serial
-of an earlier tick, two messages for one release, a message stamped behind the end of the cycle that made it.
+of an earlier tick, two messages for one release, a message stamped behind the end of the cycle that made it. The
+reader may be delayed too: a message is copied first, then its slot must still be its own (`Slots.keeps`), and only then
+is the copy judged.
 """
 
 from __future__ import annotations
 
 from zlib import crc32
 
+from backplane.address_map import oldest_kept
 from backplane.alarms import Alarm
 from backplane.cycle_record import CycleRecord
 from backplane.episodes import Episodes
@@ -18,9 +21,7 @@ from backplane.words import Slot
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
 # Plain integers for the hot path.
-_STAMP, _CRC, _SERIAL, _TICK, _VISIBLE = (
-    int(Slot[name]) for name in ("STAMP_NS", "CRC", "SERIAL", "TICK", "VISIBLE_AT")
-)
+_CRC, _SERIAL, _TICK, _VISIBLE = (int(Slot[name]) for name in ("CRC", "SERIAL", "TICK", "VISIBLE_AT"))
 
 
 class MessageWatch:
@@ -54,21 +55,24 @@ class MessageWatch:
         self._account(tick)
 
     def _begin(self, serial: int) -> None:
-        """Judge what comes behind a serial, and nothing before it."""
+        """Judge what comes after a serial, and nothing before it."""
         self.seen = serial
-        if serial and self._slots.holds(serial):
-            self._newest = self._slots.head_words(serial)[_TICK]
+        if serial and self._copies(serial):
+            self._newest = self._slots.tick
+
+    def _copies(self, serial: int) -> bool:
+        """Copy a message into the local record; False when it is not there, or not to be trusted."""
+        return self._slots.fetch(serial) and self._slots.keeps(serial)
 
     def _is_babble(self, found: int, tick: int) -> bool:
         """Say whether there are more messages than releases for them, but for one."""
         slots = self._slots
-        if slots.head_words(found)[_SERIAL] > found:
+        if not slots.keeps(found):
             # Overwritten already: nobody who writes once a cycle is that fast.
             found = slots.box[0]
-        if not slots.holds(found):
+        if not self._copies(found):
             return False
-        every = self._spec.every
-        count, cycles = found - self.seen, (slots.head_words(found)[_TICK] - self._newest) // every
+        count, cycles = found - self.seen, (slots.tick - self._newest) // self._spec.every
         if count <= cycles + 1:
             return False
         self._find(Alarm.BABBLE, tick, count / max(1, cycles))
@@ -76,14 +80,10 @@ class MessageWatch:
 
     def _walk(self, found: int, tick: int) -> None:
         """Judge one message after the other, up to the newest found."""
-        heads_and_bodies, mask, taken, late = (
-            self._heads_and_bodies,
-            self._slots.mask,
-            self._reader.serial,
-            self._late_from,
-        )
+        slots, heads_and_bodies = self._slots, self._heads_and_bodies
+        mask, taken, late = slots.mask, self._reader.serial, self._late_from
         # What a late reader finds overwritten cannot be judged.
-        for serial in range(max(self.seen, self._slots.box[0] - mask) + 1, found + 1):
+        for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
             head, body = heads_and_bodies[serial & mask]
             released = head[_TICK]
             # The reader has checked the message that it took, and only that.
@@ -91,46 +91,46 @@ class MessageWatch:
                 head[_SERIAL] == serial
                 and self._newest < released > head[_VISIBLE] - late
                 and (serial == taken or crc32(body) == head[_CRC])
+                and slots.keeps(serial)
             ):
                 self._newest = released
-            elif not self._judge_odd(serial, head, tick):
+            elif not self._judge_odd(serial, tick):
                 break
             self.seen = serial
 
-    def _judge_odd(self, serial: int, head: memoryview, tick: int) -> bool:
+    def _judge_odd(self, serial: int, tick: int) -> bool:
         """Judge a message that is not as most are; False when it is too early to."""
-        newest, released = self._newest, head[_TICK]
-        if head[_SERIAL] == serial:
-            if released < newest:
-                self._find(Alarm.DISORDER, tick, newest - released, since=released)
-            elif head[_VISIBLE] - released >= self._late_from:
-                self._judge_late(released, head[_VISIBLE], head[_STAMP], tick)
-            self._newest = max(released, newest)
-        elif self._is_lost(serial):
-            # In its slot it would be visible from here on at the earliest: until then it may not be missed.
-            if self._is_sliced and newest + self._spec.every + self._spec.delay > tick:
-                return False
-            self._newest = newest + self._spec.every
-            self._find(Alarm.GAP, tick, 1)
+        slots = self._slots
+        # Again when it is not whole: a forged message may just be overwritten by the true one.
+        if not slots.copy(serial) or not (slots.is_sound or slots.copy(serial)):
             return True
-        if self._is_damaged(serial):
+        expected = self._newest + self._spec.every
+        if slots.serial == serial and slots.is_sound:
+            self._judge_time(slots.tick, slots.visible, tick)
+        elif slots.serial == 0 or slots.is_sound:
+            # Its slot is empty, or holds another message, whole: it is lost. In its slot it would be visible from here
+            # on at the earliest: until then it may not be missed.
+            if self._is_sliced and expected + self._spec.delay > tick:
+                return False
+            self._newest = expected
+            self._find(Alarm.GAP, tick, 1)
+        else:
+            if slots.serial == serial:
+                # Its release may be damaged too; none is later than now.
+                self._newest = max(self._newest, min(slots.tick, tick))
             self._find(Alarm.DAMAGED, tick)
         return True
 
-    def _is_lost(self, serial: int) -> bool:
-        """Say whether a slot was never filled with its message: it is empty, or holds another one, whole."""
-        return self._slots.head_words(serial)[_SERIAL] == 0 or self._slots.is_whole(serial)
-
-    def _judge_late(self, released: int, visible: int, stamp_ns: int, tick: int) -> None:
-        """Tell a message that was held back from one that was finished late: its cycle had ended before."""
-        ended_ns = self._cycles.ended_ns(released)
-        if ended_ns is not None and stamp_ns > ended_ns:
-            self._find(Alarm.HELD_BACK, tick, visible - released - self._spec.delay, since=released)
-
-    def _is_damaged(self, serial: int) -> bool:
-        slots = self._slots
-        # Twice: a forged message may just be overwritten by the true one, or any by one a whole ring later.
-        return not (slots.is_whole(serial) or slots.is_whole(serial)) and slots.box[0] - serial < slots.mask
+    def _judge_time(self, released: int, visible: int, tick: int) -> None:
+        """Judge when the message in the local record was released, and when it came."""
+        if released < self._newest:
+            self._find(Alarm.DISORDER, tick, self._newest - released, since=released)
+        elif visible - released >= self._late_from:
+            # One that was held back, and not only finished late: its cycle had ended before.
+            ended_ns = self._cycles.ended_ns(released)
+            if ended_ns is not None and self._slots.stamp_ns > ended_ns:
+                self._find(Alarm.HELD_BACK, tick, visible - released - self._spec.delay, since=released)
+        self._newest = max(released, self._newest)
 
     def _account(self, tick: int) -> None:
         """Tell of what the reader itself has found since the last time."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from backplane.address_map import MAILBOX_HEAD_SIZE, slot_stride
+from backplane.address_map import MAILBOX_HEAD_SIZE, oldest_kept, slot_stride
 from backplane.segment import Segment
 from backplane.slots import message_dtype
 from backplane.words import Box, Slot
@@ -38,8 +38,8 @@ class Ring:
         head = self._head[0]
         first = max(self._taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth]
-        # What the writer reached while we copied may be half a record; it is one slot ahead of its head.
-        torn = max(0, self._head[0] + 2 - self._depth - first)
+        # What the writer reached while we copied.
+        torn = max(0, oldest_kept(self._head[0], self._depth) - first)
         lost = first - self._taken - 1 + min(torn, len(rows))
         self._taken = head
         return Drained(rows[torn:], lost)

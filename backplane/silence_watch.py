@@ -14,13 +14,13 @@ from backplane.mailbox import NOT_YET, Reader
 from backplane.process import GONE, STOPPED, state_of
 from backplane.segment import Segment
 from backplane.slots import pid_of
-from backplane.words import Block, Box, Slot
+from backplane.words import Block, Box
 
 MUTE_CYCLES = 3
 """Age, in cycles of the writer, of which two are lawful, from which silence is looked into."""
 STALE_CYCLES = 4
 LONG_AGO = -(1 << 62)
-_LOST, _TICK, _CLAIMANT = int(Block.LOST), int(Slot.TICK), int(Box.CLAIMANT)
+_LOST, _CLAIMANT = int(Block.LOST), int(Box.CLAIMANT)
 
 
 class Witness:
@@ -97,10 +97,10 @@ class SilenceWatch:
             # It comes, though later than it should.
             return False
         # In this order: a writer publishes before it says that it has finished.
-        finished = self._cycles.finished
-        head = self._slots.box[0]
+        finished, slots = self._cycles.finished, self._slots
+        head = slots.box[0]
         # A serial without a message was lost on its way, not suppressed.
-        return self._slots.holds(head) and self._slots.head_words(head)[_TICK] < finished
+        return slots.copy(head) and slots.serial == head and slots.tick < finished
 
     def _tell(self, code: Alarm, tick: int, age: int) -> None:
         """Ring once for one last message: the next good one ends the episode."""

@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 
-from backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
 from backplane.layout import FieldSpec, MailboxSpec
 from backplane.message import Message
 from backplane.segment import Segment
@@ -144,9 +144,9 @@ class Slots:
         """Return the head of that serial's slot: see `words.Slot`."""
         return self._slot_words[serial & self.mask]
 
-    def is_whole(self, serial: int) -> bool:
-        """Say whether the message in that serial's slot passes its CRC, without copying it."""
-        return self._slot_words[serial & self.mask][_CRC] == crc32(self._slots[serial & self.mask][CRC_FROM:])
+    def keeps(self, serial: int) -> bool:
+        """Say whether that serial's slot is still its own: what was copied from it until now is of no later message."""
+        return serial >= oldest_kept(self.box[0], self.depth)
 
     def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
         """Return each slot's head, as words, and the part of the slot that its CRC covers."""
@@ -160,6 +160,11 @@ class Slots:
         """Copy a message into the local record; False when it is not that message, whole."""
         self.record[:] = self._slots[serial & self.mask]
         return self._words[_SERIAL] == serial and self._words[_CRC] == crc32(self._crc_part)
+
+    def copy(self, serial: int) -> bool:
+        """Copy that serial's slot, whatever it holds, into the local record; False when it did not stay its own."""
+        self.record[:] = self._slots[serial & self.mask]
+        return self.keeps(serial)
 
     @property
     def is_sound(self) -> bool:
@@ -193,6 +198,16 @@ class Slots:
     def tick(self) -> int:
         """Release tick of the cycle that wrote that message."""
         return self._words[_TICK]
+
+    @property
+    def visible(self) -> int:
+        """Tick from which that message may be read."""
+        return self._words[_VISIBLE]
+
+    @property
+    def stamp_ns(self) -> int:
+        """When that message was published, CLOCK_MONOTONIC."""
+        return self._words[_STAMP]
 
     @property
     def basis(self) -> int:
