@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
@@ -51,21 +50,17 @@ class Bar:
 class Lines:
     """A line when something begins and one for how it ended."""
 
-    def __init__(self) -> None:
-        self._since = time.monotonic()
-
     def total(self, seconds: float) -> None:
         """Print what everything takes together."""
         print(f"about {seconds / 60.0:.0f} minutes", flush=True)
 
     def begin(self, text: str) -> None:
         """Print what begins."""
-        self._since = time.monotonic()
         print(text, flush=True)
 
     def end(self, seconds: float, ended: str, shortfalls: Sequence[str]) -> None:
         """Print how it ended."""
-        print(f"  {ended} after {time.monotonic() - self._since:.0f} s", flush=True)
+        print(f"  {ended}", flush=True)
         for line in shortfalls:
             print(f"  {line}", flush=True)
 

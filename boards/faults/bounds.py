@@ -18,6 +18,8 @@ from boards.faults.kinds import Kind
 
 RACK_NS = 5_000_000
 """Within this time the Rack knows of a death: the kernel tells it by a pidfd."""
+MEMORY_NS = 45_000_000
+"""Real time that the kernel may take, before that, to give back the memory of a process that was killed."""
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
@@ -132,3 +134,9 @@ def _mailboxes(injection: Injection, layout: Layout, board: str, reader: str | N
 def _first_read(mailboxes: tuple[MailboxSpec, ...], layout: Layout) -> int:
     """Return the cycle of the fastest reader of each mailbox, of the slowest such."""
     return max((min(cycle_ticks(layout, reader) for reader in m.readers) for m in mailboxes), default=0)
+
+
+def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
+    """Return the cycle of the slowest reader of these mailboxes: so long after a fault one may still find traces."""
+    readers = (reader for name in mailboxes for reader in layout.mailbox(name).readers)
+    return max((cycle_ticks(layout, reader) for reader in readers), default=0)

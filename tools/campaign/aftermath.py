@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from boards.events import Event
+from boards.faults.consequences import consequence
 from boards.faults.kinds import KINDS, NUMBERS, Where
+from tools.campaign.detection import table_kind
 from tools.campaign.ending import Strike
-from tools.campaign.plan import EXTERNAL
 
 UNDONE_BY: Mapping[str, str] = {"brakes_closed": "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Reactions, and the recovery that undoes each."""
@@ -17,11 +18,15 @@ TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
 
 
 class Aftermath(NamedTuple):
-    """Reactions by code, whether all of them were undone, and the ticks from the strike to the last undone."""
+    """Reactions by code, whether all of them were undone, and the ticks from the strike to the last undone.
+
+    `lacking`: codes of reactions that must come after a fault of this kind, and did not.
+    """
 
     reactions: tuple[str, ...] = ()
-    is_recovered: bool = True
+    is_undone: bool = True
     recovery: int | None = None
+    lacking: tuple[str, ...] = ()
 
 
 def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermath:
@@ -32,16 +37,22 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermat
     reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon and _can_react(strike, e)]
     undone = [_undone(reaction, after) for reaction in reactions]
     names = tuple(dict.fromkeys(event.code for event in reactions))
-    if any(tick is None for tick in undone):
-        return Aftermath(names, is_recovered=False)
+    lacking = tuple(code for code in consequence(table_kind(strike.kind)).reactions if code not in names)
     last = max((tick for tick in undone if tick is not None), default=None)
-    return Aftermath(names, True, None if last is None else last - strike.tick)
+    if None in undone or last is None:
+        return Aftermath(names, None not in undone, None, lacking)
+    return Aftermath(names, True, last - strike.tick, lacking)
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
     """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles."""
     for_misses = reaction.code == "brakes_closed" and reaction.value > 0
-    return not for_misses or strike.kind == EXTERNAL or KINDS[NUMBERS[strike.kind]].where in TAKE_CYCLES
+    return not for_misses or takes_cycles(strike)
+
+
+def takes_cycles(strike: Strike) -> bool:
+    """Say whether a fault keeps tasks from their cycles, so that these are missed because of it."""
+    return KINDS[NUMBERS[table_kind(strike.kind)]].where in TAKE_CYCLES
 
 
 def _undone(reaction: Event, after: Sequence[Event]) -> int | None:

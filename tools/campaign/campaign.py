@@ -1,50 +1,64 @@
-"""A campaign: a faultless run, trials with faults, kills, sizes, and faultless time, one after the other."""
+"""A campaign: a faultless run, trials with faults, kills, sizes, and faultless time; each run is kept in a file."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from backplane.layout import Layout
 from boards.config import wire
 from boards.config.schema import RackConfig
 from boards.faults.request import injections
 from tools.answer import Failure
-from tools.campaign.draw import Course, fault_plans, kill_plans, size_plans
+from tools.campaign.draw import Course, fault_plans, kill_plans, needs_real_time, size_plans
+from tools.campaign.instruments import examine
 from tools.campaign.interrupt import Interrupt
-from tools.campaign.load import cpu_load
+from tools.campaign.load import load
 from tools.campaign.plan import Plan
-from tools.campaign.results import Faultless, Judged, Results
+from tools.campaign.results import Faultless, Finding, Results, kept
 from tools.campaign.targets import Targets, kinds_for
-from tools.campaign.trial import run_trial
+from tools.campaign.trial import restart_s
+from tools.campaign.workers import Job, Workers
 from tools.progress import Progress
 
 LAUNCH_S = 2.0
 """What a launch and an end take, about: the progress bar's guess."""
-RESTART_S = 2.0
-"""What a restart takes in real time, at most."""
 SHORTEST_S = 1.0
 """Faultless time is not cut finer."""
+ROUNDS = 5
+"""A fault that has not struck is drawn again so often, at another instant; then it is missing."""
+ORDER, TRIALS = "order.json", "trials"
+"""What of a campaign's folder tells what it is, and where its trials are."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """What a campaign is asked for. `modes` are True for lockstep, by turns; `seconds`: of a rack that no task ends."""
+    """What a campaign is asked for. `injections` of each kind; `modes` are True for lockstep, in their order.
+
+    `seconds`: of a rack that no task ends. `loads`: for each stretch of faultless time, whether beside a load.
+    """
 
     name: str
     config: RackConfig
-    runs: int
+    injections: int
     seed: int
     modes: tuple[bool, ...]
     kinds: str | None = None
     kills: int = 0
     sizes: int = 0
     faultless_s: float = 0.0
+    loads: tuple[bool, ...] = (False, True)
     seconds: float | None = None
+
+    def document(self) -> dict[str, Any]:
+        """Return the order as plain data: equal for campaigns that are the same."""
+        return {**vars(self), "config": self.config.text()}
 
 
 class Campaign:
@@ -53,97 +67,145 @@ class Campaign:
     def __init__(self, order: Order, folder: Path, progress: Progress, interrupt: Interrupt) -> None:
         self.order, self.folder = order, folder
         self._progress, self._interrupt = progress, interrupt
-        self._rack = f"camp-{os.getpid()}x"
         # Its own faults alone: a config's own ones would strike every trial.
         self._config = order.config.model_copy(update={"fault": ()})
         self.layout: Layout = wire(self._config)
         self._second = 1e9 / self._config.clock_ns
-        targets = Targets(self._config, self.layout)
-        self.kinds = kinds_for(order.kinds, targets, True in order.modes, False in order.modes)
-        self._targets = targets
-        self._ticks = round((order.seconds or 0.0) * self._second)
+        self._targets = Targets(self._config, self.layout)
+        self.kinds = kinds_for(order.kinds, self._targets, True in order.modes, False in order.modes)
+        self._ticks = 0
+        self._number = 0
 
     def run(self) -> Results:
-        """Do everything, or what there is time for until Ctrl-C."""
-        self._progress.begin("without faults, in lockstep")
-        nominal = self._judged(Plan(0, "nominal", lockstep=True))
-        if nominal.ended != "task done" and not self._interrupt.is_set:
-            raise Failure(f"{self.order.name}: not done even without faults: {'; '.join(nominal.shortfalls)}")
-        results = Results(nominal)
-        self._ticks = nominal.trial.outcome.ticks if nominal.trial.outcome else self._ticks
-        trials, sizes = self._plans()
-        self._progress.total(self._guess_s([*trials, *sizes]) + 2 * self.order.faultless_s)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / "trials.jsonl").open("w", buffering=1) as log:
-            for plans, found in ((trials, results.trials), (sizes, results.sizes)):
-                for judged in self._trials(plans):
-                    found.append(judged)
-                    log.write(json.dumps(judged.document()) + "\n")
-        self._faultless(results)
+        """Do everything that is not done yet, or what there is time for until Ctrl-C."""
+        self._open()
+        examine(self._config)
+        with Workers(self._config, self._interrupt) as self._workers:
+            self._progress.begin("without faults, in lockstep")
+            made = self._made([Plan(0, "nominal", lockstep=True)])
+            if not made:
+                raise Failure(f"{self.order.name}: interrupted before anything was found")
+            nominal = made[0]
+            if nominal.shortfalls or nominal.ended != "task done":
+                raise Failure(f"{self.order.name}: not done even without faults: {'; '.join(nominal.shortfalls)}")
+            results, self._ticks = Results(nominal), nominal.ticks
+            self._inject(results)
+            results.sizes += self._made(size_plans(self._course(True), self.kinds, *self._swept()))
+            self._run_faultless(results)
         results.is_interrupted = self._interrupt.is_set
         return results
 
-    def _plans(self) -> tuple[list[Plan], list[Plan]]:
-        """Return the plans of trials and of the sweep of sizes; all of them fit the config."""
-        order, course = self.order, Course(self._targets, self._ticks, self._second, self._restart_s())
-        modes = [order.modes[place % len(order.modes)] for place in range(order.runs)]
-        trials = list(fault_plans(course, self.kinds, order.seed, modes))
-        trials += kill_plans(course, order.kills, order.seed, order.modes, len(trials) + 1)
-        sizes = list(size_plans(course, self.kinds, order.sizes, order.seed, len(trials) + 1))
-        for plan in (*trials, *sizes):
-            injections(plan.config(self._config, self._rack), self.layout)
-        return trials, sizes
+    def _open(self) -> None:
+        """Make the folder, or go on in it. Raises `Failure` where it is another campaign's."""
+        path, wanted = self.folder / ORDER, json.loads(json.dumps(self.order.document()))
+        if path.exists():
+            there = json.loads(path.read_text())
+            if other := [key for key in wanted if wanted[key] != there.get(key)]:
+                told = ", ".join(key.replace("_", " ") for key in other)
+                raise Failure(f"--out {self.folder}: holds another campaign; it differs in {told}", 2)
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(wanted, indent=2) + "\n")
 
-    def _restart_s(self) -> float:
-        in_lockstep = self._config.supervision.lockstep_restart_s
-        return in_lockstep if False not in self.order.modes else max(RESTART_S, in_lockstep)
+    def _course(self, lockstep: bool) -> Course:
+        return Course(self._targets, self._ticks, self._second, restart_s(self._config, lockstep))
 
-    def _trials(self, plans: list[Plan]) -> Iterator[Judged]:
-        for place, plan in enumerate(plans, 1):
-            if self._interrupt.is_set:
-                return
-            self._progress.begin(f"trial {place} of {len(plans)}: {_told(plan)}")
-            judged = self._judged(plan)
-            if judged.trial.is_interrupted:
-                return
-            shortfalls = judged.shortfalls
-            if shortfalls:
-                (self.folder / f"trial-{plan.number:03}.toml").write_text(plan.toml(self.order.name))
-            self._progress.end(self._guess_s([plan]), judged.ended, shortfalls)
-            yield judged
+    def _swept(self) -> tuple[int, int, int]:
+        return self.order.sizes, self.order.seed, self._number + 1
 
-    def _faultless(self, results: Results) -> None:
-        """Run without faults, first alone, then beside busy processes."""
-        for loaded in (False, True) if self.order.faultless_s else ():
-            with ExitStack() as stack:
-                load = stack.enter_context(cpu_load()) if loaded else 0
-                judged, total = [], 0.0
-                while (left := self.order.faultless_s - total) >= SHORTEST_S and not self._interrupt.is_set:
-                    beside = f" beside {load} busy processes" if load else ""
-                    self._progress.begin(f"faultless{beside}, {left:.0f} s to go")
-                    seconds = left if left < self._ticks / self._second else self.order.seconds
-                    run = self._judged(Plan(0, "faultless", lockstep=False), seconds)
-                    if run.trial.is_interrupted:
-                        break
-                    judged.append(run)
-                    # A run that has not come to an end would come to none the next time either.
-                    ran_s = run.trial.outcome.ticks / self._second if run.trial.outcome else left
-                    total += ran_s
-                    self._progress.end(ran_s, run.ended, run.shortfalls)
-                results.faultless.append(Faultless(load, total, tuple(judged)))
+    def _inject(self, results: Results) -> None:
+        """Make trials until every kind has struck as often as asked for; in real time what lockstep cannot have."""
+        order, both = self.order, len(self.order.modes) > 1
+        for lockstep in order.modes:
+            kinds = [k for k in self.kinds if needs_real_time(k) != lockstep] if both or lockstep else self.kinds
+            lacking = dict.fromkeys(kinds if order.injections else (), order.injections)
+            for turn in range(ROUNDS):
+                plans = fault_plans(self._course(lockstep), lacking, f"{order.seed} {turn}", lockstep, self._number + 1)
+                found = self._made(plans)
+                results.trials += found
+                struck = Counter(f.kind for run in found for f in run.faults if f.is_judged and f.seen != "not struck")
+                lacking = {kind: left for kind, count in lacking.items() if (left := count - struck[kind]) > 0}
+                if not lacking or self._interrupt.is_set:
+                    break
+            results.lacking += _lines(lacking, order.injections)
+        # A run of kills is in one mode or the other, by turns.
+        course = self._course(False not in order.modes)
+        kills = kill_plans(course, order.kills, order.seed, order.modes, self._number + 1)
+        results.trials += self._made(list(kills))
 
-    def _judged(self, plan: Plan, seconds: float | None = None) -> Judged:
+    def _made(self, plans: Sequence[Plan]) -> list[Finding]:
+        """Return what became of these plans, in their order: made now, or kept from before."""
+        for plan in plans:
+            injections(plan.config(self._config, "campaign"), self.layout)
+        self._number = max([self._number, *(plan.number for plan in plans)])
+        self._progress.total(self._guess_s(plans))
+        for lockstep in (True, False):
+            jobs = [self._job(plan) for plan in plans if plan.lockstep is lockstep]
+            jobs = [job for job in jobs if self._kept(job) is None]
+            if jobs:
+                self._progress.begin(f"{len(jobs)} in {'lockstep' if lockstep else 'real time'}")
+            for job in self._workers.run(jobs, alone=not lockstep):
+                self._tell(job)
+        return [found for plan in plans if (found := self._kept(self._job(plan))) is not None]
+
+    def _job(self, plan: Plan, seconds: float | None = None) -> Job:
+        name = f"{plan.number:04}" if plan.number else plan.purpose
         seconds = self.order.seconds if seconds is None else seconds
-        return Judged.of(run_trial(self._config, plan, self._rack, self._ticks, seconds, self._interrupt))
+        return Job(plan, self.folder / TRIALS / f"{name}.json", self._ticks, seconds)
+
+    def _kept(self, job: Job) -> Finding | None:
+        """Return what is kept of a trial; None for another one's, drawn by another version."""
+        found = kept(job.path)
+        return found if found is not None and found.plan == job.plan else None
+
+    def _tell(self, job: Job) -> None:
+        """Show how a trial ended; where it falls short, leave a plan that repeats it."""
+        if (found := self._kept(job)) is None:
+            return
+        if found.shortfalls and job.plan.number:
+            (self.folder / f"trial-{job.plan.number:04}.toml").write_text(job.plan.toml(self.order.name))
+        self._progress.end(self._guess_s([job.plan]), f"{_told(job.plan)}: {found.ended}", found.shortfalls)
+
+    def _run_faultless(self, results: Results) -> None:
+        """Run without faults, alone or beside a load, until there is time enough of it."""
+        for place, is_loaded in enumerate(self.order.loads if self.order.faultless_s else ()):
+            with ExitStack() as stack:
+                beside = stack.enter_context(load()) if is_loaded else ""
+                runs = list(self._calm(place, beside))
+            results.faultless.append(Faultless(beside, sum(run.ticks for run in runs) / self._second, tuple(runs)))
+
+    def _calm(self, place: int, beside: str) -> Iterator[Finding]:
+        """Yield faultless runs in real time."""
+        left, nth = self.order.faultless_s, 0
+        while left >= SHORTEST_S and not self._interrupt.is_set:
+            self._progress.begin(f"faultless{f' beside {beside}' if beside else ''}, {left:.0f} s to go")
+            seconds = left if left < self._ticks / self._second else self.order.seconds
+            plan = Plan(0, "faultless", lockstep=False)
+            job = self._job(plan, seconds)
+            job = Job(plan, job.path.with_stem(f"faultless-{place}-{nth:03}"), job.ticks, seconds)
+            if self._kept(job) is None:
+                list(self._workers.run([job], alone=True))
+            if (found := self._kept(job)) is None:
+                return
+            yield found
+            # A run that has not come to an end would come to none the next time either.
+            ran_s = found.ticks / self._second or left
+            left, nth = left - ran_s, nth + 1
+            self._progress.end(ran_s, found.ended, found.shortfalls)
 
     def _guess_s(self, plans: Sequence[Plan]) -> float:
-        """Return about how long runs take: in lockstep a second of the default rack takes a third of one."""
-        real_s = self._ticks / self._second
-        return sum(LAUNCH_S + (real_s / 3.0 if plan.lockstep else real_s) for plan in plans)
+        """Return about how long runs take: in lockstep a second of the default rack takes a third of one on a core."""
+        real_s, cores = self._ticks / self._second, len(os.sched_getaffinity(0))
+        return sum(LAUNCH_S + (real_s / 3.0 / cores if plan.lockstep else real_s) for plan in plans)
+
+
+def _lines(lacking: Mapping[str, int], wanted: int) -> Iterator[str]:
+    for kind, left in lacking.items():
+        yield f"{kind}: struck {wanted - left} of {wanted} times, however often it was drawn"
 
 
 def _told(plan: Plan) -> str:
-    faults = [f"{table['kind']} {table.get('mailbox') or table['board']}" for table in plan.faults]
-    kills = [f"{kill.board}" for kill in plan.kills]
-    told = [*faults, *([f"external kills of {', '.join(kills)}"] if kills else [])]
-    return f"{'lockstep' if plan.lockstep else 'real time'}: {', '.join(told)}"
+    """Return a plan in a few words."""
+    kinds = Counter([*(table["kind"] for table in plan.faults), *(["external kill"] * len(plan.kills))])
+    found = ", ".join(f"{count} {kind}" if count > 1 else kind for kind, count in kinds.items())
+    return f"trial {plan.number}, {found}" if plan.number else plan.purpose

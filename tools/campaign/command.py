@@ -16,43 +16,52 @@ if TYPE_CHECKING:
     from tools.campaign.campaign import Campaign, Order
     from tools.campaign.results import Results
 
+INJECTIONS = 3
 SIZES = 10
 FAULTLESS_S = 60.0
 
-Runs = Annotated[
-    int, typer.Option("--runs", metavar="N", min=1, help="trials, each with 3 to 5 faults in the whole task")
+Injections = Annotated[
+    int,
+    typer.Option("--injections", metavar="N", min=0, help="how often each kind strikes, as many faults a trial as fit"),
 ]
 Seed = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="the same seed draws the same plans")]
 Kinds = Annotated[str | None, typer.Option(metavar="A,B", help="these kinds alone; default: all that it can have")]
 Kills = Annotated[
     int | None, typer.Option(metavar="N", min=1, help="nothing but N kills from outside, in as many runs as it takes")
 ]
-LockstepOnly = Annotated[bool, typer.Option("--lockstep", help="trials in lockstep alone; default: both by turns")]
-RealtimeOnly = Annotated[bool, typer.Option("--realtime", help="trials in real time alone")]
+LockstepOnly = Annotated[bool, typer.Option("--lockstep", help="trials in lockstep alone; default: both")]
+RealtimeOnly = Annotated[
+    bool, typer.Option("--realtime", help="trials in real time alone; default: what lockstep lacks")
+]
 Faultless = Annotated[
     float | None,
     typer.Option(
         metavar="S", min=0.0, help=f"faultless seconds in real time, alone and loaded, each; default {FAULTLESS_S:g}"
     ),
 ]
+Load = Annotated[bool, typer.Option("--load", help="faultless time beside a load alone: stress-ng where there is one")]
 Sizes = Annotated[
     int | None, typer.Option(metavar="N", min=0, help=f"sizes for the curves of bias and noise; default {SIZES}")
 ]
 Seconds = Annotated[
     float | None, typer.Option(metavar="S", min=1.0, help="simulated time of a run, for a rack that no task ends")
 ]
-Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the campaign; default: runs/campaign-<time>")]
+Out = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="folder; one of the same campaign goes on; default: runs/campaign-<time>"),
+]
 
 
 def campaign(
     config: ConfigName,
-    runs: Runs = 20,
+    injections: Injections = INJECTIONS,
     seed: Seed = 0,
     kinds: Kinds = None,
     kills: Kills = None,
     lockstep: LockstepOnly = False,
     realtime: RealtimeOnly = False,
     faultless: Faultless = None,
+    load: Load = False,
     sizes: Sizes = None,
     seconds: Seconds = None,
     settings: Settings = [],  # noqa: B006  typer copies it
@@ -61,17 +70,21 @@ def campaign(
 ) -> None:
     """Inject faults of all kinds at random into runs of a rack, and publish what became of each.
 
-    A trial in lockstep of the default rack takes about ten seconds, one in real time forty. The exit status is 1 where
-    a fault was not found in its bound, a limit was violated, anything was left behind, a task was neither
-    done nor safely stopped, or anything tripped without a fault.
+    Trials in lockstep run on all cores at once, others one after the other. A campaign that was interrupted goes on
+    with the same --out. The exit status is 1 where a fault did not strike, was not found in its bound, not reacted
+    to or not recovered from in its bound, a limit was violated, anything was left behind, a task was neither done
+    nor safely stopped, or anything tripped without a fault.
     """
-    from tools.campaign.campaign import Campaign
+    from tools.campaign.campaign import ORDER, Campaign
     from tools.campaign.interrupt import Interrupt
     from tools.folders import folder_of
     from tools.progress import progress_for
 
-    order = _order(config, settings, runs, seed, kinds, kills, lockstep, realtime, faultless, sizes, seconds)
-    folder, started = folder_of(out, "campaign"), time.monotonic()
+    order = _order(
+        config, settings, injections, seed, kinds, kills, lockstep, realtime, faultless, load, sizes, seconds
+    )
+    goes_on, started = out is not None and (out / ORDER).is_file(), time.monotonic()
+    folder = out if out is not None and goes_on else folder_of(out, "campaign")
     with Interrupt() as interrupt:
         with progress_for(silent=as_json) as progress:
             work = Campaign(order, folder, progress, interrupt)
@@ -84,25 +97,26 @@ def campaign(
 def _order(
     name: str,
     settings: list[str],
-    runs: int,
+    injections: int,
     seed: int,
     kinds: str | None,
     kills: int | None,
     lockstep: bool,
     realtime: bool,
     faultless: float | None,
+    load: bool,
     sizes: int | None,
     seconds: float | None,
 ) -> Order:
     """Return what is asked for. Raises `ConfigError`, and `Failure` for options that exclude each other."""
-    from boards.config import load
+    from boards.config import load as load_config
     from tools.campaign.campaign import Order
 
     if lockstep and realtime:
         raise Failure("--lockstep and --realtime: each excludes the other; give one, or none for both by turns", 2)
     if kills is not None and kinds is not None:
         raise Failure(f"--kills {kills} and --kinds {kinds}: kills from outside are a kind by themselves; give one", 2)
-    found = load(name, settings)
+    found = load_config(name, settings)
     if seconds is None and not any(board.ends_run for board in found.board.values()):
         raise Failure(f"{name}: no board ends the run: give --seconds, the simulated time of a run", 2)
     # What runs in real time beside the trials is left out where only lockstep, or only kills, were asked for.
@@ -110,13 +124,14 @@ def _order(
     return Order(
         name=name,
         config=found,
-        runs=0 if kills else runs,
+        injections=0 if kills else injections,
         seed=seed,
         modes=(True,) if lockstep else (False,) if realtime else (True, False),
         kinds=kinds,
         kills=kills or 0,
         sizes=(0 if kills or realtime else SIZES) if sizes is None else sizes,
         faultless_s=(0.0 if alone else FAULTLESS_S) if faultless is None else faultless,
+        loads=(True,) if load else (False, True),
         seconds=seconds,
     )
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from backplane.address_map import CLOCK
 from backplane.alarms import Alarm
 from boards.events import Event
+from boards.faults.consequences import consequence
 from boards.faults.kinds import KINDS, NUMBERS
+from boards.faults.text import ALL_JOINTS
 from tools.campaign.ending import Strike
 from tools.campaign.plan import EXTERNAL
 
 FOUND = ("detection", "miss", "died")
 """Kinds of events that can be a detection."""
-DEATHS = ("kill", EXTERNAL, "lock-held")
-"""Kinds that end a process: the Rack sees it, besides its neighbours."""
 MAILBOX_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.LOCKED}
+CLOCK_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE}
 TASK_ALARMS = {alarm.name.lower() for alarm in (Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED)}
 
 
@@ -25,8 +27,7 @@ class Detection:
 
     `delay` and `bound` are ticks; ticks that the clock itself left out did not happen and are not counted.
     `delay_ms` is time of the wall clock, None where that means nothing: in lockstep. `bound_ms` is the bound of a death
-    at the Rack; beyond that there is still the one of the neighbours, in ticks, for the loss stands on the backplane as
-    soon as the Rack's crate has seen it.
+    in real time, and then the only one.
     """
 
     event: Event
@@ -38,8 +39,8 @@ class Detection:
     @property
     def is_within(self) -> bool:
         """Whether the fault was found as soon as it must be."""
-        if self.bound_ms is not None and self.delay_ms is not None and self.delay_ms <= self.bound_ms:
-            return True
+        if self.bound_ms is not None and self.delay_ms is not None:
+            return self.delay_ms <= self.bound_ms
         return self.bound is None or self.delay <= self.bound
 
     @property
@@ -48,31 +49,51 @@ class Detection:
         return not self.is_within, self.delay, self.delay_ms or 0.0
 
 
+def table_kind(kind: str) -> str:
+    """Return the kind of the table of kinds that a kind of a campaign behaves as."""
+    return "kill" if kind == EXTERNAL else kind
+
+
 def codes_of(kind: str) -> set[str]:
-    """Return the codes of events that count as detection of a kind."""
-    kill = kind == EXTERNAL
-    codes = {alarm.name.lower() for alarm in KINDS[NUMBERS["kill" if kill else kind]].seen_as}
-    return codes | ({"died"} if kind in DEATHS else set())
+    """Return the codes of events that count as detection of a kind: a death is the Rack's to find."""
+    if table_kind(kind) == "kill":
+        return {"died"}
+    return {alarm.name.lower() for alarm in KINDS[NUMBERS[kind]].seen_as} | ({"died"} if kind == "lock-held" else set())
 
 
 def fits(event: Event, strike: Strike) -> bool:
-    """Say whether an event can be of a fault: it is of its kind, about the same thing, and not before it.
+    """Say whether an event can be the detection of a fault: it is of its kind, about the same thing, and not before it.
 
     A fault may strike a moment before its tick is given out; who looks at the tick then sees the one before.
     """
     if event.kind not in FOUND or strike.tick < 0 or event.tick < strike.tick - (event.kind == "died"):
         return False
-    code = "died" if event.kind == "died" else event.code
-    if code not in codes_of(strike.kind):
-        return False
-    if code == "died":
+    return event.code in codes_of(strike.kind) and is_about(event, strike)
+
+
+def explains(strike: Strike, event: Event) -> bool:
+    """Say whether an event in a fault's time can come of it: as its detection, or as a consequence of its kind."""
+    follows = consequence(table_kind(strike.kind))
+    if event.kind == "died":
+        return strike.board == event.board and follows.ends_process
+    if event.code in {alarm.name.lower() for alarm in follows.arm}:
+        return True
+    own = {alarm.name.lower() for alarm in (*KINDS[NUMBERS[table_kind(strike.kind)]].seen_as, *follows.own)}
+    return event.code in own and is_about(event, strike)
+
+
+def is_about(event: Event, strike: Strike) -> bool:
+    """Say whether an event is about what a fault has struck: its mailboxes, its task, its joint."""
+    if event.code == "died":
         return event.board == strike.board
-    if code in MAILBOX_ALARMS:
+    if event.code in MAILBOX_ALARMS:
         return event.subject in strike.mailboxes
-    if code in TASK_ALARMS:
+    if event.code in TASK_ALARMS:
         return event.subject == strike.board
-    # What is said of all joints may be said of any, and the other way round.
-    return not event.subject or not strike.joint or event.subject == strike.joint
+    if event.code in CLOCK_ALARMS:
+        return strike.board == CLOCK
+    # An alarm about all joints may be about any, and the other way round.
+    return not event.subject or not strike.joint or event.subject in (strike.joint, ALL_JOINTS)
 
 
 class LeftOut:

@@ -8,9 +8,9 @@ from dataclasses import asdict
 from typing import Any
 
 from tools.campaign.campaign import Campaign
-from tools.campaign.results import Judged, Results
+from tools.campaign.results import Finding, Results
 from tools.campaign.shape import SIZED, judged_size
-from tools.campaign.statistics import by_kind, curve, totals
+from tools.campaign.statistics import by_kind, curve, rate, totals
 
 Document = dict[str, Any]
 
@@ -20,10 +20,10 @@ def document(campaign: Campaign, results: Results, wall_s: float) -> Document:
     order, clock_ns = campaign.order, campaign.layout.clock_ns
     kinds = by_kind(results.faults, clock_ns)
     for kind, figures in kinds.items():
-        with_it = [j for j in results.trials if any(f.kind == kind and f.struck >= 0 for f in j.verdict.faults)]
+        with_it = [run for run in results.trials if any(f.kind == kind and f.struck >= 0 for f in run.faults)]
         figures["trials"] = len(with_it)
-        figures["tasks_done"] = sum(judged.ended == "task done" for judged in with_it)
-    summary = _summary(results)
+        figures["tasks_done"] = sum(run.ended == "task done" for run in with_it)
+    summary = _summary(results, 1e9 / clock_ns)
     return {
         "config": order.name,
         "seed": order.seed,
@@ -39,20 +39,22 @@ def document(campaign: Campaign, results: Results, wall_s: float) -> Document:
         "sizes": _sizes(results, clock_ns),
         "faultless": [part.document() for part in results.faultless],
         "faults": [
-            {"trial": judged.trial.plan.number, "lockstep": judged.trial.plan.lockstep, **asdict(fault)}
-            for judged in results.trials
-            for fault in judged.verdict.faults
+            {"trial": run.plan.number, "lockstep": run.plan.lockstep, **asdict(fault)}
+            for run in results.trials
+            for fault in run.faults
         ],
-        "trials": [_trial(judged) for judged in results.trials],
-        "shortfalls": _shortfalls(results, summary),
+        "trials": [_trial(run) for run in results.trials],
+        "shortfalls": _shortfalls(results),
     }
 
 
-def _summary(results: Results) -> Document:
-    trials = results.trials
-    ended = [judged.ended for judged in trials]
+def _summary(results: Results, second: float) -> Document:
+    trials, runs = results.trials, results.runs
+    ended = [run.ended for run in trials]
     calm_s = sum(part.seconds for part in results.faultless)
     trips = sum(part.trips for part in results.faultless)
+    simulated_s = sum(run.ticks for run in runs) / second
+    unexplained = sum(len(run.unexplained) for run in runs)
     return {
         **totals(results.faults),
         "trials": len(trials),
@@ -60,56 +62,53 @@ def _summary(results: Results) -> Document:
         "safely_stopped": ended.count("safely stopped"),
         "not_armed": ended.count("not armed"),
         "neither": ended.count("neither"),
-        "limits_violated": sum(judged.trial.arm.violations for judged in results.runs),
-        "touches": sum(judged.trial.arm.touches for judged in results.runs),
-        "left_behind": sum(len(judged.trial.left) for judged in results.runs),
-        "unexplained": sum(len(judged.verdict.unexplained) for judged in (results.nominal, *trials, *results.sizes)),
+        "limits_violated": sum(run.violations for run in runs),
+        "touches": sum(run.touches for run in runs),
+        "left_behind": sum(len(run.left) for run in runs),
+        "simulated_s": round(simulated_s, 1),
+        "unexplained": unexplained,
+        "unexplained_per_hour": rate(unexplained, simulated_s),
+        "stray_misses": sum(run.stray_misses for run in trials if not run.plan.lockstep),
         "false_trips": trips,
         "faultless_s": round(calm_s, 1),
-        "false_trips_per_hour": round(trips * 3600.0 / calm_s, 3) if calm_s else None,
+        "false_trips_per_hour": rate(trips, calm_s),
     }
 
 
-def _shortfalls(results: Results, summary: Document) -> list[str]:
+def _shortfalls(results: Results) -> list[str]:
     """Return what fails the campaign, a line each."""
-    found = [f"{_run_of(judged)}: {line}" for judged in results.runs for line in judged.shortfalls]
-    if summary["drawn"] and not summary["injected"]:
-        found.append(f"none of the {summary['drawn']} faults that were drawn has struck")
-    return found
+    return [*(f"{_run_of(run)}: {line}" for run in results.runs for line in run.shortfalls), *results.lacking]
 
 
-def _run_of(judged: Judged) -> str:
-    plan = judged.trial.plan
-    return f"trial {plan.number}" if plan.number else f"{plan.purpose} run"
+def _run_of(run: Finding) -> str:
+    return f"trial {run.plan.number}" if run.plan.number else f"{run.plan.purpose} run"
 
 
 def _sizes(results: Results, clock_ns: int) -> Document:
-    swept = [fault for judged in results.sizes for fault in judged.verdict.faults] + results.faults
+    swept = [fault for run in results.sizes for fault in run.faults] + results.faults
     curves = {kind: curve(swept, kind, clock_ns) for kind in SIZED}
     return {kind: {"judged_from": judged_size(kind), "curve": points} for kind, points in curves.items() if points}
 
 
-def _nominal(judged: Judged, clock_ns: int) -> Document:
-    outcome = judged.trial.outcome
-    ticks = outcome.ticks if outcome else 0
-    return {"ticks": ticks, "seconds": round(ticks * clock_ns * 1e-9, 3), "digest": outcome.digest if outcome else ""}
+def _nominal(run: Finding, clock_ns: int) -> Document:
+    return {"ticks": run.ticks, "seconds": round(run.ticks * clock_ns * 1e-9, 3), "digest": run.digest}
 
 
-def _trial(judged: Judged) -> Document:
-    plan = judged.trial.plan
+def _trial(run: Finding) -> Document:
     return {
-        "number": plan.number,
-        "purpose": plan.purpose,
-        "lockstep": plan.lockstep,
-        "faults": len(judged.verdict.faults),
-        "ended": judged.ended,
-        "wall_s": round(judged.trial.wall_s, 1),
-        "shortfalls": judged.shortfalls,
+        "number": run.plan.number,
+        "purpose": run.plan.purpose,
+        "lockstep": run.plan.lockstep,
+        "faults": len(run.faults),
+        "ended": run.ended,
+        "wall_s": round(run.wall_s, 1),
+        "shortfalls": list(run.shortfalls),
     }
 
 
 def _machine(results: Results) -> Document:
-    notes = [e.text for j in results.runs for e in j.trial.events if e.kind == "ready"]
+    # In lockstep trials are kept to a core each, and say so.
+    notes = [note for run in results.runs if not run.plan.lockstep for note in run.notes]
     return {
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),

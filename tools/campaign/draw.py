@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from random import Random
 from typing import Any
 
+from boards.faults.consequences import recovery_ticks
 from boards.faults.kinds import KINDS, NUMBERS
+from tools.campaign.detection import table_kind
 from tools.campaign.plan import EXTERNAL, Kill, Plan, Purpose
 from tools.campaign.shape import SIZED, Drawing, Shape, shape, swept_sizes
 from tools.campaign.targets import Target, Targets
 
-FEWEST, MOST = 3, 5
-"""Faults of one trial; as many as fit into the task."""
+MOST = 40
+"""Faults of one trial, at most: as many as fit into the task, and into the fault table."""
 LEAD_S = 0.1
 """Simulated time before the first fault, at least."""
 TAIL_S = 1.0
 """Simulated time of a faultless run for which a fault must not begin: it is to meet a task under way."""
-SETTLE_S = 1.5
-"""Simulated time between the end of a fault and the next one, beside the restart of a board: it recovers first."""
+SETTLE_S = 0.1
+"""Simulated time between the end of all that a fault may lead to and the next fault."""
+EPISODE = 25
+"""Reads after which a reader tells of the next fault of a mailbox again: `backplane.episodes`, and some more."""
+AHEAD = 60
+"""Faults that are looked at for one that still fits into a trial."""
 KILL_GAP_S = 3.5
 """Simulated time between two kills from outside, at least: a restart takes up to two seconds of real time."""
 SEEDS = 2**31
@@ -41,34 +47,29 @@ class Course:
         return round(LEAD_S * self.second)
 
     def last(self) -> int:
-        """Return the tick up to which faults may begin."""
+        """Return the tick up to which faults may begin, and what they lead to last."""
         return max(self.first() + 1, self.ticks - round(TAIL_S * self.second))
 
     def window(self, target: Target, length: int) -> int:
         """Return the ticks from the beginning of a fault to the next: it is seen, over, and recovered from."""
-        restart = self.restart_s if target.kind in ("kill", "hang", "lock-held", EXTERNAL) else 0.0
+        layout, kind = self.targets.layout, table_kind(target.kind)
         # A board that hangs is killed as soon as it is found: its fault is over then.
         lasts = 0 if target.kind == "hang" else length
-        return max(lasts, 5 * target.cycle) + target.cycle + round((restart + SETTLE_S) * self.second)
+        # The slowest bound there is: five cycles of a task, its reader's cycle on top.
+        seen = 5 * target.cycle if target.kind == "hang" else 2 * target.cycle + target.reader if target.mailbox else 20
+        undone = recovery_ticks(kind, target.board, layout, self.restart_s)
+        return max(lasts, seen) + undone + round(SETTLE_S * self.second)
 
 
-class Deck:
-    """Deals kinds at random, each as often as any other."""
+@dataclass(frozen=True)
+class Card:
+    """One fault that waits for its place in a trial."""
 
-    def __init__(self, kinds: Sequence[str], rng: Random) -> None:
-        self._kinds, self._rng = list(kinds), rng
-        self._cards: list[str] = []
-
-    def deal(self, count: int) -> list[str]:
-        """Return so many kinds; one that ends the run before it begins comes alone."""
-        dealt: list[str] = []
-        while len(dealt) < count:
-            if not self._cards:
-                self._cards = self._rng.sample(self._kinds, len(self._kinds))
-            if ends_alone(self._cards[-1]):
-                return dealt or [self._cards.pop()]
-            dealt.append(self._cards.pop())
-        return dealt
+    target: Target
+    shape: Shape
+    window: int
+    seed: int
+    phase: float
 
 
 def ends_alone(kind: str) -> bool:
@@ -76,17 +77,16 @@ def ends_alone(kind: str) -> bool:
     return kind != EXTERNAL and not KINDS[NUMBERS[kind]].recoverable
 
 
-def fault_plans(course: Course, kinds: Sequence[str], seed: int, modes: Sequence[bool]) -> Iterator[Plan]:
-    """Yield a plan for each of `modes`, True for lockstep, with some faults of these kinds.
+def fault_plans(course: Course, counts: Mapping[str, int], seed: str, lockstep: bool, first: int) -> list[Plan]:
+    """Return plans, numbered from `first`, that have each of these kinds so many times.
 
-    The kinds that a mode lacks are left out of its plans; where it lacks all, the mode has no plan.
+    Faults come in random order, as many in a trial as fit into the task, each behind the one before.
     """
-    decks = {mode: _deck(course, kinds, seed, mode) for mode in set(modes)}
-    for number, mode in enumerate(modes, 1):
-        if (found := decks[mode]) is not None:
-            rng, deck = found
-            wanted = [(kind, shape) for kind in deck.deal(rng.randint(FEWEST, MOST))]
-            yield _filled(course, number, mode, "faults", wanted, rng)
+    rng = Random(f"{seed} {'lockstep' if lockstep else 'realtime'}")
+    kinds = [kind for kind, count in counts.items() for _ in range(count)]
+    rng.shuffle(kinds)
+    wanted = [(kind, shape) for kind in kinds]
+    return _packed(course, first, lockstep, "faults", [_card(course, *one, rng) for one in wanted], rng)
 
 
 def kill_plans(course: Course, count: int, seed: int, modes: Sequence[bool], first: int) -> Iterator[Plan]:
@@ -106,60 +106,59 @@ def kill_plans(course: Course, count: int, seed: int, modes: Sequence[bool], fir
         )
 
 
-def size_plans(course: Course, kinds: Sequence[str], count: int, seed: int, first: int) -> Iterator[Plan]:
-    """Yield plans in lockstep with `count` sizes of every kind that is seen from a certain size on."""
+def size_plans(course: Course, kinds: Sequence[str], count: int, seed: int, first: int) -> list[Plan]:
+    """Return plans in lockstep with `count` sizes of every kind that is seen from a certain size on."""
     rng = Random(f"{seed} sizes")
     sizes = [(kind, size) for kind in SIZED if kind in kinds for size in swept_sizes(kind, count)]
     rng.shuffle(sizes)
-    number = first
-    while sizes:
-        drawn, sizes = sizes[:MOST], sizes[MOST:]
-        faults = [(kind, _resized(size)) for kind, size in drawn]
-        plan = _filled(course, number, True, "sizes", faults, rng)
-        # What did not fit into the run comes with the next one.
-        sizes += drawn[len(plan.faults) :]
-        number += 1
-        yield plan
-
-
-def _deck(course: Course, kinds: Sequence[str], seed: int, lockstep: bool) -> tuple[Random, Deck] | None:
-    rng = Random(f"{seed} {'lockstep' if lockstep else 'realtime'}")
-    fitting = [k for k in kinds if course.targets.by_kind[k] and not (lockstep and needs_real_time(k))]
-    return (rng, Deck(fitting, rng)) if fitting else None
+    cards = [_card(course, kind, _resized(size), rng) for kind, size in sizes]
+    return _packed(course, first, True, "sizes", cards, rng)
 
 
 def needs_real_time(kind: str) -> bool:
-    """Say whether a kind does not exist in lockstep."""
-    return kind != EXTERNAL and KINDS[NUMBERS[kind]].realtime
+    """Say whether a kind does not exist in lockstep, or means nothing there: no time passes while a process dies."""
+    return kind == EXTERNAL or KINDS[NUMBERS[kind]].realtime
 
 
-def _filled(
-    course: Course,
-    number: int,
-    lockstep: bool,
-    purpose: Purpose,
-    wanted: Sequence[tuple[str, Callable[[Drawing], Shape]]],
-    rng: Random,
-) -> Plan:
-    """Return a plan with as many of the wanted faults as fit into the task, each behind the one before."""
-    drawn: list[tuple[Target, Shape]] = []
-    windows: list[int] = []
-    for kind, shape_of in wanted:
-        target = rng.choice(course.targets.by_kind[kind])
-        found = shape_of(Drawing(rng, target, course.second, course.targets.joints))
-        window = course.window(target, found.ticks)
-        if drawn and sum(windows) + window > course.last() - course.first():
-            break
-        drawn.append((target, found))
-        windows.append(window)
-    faults, kills = [], []
-    for (target, found), start in zip(drawn, _starts(course, windows, rng), strict=True):
-        phase = _phase(rng)
-        if target.kind == EXTERNAL:
-            kills.append(Kill(target.board, start, phase))
-        else:
-            faults.append(_table(course, target, found, start, 0.0 if lockstep else phase, rng))
-    return Plan(number, purpose, lockstep, tuple(faults), tuple(kills))
+def _card(course: Course, kind: str, shape_of: Callable[[Drawing], Shape], rng: Random) -> Card:
+    target = rng.choice(course.targets.by_kind[kind])
+    found = shape_of(Drawing(rng, target, course.second, course.targets.joints))
+    return Card(target, found, course.window(target, found.ticks), rng.randrange(SEEDS), _phase(rng))
+
+
+def _packed(
+    course: Course, first: int, lockstep: bool, purpose: Purpose, cards: Sequence[Card], rng: Random
+) -> list[Plan]:
+    """Return plans with all of these faults, as many in each as fit into the task."""
+    plans, waiting = list[Plan](), list(cards)
+    while waiting:
+        chosen = _chosen(course, waiting)
+        faults, kills = list[dict[str, Any]](), list[Kill]()
+        for card, start in zip(chosen, _starts(course, [card.window for card in chosen], rng), strict=True):
+            if card.target.kind == EXTERNAL:
+                kills.append(Kill(card.target.board, start, card.phase))
+            else:
+                faults.append(_table(course, card, start, 0.0 if lockstep else card.phase))
+        plans.append(Plan(first + len(plans), purpose, lockstep, tuple(faults), tuple(kills)))
+    return plans
+
+
+def _chosen(course: Course, waiting: list[Card]) -> list[Card]:
+    """Take the faults of one trial out of those that wait, the first of them always."""
+    if ends_alone(waiting[0].target.kind):
+        return [waiting.pop(0)]
+    chosen: list[Card] = []
+    free, busy = course.last() - course.first(), set[str]()
+    for card in waiting[:AHEAD]:
+        target, is_first = card.target, not chosen
+        is_told = target.mailbox is None or target.mailbox not in busy
+        if is_first or (card.window <= free and is_told and len(chosen) < MOST and not ends_alone(target.kind)):
+            chosen.append(card)
+            waiting.remove(card)
+            free -= card.window
+            if target.mailbox is not None and EPISODE * max(target.reader, target.cycle) > card.window:
+                busy.add(target.mailbox)
+    return chosen
 
 
 def _starts(course: Course, windows: Sequence[int], rng: Random) -> list[int]:
@@ -174,8 +173,8 @@ def _starts(course: Course, windows: Sequence[int], rng: Random) -> list[int]:
     return starts
 
 
-def _table(course: Course, target: Target, found: Shape, tick: int, phase: float, rng: Random) -> dict[str, Any]:
-    kind = KINDS[NUMBERS[target.kind]]
+def _table(course: Course, card: Card, tick: int, phase: float) -> dict[str, Any]:
+    target, found, kind = card.target, card.shape, KINDS[NUMBERS[card.target.kind]]
     table: dict[str, Any] = {"kind": kind.name, "board": target.board}
     if kind.where != "start":
         table["tick"] = tick
@@ -185,7 +184,7 @@ def _table(course: Course, target: Target, found: Shape, tick: int, phase: float
         table["phase"] = phase
     if target.mailbox is not None:
         table["mailbox"] = target.mailbox
-    return {**table, "seed": rng.randrange(SEEDS), **found.parameters}
+    return {**table, "seed": card.seed, **found.parameters}
 
 
 def _phase(rng: Random) -> float:

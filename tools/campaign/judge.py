@@ -9,10 +9,11 @@ from typing import Literal
 from backplane.fault_table import Injection
 from backplane.layout import Layout
 from boards.events import Event
-from boards.faults.bounds import RACK_NS, bound_ticks, cycle_ticks
+from boards.faults.bounds import MEMORY_NS, RACK_NS, bound_ticks, cycle_ticks, last_read
+from boards.faults.consequences import consequence, recovery_ticks
 from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.aftermath import aftermath
-from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, fits
+from tools.campaign.aftermath import Aftermath, aftermath, takes_cycles
+from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, explains, fits, table_kind
 from tools.campaign.ending import Strike
 from tools.campaign.plan import EXTERNAL
 from tools.campaign.shape import SIZED, judged_size
@@ -21,12 +22,8 @@ Seen = Literal["detected", "missed", "not struck"]
 Bound = Callable[[Strike, str | None], int | None]
 """Ticks in which a fault must be found, by a reader or, None, by whoever else."""
 
-AFTERMATH_S = 1.5
-"""Simulated time behind a fault's end, and its recovery, in which detections may still be its consequence."""
-
-
-NEIGHBOURS_CYCLES = 4
-"""Cycles of a task that died within which its neighbours must know."""
+SETTLE_S = 0.25
+"""Simulated time behind a fault's bounds in which its traces may still be found."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +31,9 @@ class Judgement:
     """What became of one fault. Delays, bounds and recovery are ticks, `cycle` the ticks of the task's cycle.
 
     `is_judged`: False for a size below the one from which its kind must be seen. `recovery` is the time from the strike
-    until everything that was done about it is undone; None: nothing was done, or it was not undone.
+    until everything that was done about it is undone; None: nothing was done, or it was not undone. `recovery_bound` is
+    counted from the strike too. `lacking` are reactions that must come and did not. `is_latched`: the kind may end the
+    task, and it did.
     """
 
     kind: str
@@ -57,91 +56,112 @@ class Judgement:
     reactions: tuple[str, ...] = ()
     is_recovered: bool = True
     recovery: int | None = None
+    recovery_bound: int | None = None
+    lacking: tuple[str, ...] = ()
+    is_latched: bool = False
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgements of a trial, and what it found that no fault explains."""
+    """The judgements of a trial, and what it found that no fault explains: detections, and misses apart from them."""
 
     faults: tuple[Judgement, ...]
     unexplained: tuple[Event, ...]
+    misses: tuple[Event, ...] = ()
 
 
-def judge(
-    strikes: Sequence[Strike], events: Sequence[Event], layout: Layout, offset_ns: int, lockstep: bool = False
-) -> Verdict:
+@dataclass(frozen=True)
+class Circumstances:
+    """The run whose faults are judged.
+
+    `offset_ns` turns CLOCK_MONOTONIC into the events' time. `restart_s`: simulated time that a restart may take.
+    `has_failed`: the task ended with an error, as some kinds have it.
+    """
+
+    layout: Layout
+    offset_ns: int
+    is_lockstep: bool = False
+    restart_s: float = 2.0
+    has_failed: bool = False
+
+
+def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> Verdict:
     """Judge the faults of a run by what happened in it.
 
-    `offset_ns` turns CLOCK_MONOTONIC into the events' time. One event is the detection of one fault: of two
-    that it fits, of the one that struck first and is not found yet.
+    One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet.
     """
-    return _Judge(strikes, events, layout, offset_ns, lockstep).verdict()
+    return _Judge(strikes, events, run).verdict()
 
 
 class _Judge:
-    def __init__(
-        self, strikes: Sequence[Strike], events: Sequence[Event], layout: Layout, offset_ns: int, lockstep: bool
-    ) -> None:
+    def __init__(self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> None:
         self._strikes = sorted(strikes, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
-        self._events, self._layout, self._offset_ns, self._lockstep = events, layout, offset_ns, lockstep
-        self._bound = _bound_in(layout)
+        self._events, self._run, self._layout = events, run, run.layout
+        self._bound = _bound_in(run.layout)
         self._left_out = LeftOut(events)
         self._last = max((event.tick for event in events), default=0)
-        self._settle = round(AFTERMATH_S * 1e9 / layout.clock_ns)
+        self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
 
     def verdict(self) -> Verdict:
         used: set[int] = set()
-        judged, explained = [], []
+        judged = []
+        windows = [self._window(strike) for strike in self._strikes]
         for place, strike in enumerate(self._strikes):
-            found = self._detections(strike, used)
+            found = self._detections(strike, windows[place][1], used)
             best = min(found, key=lambda detection: detection.order, default=None)
             if best is not None:
                 used.add(id(best.event))
-            judgement = self._judgement(strike, best, self._horizon(place))
-            judged.append(judgement)
-            explained.append(self._window(strike, judgement))
-        return Verdict(tuple(judged), tuple(e for e in self._events if self._is_unexplained(e, explained)))
+            judged.append(self._judgement(strike, best, self._horizon(place, windows[place][1])))
+        stray = [event for event in self._events if self._is_stray(event, windows)]
+        detections = tuple(event for event in stray if event.kind != "miss")
+        return Verdict(tuple(judged), detections, tuple(event for event in stray if event.kind == "miss"))
 
-    def _detections(self, strike: Strike, used: set[int]) -> list[Detection]:
-        ends = strike.ends if strike.ends >= 0 else self._last
-        until = max(ends, strike.tick) + (self._bound(strike, None) or 0) + self._settle
+    def _window(self, strike: Strike) -> tuple[int, int]:
+        """Return the first and the last tick in which an event may come of a fault."""
+        first = strike.tick if strike.tick >= 0 else strike.began
+        over = max(self._ends(strike), first + (self._bound(strike, None) or 0))
+        undone = recovery_ticks(table_kind(strike.kind), strike.board, self._layout, self._run.restart_s)
+        return first - 1, over + undone + last_read(strike.mailboxes, self._layout) + self._settle
+
+    def _ends(self, strike: Strike) -> int:
+        # A task that hangs is killed as soon as it is found, however long it was to hang.
+        if consequence(table_kind(strike.kind)).ends_process:
+            return strike.tick
+        return strike.ends if strike.ends >= 0 else self._last
+
+    def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
         fresh = [e for e in candidates(self._events, strike, until) if id(e) not in used]
         return [self._detection(event, strike) for event in fresh]
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
         delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
-        if event.kind == "died":
-            bound_ms = None if self._lockstep else RACK_NS * 1e-6
-            delay -= self._left_out.between(strike.tick, event.tick)
-            return Detection(event, delay, self._death_bound(strike), delay_ms, bound_ms)
         if event.code != "clock_skipped":
             delay -= self._left_out.between(strike.tick, event.tick)
+        if event.kind == "died":
+            # Lockstep waits for the end of a process that its own clock has killed. Of any other it knows nothing, and
+            # goes as fast as it can: neither ticks nor time are a measure.
+            unbounded = self._run.is_lockstep and strike.kind == EXTERNAL
+            bound_ms = None if self._run.is_lockstep else (RACK_NS + MEMORY_NS) * 1e-6
+            return Detection(event, delay, None if unbounded else self._bound(strike, None), delay_ms, bound_ms)
         reader = event.board if event.code in MAILBOX_ALARMS else None
         return Detection(event, delay, self._bound(strike, reader), delay_ms)
 
-    def _death_bound(self, strike: Strike) -> int | None:
-        # Lockstep waits for the end of a process that its own clock has killed. Of any other it knows nothing, and
-        # goes as fast as it can: neither ticks nor time are a measure.
-        if self._lockstep:
-            return None if strike.kind == EXTERNAL else self._bound(strike, None)
-        return NEIGHBOURS_CYCLES * cycle_ticks(self._layout, strike.board)
-
     def _delay_ms(self, event: Event, strike: Strike) -> float | None:
-        if self._lockstep:
+        if self._run.is_lockstep:
             return None
         # A fault of the arm is counted behind the cycle that has already found it.
-        return max(0, event.time_ns - self._offset_ns - strike.time_ns) * 1e-6
+        return max(0, event.time_ns - self._run.offset_ns - strike.time_ns) * 1e-6
 
-    def _horizon(self, place: int) -> int:
+    def _horizon(self, place: int, last: int) -> int:
         """Return the tick up to which reactions are of this fault: the next one strikes then, or it is long over."""
-        strike = self._strikes[place]
-        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > strike.tick]
-        over = max(strike.ends if strike.ends >= 0 else self._last, strike.tick + (self._bound(strike, None) or 0))
-        return min([*later, over + self._settle, self._last + 1])
+        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick]
+        return min([*later, last + 1])
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
         after = aftermath(strike, self._events, horizon)
         seen: Seen = "not struck" if strike.tick < 0 else "missed" if best is None else "detected"
+        bound = self._recovery_bound(strike, best)
+        is_latched = self._is_latched(strike, after)
         return Judgement(
             kind=strike.kind,
             board=strike.board,
@@ -161,45 +181,52 @@ class _Judge:
             bound_ms=best.bound_ms if best else None,
             is_within=best is not None and best.is_within,
             reactions=after.reactions,
-            is_recovered=after.is_recovered,
+            is_recovered=is_latched or (after.is_undone and (after.recovery or 0) <= bound),
             recovery=after.recovery,
+            recovery_bound=bound,
+            lacking=() if strike.tick < 0 else after.lacking,
+            is_latched=is_latched,
         )
 
-    def _window(self, strike: Strike, judgement: Judgement) -> tuple[Strike, int, int]:
-        """Return the ticks in which detections are the fault's, or its consequence."""
-        ends = strike.ends if strike.ends >= 0 else self._last
-        first = strike.tick if strike.tick >= 0 else strike.began
-        last = max(ends, first + (judgement.recovery or 0), first + (judgement.bound or 0))
-        return strike, first - 1, last + self._settle
+    def _recovery_bound(self, strike: Strike, best: Detection | None) -> int:
+        """Return the ticks from a strike in which everything must be undone."""
+        found = best.event.tick if best is not None else strike.tick
+        over = max(self._ends(strike), found) - strike.tick
+        return over + recovery_ticks(table_kind(strike.kind), strike.board, self._layout, self._run.restart_s)
 
-    def _is_unexplained(self, event: Event, windows: Sequence[tuple[Strike, int, int]]) -> bool:
-        if event.kind not in ("detection", "died"):
+    def _is_latched(self, strike: Strike, after: Aftermath) -> bool:
+        """Say whether the task has ended with an error because of a fault that may end it so."""
+        may = consequence(table_kind(strike.kind)).latches and self._run.has_failed
+        return may and not after.is_undone
+
+    def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
+        """Say whether no fault explains a detection, a death or a miss."""
+        if event.kind not in ("detection", "died", "miss"):
             return False
-        around = (strike for strike, first, last in windows if strike.began >= 0 and first <= event.tick <= last)
-        return not any(_explains(strike, event) for strike in around)
+        around = [s for s, (first, last) in zip(self._strikes, windows, strict=True) if first <= event.tick <= last]
+        return not any(_explains(strike, event) for strike in around if strike.began >= 0)
 
 
 def _explains(strike: Strike, event: Event) -> bool:
-    """Say whether an event in a fault's time can be its consequence."""
     if strike.tick < 0:
         # It was too slight to count as an injection, and may have been found all the same.
         return fits(event, replace(strike, tick=strike.began))
-    # A process that ends ends of its own fault, not of another's.
-    return event.kind != "died" or strike.board == event.board
+    # Whoever takes one task's cycles may take those of any task on its core.
+    return takes_cycles(strike) if event.kind == "miss" else explains(strike, event)
 
 
 def _takes_mailbox(strike: Strike) -> bool:
-    return strike.kind != EXTERNAL and KINDS[NUMBERS[strike.kind]].takes_mailbox
+    return KINDS[NUMBERS[table_kind(strike.kind)]].takes_mailbox
 
 
 def _bound_in(layout: Layout) -> Bound:
     tasks = [task.name for task in layout.tasks]
 
     def bound(strike: Strike, reader: str | None) -> int | None:
-        if strike.kind == EXTERNAL:
-            killed = Injection(NUMBERS["kill"], tasks.index(strike.board) if strike.board in tasks else -1)
-            return bound_ticks(KINDS[NUMBERS["kill"]], killed, layout, reader)
-        assert strike.injection is not None, "a fault of the table has its injection"
-        return bound_ticks(KINDS[NUMBERS[strike.kind]], strike.injection, layout, reader)
+        kind = KINDS[NUMBERS[table_kind(strike.kind)]]
+        injection = strike.injection
+        if injection is None:
+            injection = Injection(NUMBERS[kind.name], tasks.index(strike.board) if strike.board in tasks else -1)
+        return bound_ticks(kind, injection, layout, reader)
 
     return bound

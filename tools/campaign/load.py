@@ -1,11 +1,12 @@
-"""CPU load beside a rack: one busy process a core, under ordinary scheduling.
+"""Load beside a rack: a busy process a core, under ordinary scheduling, and one that has the disks written.
 
-As a program, `python -m tools.campaign.load CORE PARENT`: the busy process itself; it ends with its parent.
+As a program, `python -m tools.campaign.load PARENT WHAT`: one process of it, or stress-ng; it ends with its parent.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,30 +15,46 @@ from contextlib import contextmanager
 from boards.crate_line import PROJECT
 from boards.processor import die_with_parent, name_process
 
+DISKS = "disks"
+
 
 @contextmanager
-def cpu_load() -> Iterator[int]:
-    """Keep every core that this process may use busy; gives the number of cores."""
+def load() -> Iterator[str]:
+    """Keep every core that this process may use busy, and the disks; gives the load in words.
+
+    `stress-ng` does it where it is installed.
+    """
     cores = sorted(os.sched_getaffinity(0))
+    stress = ["stress-ng", "--cpu", str(len(cores)), "--io", "1"]
+    has_stress = shutil.which(stress[0]) is not None
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])}
-    command = [sys.executable, "-m", "tools.campaign.load"]
-    busy = [subprocess.Popen([*command, str(core), str(os.getpid())], env=environment) for core in cores]
+    command = [sys.executable, "-m", "tools.campaign.load", str(os.getpid())]
+    parts = [stress] if has_stress else [*([str(core)] for core in cores), [DISKS]]
+    busy = [
+        subprocess.Popen([*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for part in parts
+    ]
     try:
-        yield len(cores)
+        yield " ".join(stress) if has_stress else f"{len(cores)} busy processes and one that writes"
     finally:
         for process in busy:
-            process.kill()
+            # Not killed: stress-ng ends its own processes.
+            process.terminate()
             process.wait()
 
 
 def main() -> None:
-    """Keep a core busy until the end of the parent."""
-    core, parent = int(sys.argv[1]), int(sys.argv[2])
+    """Be a part of the load until the end of the parent."""
+    parent, what = int(sys.argv[1]), sys.argv[2]
     die_with_parent(parent)
+    if what == "stress-ng":
+        os.execvp(what, sys.argv[2:])
     name_process("campaign load")
-    os.sched_setaffinity(0, {core})
+    if what != DISKS:
+        os.sched_setaffinity(0, {int(what)})
     while True:
-        pass
+        if what == DISKS:
+            os.sync()
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ Report = dict[str, Any]
 SHOWN = 30
 """Shortfalls that the text shows; campaign.json has them all."""
 KINDS_HEAD = [
-    *("kind", "injected", "detected", "in bound", "cycles median", "max", "ticks median", "max", "bound, ticks"),
-    *("ms median", "max", "recovery median, ms", "max", "task done", "reactions"),
+    *("kind", "injected", "detected", "in bound", "recovered", "at least", "ticks median", "max", "bound, ticks"),
+    *("ms median", "max", "recovery median, ms", "max", "reactions"),
 ]
 
 
@@ -35,28 +35,41 @@ def _lines(report: Report) -> Iterator[str]:
     if report["by_kind"]:
         yield from ("", "## Faults by kind", "")
         yield from table(KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()])
-        yield from ("", "A cycle is the one of the task concerned, a planner's its time slice; a tick is the clock's.")
+        yield from (
+            "",
+            "At least: the least share of detected, in bound and recovered, as the lower end of Wilson's 95 % interval."
+            " A tick is the clock's.",
+        )
     yield from _faultless(report["faultless"])
     yield from _sizes(report["sizes"])
     yield from _shortfalls(report["shortfalls"])
 
 
 def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
-    yield "faults drawn", f"{summary['drawn']}, of which {summary['not_struck']} did not strike"
-    yield "injected", summary["injected"]
+    yield "injected", f"{summary['injected']}; {summary['not_struck']} more did not strike, and were drawn again"
     yield "detected", summary["detected"]
     yield "within the bound", summary["within_bound"]
-    yield "deaths seen at the Rack later than 5 ms", summary["late_at_rack"]
-    yield "recovered from", summary["recovered"]
+    yield "reacted to", summary["reacted_to"]
+    latched = f", of which {summary['latched']} ended the task, as they may" if summary["latched"] else ""
+    yield "recovered from", f"{summary['recovered']}{latched}"
     ends = [f"{summary[key]} {name}" for key, name in _ENDS if summary[key]]
     yield "trials ended", ", ".join(ends) or "none"
     yield "limits violated", f"{summary['limits_violated']} (in any substep of any run)"
     yield "touches", summary["touches"]
     yield "left behind", f"{summary['left_behind']} (processes, segments)"
-    yield "unexplained detections", summary["unexplained"]
+    hours = f"{summary['simulated_s'] / 3600.0:.2f} simulated hours"
+    yield "false detections", f"{summary['unexplained']} in {hours}: {_rate(summary['unexplained_per_hour'])}"
+    yield "misses in real time that no fault explains", summary["stray_misses"]
     if summary["faultless_s"]:
-        rate = f"{summary['false_trips_per_hour']:g} an hour"
-        yield "false trips", f"{summary['false_trips']} in {summary['faultless_s']:g} s: {rate}"
+        rate = _rate(summary["false_trips_per_hour"])
+        yield (
+            "of these without faults, in real time",
+            f"{summary['false_trips']} in {summary['faultless_s']:g} s: {rate}",
+        )
+
+
+def _rate(found: Report | None) -> str:
+    return "-" if found is None else f"{found['an_hour']:.3g} an hour, below {found['below']:.3g} with 95 %"
 
 
 _ENDS = (
@@ -72,13 +85,12 @@ def _kind_row(kind: str, figures: Report) -> list[str]:
     spans = "-" if bound is None else "-".join(dict.fromkeys(str(bound[key]) for key in ("least", "most")))
     return [
         kind,
-        *(str(figures[key]) for key in ("injected", "detected", "within_bound")),
-        *_spread(figures["cycles"]),
+        *(str(figures[key]) for key in ("injected", "detected", "within_bound", "recovered")),
+        "-" if None in (shares := list(figures["wilson"].values())) else f"{min(low for low, _ in shares):.1%}",
         *_spread(figures["ticks"]),
         spans,
         *_spread(figures["ms"]),
         *_spread(figures["recovery_ms"]),
-        f"{figures['tasks_done']} of {figures['trials']}",
         ", ".join(figures["reactions"]) or "-",
     ]
 
@@ -93,10 +105,10 @@ def _faultless(parts: list[Report]) -> Iterator[str]:
     yield from ("", "## Faultless, in real time", "")
     rows = [
         [
-            f"beside {part['load']} busy processes" if part["load"] else "alone",
+            f"beside {part['load']}" if part["load"] else "alone",
             f"{part['seconds']:.0f}",
             str(part["trips"]),
-            "-" if part["trips_per_hour"] is None else f"{part['trips_per_hour']:g}",
+            _rate(part["trips_per_hour"]),
             ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in part["misses"].items()) or "none",
         ]
         for part in parts

@@ -1,13 +1,20 @@
-"""What a campaign has found so far: trials with their verdicts, faultless time."""
+"""What a campaign has found so far: trials with their verdicts, each kept in a file of its own; faultless time."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
-from tools.campaign.judge import Judgement, Verdict, judge
+from pydantic import TypeAdapter
+
+from boards.events import Event
+from tools.campaign.judge import Circumstances, Judgement, Verdict, judge
+from tools.campaign.plan import Plan
+from tools.campaign.statistics import rate
 from tools.campaign.trial import Trial
 
 Ended = Literal["task done", "safely stopped", "not armed", "neither"]
@@ -26,7 +33,14 @@ class Judged:
         """Judge a trial."""
         if trial.refused or trial.layout is None:
             return cls(trial, Verdict(_refused(trial), ()))
-        return cls(trial, judge(trial.strikes, trial.events, trial.layout, trial.offset_ns, trial.plan.lockstep))
+        run = Circumstances(
+            layout=trial.layout,
+            offset_ns=trial.offset_ns,
+            is_lockstep=trial.plan.lockstep,
+            restart_s=trial.restart_s,
+            has_failed=trial.outcome is not None and not trial.outcome.worked,
+        )
+        return cls(trial, judge(trial.strikes, trial.events, run))
 
     @property
     def ended(self) -> Ended:
@@ -49,12 +63,14 @@ class Judged:
     def shortfalls(self) -> list[str]:
         """What is not as it must be, a line each; empty for a good trial."""
         trial = self.trial
-        lines = [_shortfall(fault) for fault in self.verdict.faults if fault.is_judged and _falls_short(fault)]
+        lines = [line for fault in self.verdict.faults if fault.is_judged for line in _shortfalls(fault)]
         lines += [f"{e.board}: {e.text}: no fault explains it (tick {e.tick})" for e in self.verdict.unexplained]
         lines += [f"limits violated at {trial.arm.violations} substeps"] if trial.arm.violations else []
         lines += [f"left behind: {thing}" for thing in trial.left]
         if self.ended == "neither":
             lines.append(f"the task is neither done nor safely stopped: {self._why_neither()}")
+        if self.ended == "safely stopped" and not lines and not any(f.is_latched for f in self.verdict.faults):
+            lines.append(f"the task is not done, and no fault had to end it: {self._why_neither()}")
         return lines
 
     def _why_neither(self) -> str:
@@ -63,39 +79,92 @@ class Judged:
             return trial.refused or f"it does not end; {trial.levels}"
         return "; ".join(filter(None, [outcome.cause, *outcome.faults, trial.levels]))
 
+    def finding(self) -> Finding:
+        """Return what is kept of the trial."""
+        trial, outcome = self.trial, self.trial.outcome
+        return Finding(
+            plan=trial.plan,
+            ended=self.ended,
+            ticks=outcome.ticks if outcome else 0,
+            digest=outcome.digest if outcome else "",
+            violations=trial.arm.violations,
+            touches=trial.arm.touches,
+            left=trial.left,
+            wall_s=round(trial.wall_s, 3),
+            notes=tuple(event.text for event in trial.events if event.kind == "ready"),
+            misses=dict(Counter(event.code for event in trial.events if event.kind == MISS)),
+            stray_misses=len(self.verdict.misses),
+            faults=self.verdict.faults,
+            unexplained=self.verdict.unexplained,
+            shortfalls=tuple(self.shortfalls),
+        )
+
     def document(self) -> dict[str, Any]:
-        """Return the trial as plain data: a line of trials.jsonl."""
+        """Return the trial as plain data, with all that happened in it."""
         trial, outcome = self.trial, self.trial.outcome
         return {
-            **trial.plan.document(),
-            "ended": self.ended,
+            "finding": asdict(self.finding()),
             "outcome": asdict(outcome) if outcome else None,
             "refused": trial.refused,
             "levels": trial.levels,
-            "violations": trial.arm.violations,
-            "touches": trial.arm.touches,
-            "left": list(trial.left),
-            "wall_s": round(trial.wall_s, 3),
-            "misses": misses_of([trial]),
-            "judgements": [asdict(fault) for fault in self.verdict.faults],
-            "unexplained": [asdict(event) for event in self.verdict.unexplained],
-            "shortfalls": self.shortfalls,
             "events": [asdict(event) for event in trial.events],
         }
 
 
 @dataclass(frozen=True)
-class Faultless:
-    """Running without faults in real time, `seconds` of it, beside `load` busy processes."""
+class Finding:
+    """What is kept of a trial: what the report of a campaign is made of.
 
-    load: int
+    `misses`: how many of each code; `stray_misses`: those that no fault explains. `unexplained`: false detections.
+    """
+
+    plan: Plan
+    ended: Ended
+    ticks: int
+    digest: str
+    violations: int
+    touches: int
+    left: tuple[str, ...]
+    wall_s: float
+    notes: tuple[str, ...]
+    misses: dict[str, int]
+    stray_misses: int
+    faults: tuple[Judgement, ...]
+    unexplained: tuple[Event, ...]
+    shortfalls: tuple[str, ...]
+
+
+_KEPT = TypeAdapter(Finding)
+
+
+def keep(judged: Judged, path: Path) -> None:
+    """Write a trial to a file, which is there as a whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(json.dumps(judged.document()) + "\n")
+    unfinished.replace(path)
+
+
+def kept(path: Path) -> Finding | None:
+    """Return what a file keeps of a trial; None where there is none."""
+    try:
+        return _KEPT.validate_python(json.loads(path.read_text())["finding"])
+    except FileNotFoundError:
+        return None
+
+
+@dataclass(frozen=True)
+class Faultless:
+    """Running without faults in real time, `seconds` of simulated time, beside `load`: a command, or "" for alone."""
+
+    load: str
     seconds: float
-    trials: tuple[Judged, ...]
+    runs: tuple[Finding, ...]
 
     @property
     def trips(self) -> int:
         """False trips: detections, and boards that died of no fault."""
-        return sum(len(judged.verdict.unexplained) for judged in self.trials)
+        return sum(len(run.unexplained) for run in self.runs)
 
     def document(self) -> dict[str, Any]:
         """Return the figures as plain data."""
@@ -103,37 +172,44 @@ class Faultless:
             "load": self.load,
             "seconds": round(self.seconds, 3),
             "trips": self.trips,
-            "trips_per_hour": round(self.trips * 3600.0 / self.seconds, 3) if self.seconds else None,
-            "tripped": [asdict(event) for judged in self.trials for event in judged.verdict.unexplained],
-            "misses": misses_of([judged.trial for judged in self.trials]),
+            "trips_per_hour": rate(self.trips, self.seconds),
+            "tripped": [asdict(event) for run in self.runs for event in run.unexplained],
+            "misses": misses_of(self.runs),
         }
 
 
 @dataclass
 class Results:
-    """Everything that a campaign has done. `nominal` is its faultless run in lockstep."""
+    """Everything that a campaign has done. `nominal` is its faultless run in lockstep.
 
-    nominal: Judged
-    trials: list[Judged] = field(default_factory=list)
-    sizes: list[Judged] = field(default_factory=list)
+    `lacking`: lines about faults that were to strike and did not, however often they were drawn.
+    """
+
+    nominal: Finding
+    trials: list[Finding] = field(default_factory=list)
+    sizes: list[Finding] = field(default_factory=list)
     faultless: list[Faultless] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
     is_interrupted: bool = False
 
     @property
-    def runs(self) -> list[Judged]:
+    def runs(self) -> list[Finding]:
         """All runs, of whatever purpose."""
-        calm = [judged for part in self.faultless for judged in part.trials]
+        calm = [run for part in self.faultless for run in part.runs]
         return [self.nominal, *self.trials, *self.sizes, *calm]
 
     @property
     def faults(self) -> list[Judgement]:
         """The judgements of all trials; those of the sweep of sizes are not among them."""
-        return [fault for judged in self.trials for fault in judged.verdict.faults]
+        return [fault for run in self.trials for fault in run.faults]
 
 
-def misses_of(trials: Sequence[Trial]) -> dict[str, int]:
+def misses_of(runs: Sequence[Finding]) -> dict[str, int]:
     """Return how many misses of each code there were: a busy machine explains them."""
-    return dict(Counter(event.code for trial in trials for event in trial.events if event.kind == MISS))
+    total: Counter[str] = Counter()
+    for run in runs:
+        total.update(run.misses)
+    return dict(total)
 
 
 def _refused(trial: Trial) -> tuple[Judgement, ...]:
@@ -165,15 +241,20 @@ def _seen_at_start(table: Any, trial: Trial) -> Literal["detected", "missed", "n
     return "detected" if f"'{table['board']}'" in trial.refused else "missed"
 
 
-def _falls_short(fault: Judgement) -> bool:
-    return fault.seen == "missed" or (fault.seen == "detected" and not fault.is_within)
-
-
-def _shortfall(fault: Judgement) -> str:
+def _shortfalls(fault: Judgement) -> Iterator[str]:
     what = f"{fault.kind} of {fault.mailbox or fault.board}{' ' + fault.joint if fault.joint else ''}"
-    at = f"struck at tick {fault.struck}"
+    what += f", struck at tick {fault.struck}"
     if fault.seen == "missed":
-        return f"{what}, {at}: not detected"
+        yield f"{what}: not detected"
+    if fault.seen == "detected" and not fault.is_within:
+        yield f"{what}: {_lateness(fault)}"
+    yield from (f"{what}: no {code.replace('_', ' ')} follows" for code in fault.lacking)
+    if not fault.is_recovered:
+        undone = f"undone after {fault.recovery} ticks" if fault.recovery is not None else "never undone"
+        yield f"{what}: {', '.join(fault.reactions)} {undone}; bound {fault.recovery_bound}"
+
+
+def _lateness(fault: Judgement) -> str:
     if fault.bound_ms is not None:
-        return f"{what}, {at}: {fault.found_as} after {fault.delay_ms:g} ms; bound {fault.bound_ms:g}"
-    return f"{what}, {at}: {fault.found_as} by {fault.found_by} after {fault.delay} ticks; bound {fault.bound}"
+        return f"{fault.found_as} after {fault.delay_ms:g} ms; bound {fault.bound_ms:g}"
+    return f"{fault.found_as} by {fault.found_by} after {fault.delay} ticks; bound {fault.bound}"

@@ -76,13 +76,13 @@ def shape(drawing: Drawing) -> Shape:
 
 
 def _mute(d: Drawing) -> Shape:
-    # Twice and more what it takes the fastest reader to see it.
-    return Shape(round((2 * d.target.cycle + d.target.reader) * d.rng.uniform(2.0, 4.0)))
+    # More than it takes the fastest reader to see it.
+    return Shape(round((2 * d.target.cycle + d.target.reader) * d.rng.uniform(1.2, 2.0)))
 
 
 def _messages(d: Drawing, more: int = 0) -> int:
     """Return a length in which several messages are written, and one more is read."""
-    return max(d.cycles(8 + more, 16 + more), 2 * d.target.reader)
+    return max(d.cycles(4 + more, 8 + more), 2 * d.target.reader)
 
 
 def _sized(d: Drawing) -> Shape:

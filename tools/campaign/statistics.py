@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from math import exp, lgamma, log, sqrt
 from statistics import median
 from typing import Any
 
@@ -20,6 +21,37 @@ def by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, Figures]:
     return {kind: _figures(kind, [f for f in faults if f.kind == kind and f.is_judged], clock_ns) for kind in kinds}
 
 
+Z95 = 1.959964
+"""Standard deviations of the normal distribution between which 95 % lie."""
+RULE_95 = 0.05
+
+
+def wilson(count: int, of: int) -> tuple[float, float] | None:
+    """Return the bounds of Wilson's 95 % interval of a share; None of nothing."""
+    if not of:
+        return None
+    share, z2 = count / of, Z95**2
+    middle = (share + z2 / (2 * of)) / (1 + z2 / of)
+    half = Z95 / (1 + z2 / of) * sqrt(share * (1 - share) / of + z2 / (4 * of * of))
+    return max(0.0, round(middle - half, 6)), min(1.0, round(middle + half, 6))
+
+
+def rate(count: int, seconds: float) -> Figures | None:
+    """Return events an hour, and the rate that they stay below with 95 % certainty, as Poisson has it; None of no time.
+
+    The bound is where so few events have a chance of 5 %.
+    """
+    if seconds <= 0.0:
+        return None
+    low, high = float(count), count + 10.0 + 5.0 * sqrt(count)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        chance = sum(exp(k * log(middle) - middle - lgamma(k + 1)) for k in range(count + 1)) if middle else 1.0
+        low, high = (middle, high) if chance > RULE_95 else (low, middle)
+    hours = seconds / 3600.0
+    return {"an_hour": round(count / hours, 3), "below": round(high / hours, 3)}
+
+
 def totals(faults: Iterable[Judgement]) -> Figures:
     """Return how many faults struck, were found, and were found in time."""
     judged = [fault for fault in faults if fault.is_judged]
@@ -31,8 +63,9 @@ def totals(faults: Iterable[Judgement]) -> Figures:
         "missed": sum(fault.seen == "missed" for fault in struck),
         "not_struck": len(judged) - len(struck),
         "within_bound": sum(fault.is_within for fault in struck),
-        "late_at_rack": sum((f.delay_ms or 0.0) > f.bound_ms for f in struck if f.bound_ms is not None),
+        "reacted_to": sum(not fault.lacking for fault in struck),
         "recovered": sum(fault.is_recovered for fault in struck),
+        "latched": sum(fault.is_latched for fault in struck),
     }
 
 
@@ -49,9 +82,11 @@ def spread(values: Sequence[float]) -> Figures | None:
 
 def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> Figures:
     seen = [fault for fault in faults if fault.seen == "detected"]
+    counts = totals(faults)
     bounds = [fault.bound for fault in faults if fault.bound is not None]
     return {
-        **totals(faults),
+        **counts,
+        "wilson": {key: wilson(counts[key], counts["injected"]) for key in ("detected", "within_bound", "recovered")},
         "bound": KINDS[NUMBERS["kill" if kind == EXTERNAL else kind]].bound,
         "cycles": spread([f.delay / f.cycle for f in seen if f.delay is not None]),
         "ticks": spread([f.delay for f in seen if f.delay is not None]),

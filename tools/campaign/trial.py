@@ -22,9 +22,15 @@ from tools.campaign.plan import Plan
 LONGEST = 4
 """A run with faults may take that many times as long as without, and"""
 GRACE_S = 60.0
-"""so much longer: behind that it is stopped. Nothing is ever waited for without end."""
+"""so much simulated time more: behind that it is stopped. Nothing is ever waited for without end."""
+NOMINAL_S = 1800.0
+"""Simulated time of a run of which nobody knows how long it takes."""
+STILL_S = 120.0
+"""Time in which a rack must give out a tick; one without faults that plans for longer than this does not end."""
 STUCK_S = 20.0
 """Time in which a rack that is told to stop does so."""
+RESTART_S = 2.0
+"""What a restart takes in real time, at most: a planner with its libraries 1.5 s."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,7 @@ class Trial:
     left: tuple[str, ...]
     wall_s: float
     offset_ns: int
+    restart_s: float = RESTART_S
     levels: str = ""
     is_interrupted: bool = False
 
@@ -82,21 +89,30 @@ def run_trial(
         left=tuple(left_behind(rack_name, before)),
         wall_s=time.monotonic() - started,
         offset_ns=time.time_ns() - time.monotonic_ns(),
+        restart_s=restart_s(config, plan.lockstep),
         levels=levels,
         is_interrupted=interrupt.is_set,
     )
+
+
+def restart_s(config: RackConfig, lockstep: bool) -> float:
+    """Return the simulated time that a restart may take."""
+    in_lockstep = config.supervision.lockstep_restart_s
+    return in_lockstep if lockstep else max(RESTART_S, in_lockstep)
 
 
 def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None, interrupt: Interrupt) -> None:
     """Watch a run to its end, and kill what is to be killed; no run lasts for ever."""
     rack.start(seconds)
     words = rack.segment.words
-    most_ticks = LONGEST * ticks + GRACE_S * 1e9 / rack.config.clock_ns
-    deadline = time.monotonic() + most_ticks * rack.config.clock_ns * 1e-9
-    stopped = False
+    most_s = NOMINAL_S if not ticks else GRACE_S
+    most_ticks = LONGEST * ticks + max(most_s, seconds or 0.0) * 1e9 / rack.config.clock_ns
+    seen, deadline, stopped = -1, 0.0, False
     while rack.watch(killer.due_in_s()):
         killer.advance()
-        if not stopped and (why := _why_stop(interrupt, words[System.TICK] > most_ticks, deadline)):
+        if not stopped and (tick := words[System.TICK]) != seen:
+            seen, deadline = tick, time.monotonic() + STILL_S
+        if not stopped and (why := _why_stop(interrupt, seen > most_ticks, deadline)):
             rack.stop(why)
             stopped, deadline = True, time.monotonic() + STUCK_S
         elif stopped and time.monotonic() > deadline:

@@ -11,7 +11,7 @@ from backplane.fault_table import Injection
 from backplane.layout import Layout
 from boards.events import Event
 from tools.campaign.ending import Strike
-from tools.campaign.judge import Judgement, judge
+from tools.campaign.judge import Circumstances, Judgement, judge
 from tools.recording import Recording
 
 Report = dict[str, Any]
@@ -22,7 +22,7 @@ def faults(recording: Recording, layout: Layout) -> Report:
     events = [Event(**event) for event in recording.events if "tick" in event]
     ended = next((event for event in recording.events if event["kind"] == "outcome"), {})
     strikes = [_strike(entry) for entry in ended.get("faults", [])]
-    verdict = judge(strikes, events, layout, ended.get("clock_offset_ns", 0))
+    verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0)))
     restarts = Counter(event.board for event in events if event.code == "restart")
     return {
         # Those that never struck come last.

@@ -1,0 +1,134 @@
+"""Trials in processes of their own, as many at once as there are cores: each has its own rack, each leaves one file.
+
+As a program, `python -m tools.campaign.workers FD PARENT`: one such process; it ends with its parent.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe, wait
+from pathlib import Path
+from typing import Any
+
+from boards.config.schema import RackConfig
+from boards.crate_line import PROJECT
+from boards.processor import die_with_parent
+from tools.answer import Failure
+from tools.campaign.interrupt import Interrupt
+from tools.campaign.plan import Plan
+from tools.campaign.results import Judged, keep
+from tools.campaign.trial import run_trial
+
+LOOK_S = 0.2
+"""How often a campaign that waits for its trials looks whether it is to end."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A trial to be made: `ticks` of a faultless run, `seconds` of simulated time where no task ends the run."""
+
+    plan: Plan
+    path: Path
+    ticks: int
+    seconds: float | None
+
+
+class Workers:
+    """Processes that make trials. Use it as a context; they end with it, and with the process that made it."""
+
+    def __init__(self, config: RackConfig, interrupt: Interrupt) -> None:
+        self._config, self._interrupt = config, interrupt
+        self._cores = sorted(os.sched_getaffinity(0))
+        self._lines: list[Connection] = []
+        self._is_stopped = False
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if error[0] is not None:
+            self._stop()
+        for line in self._lines:
+            line.close()
+        for process in self._processes:
+            process.wait()
+
+    def run(self, jobs: Sequence[Job], alone: bool) -> Iterator[Job]:
+        """Make trials and yield each that is done, with its file; those that Ctrl-C cuts short leave none.
+
+        Trials that are `alone` have the machine for themselves, others a core each: what boards hand to each other on
+        one core is there sooner.
+        """
+        waiting, busy = list(jobs), dict[Any, Job]()
+        most = 1 if alone else len(self._cores)
+        while waiting or busy:
+            for place, line in enumerate(self._some(min(most, len(waiting) + len(busy)))):
+                if line not in busy and waiting and not self._interrupt.is_set:
+                    busy[line] = waiting.pop(0)
+                    line.send((busy[line], set(self._cores) if alone else {self._cores[place]}))
+            if not busy:
+                return
+            for line in wait(list(busy), LOOK_S):
+                yield self._done(line, busy.pop(line))
+            if self._interrupt.is_set:
+                waiting.clear()
+                self._stop()
+
+    def _done(self, line: Any, job: Job) -> Job:
+        try:
+            wrong = line.recv()
+        except (EOFError, ConnectionResetError):
+            wrong = "the process that made it ended"
+        if wrong:
+            raise Failure(f"trial {job.plan.number}: {wrong}")
+        return job
+
+    def _stop(self) -> None:
+        """Have the trials that are being made stopped; asked for twice a worker would leave its rack as it is."""
+        if not self._is_stopped:
+            self._is_stopped = True
+            for process in self._processes:
+                process.terminate()
+
+    def _some(self, count: int) -> list[Connection]:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])}
+        while len(self._lines) < count:
+            here, there = Pipe()
+            command = [sys.executable, "-m", "tools.campaign.workers", str(there.fileno()), str(os.getpid())]
+            # In a group of its own: Ctrl-C on the terminal is for the campaign, which asks for the end in order.
+            self._processes.append(
+                subprocess.Popen(command, env=environment, pass_fds=[there.fileno()], process_group=0)
+            )
+            there.close()
+            here.send(self._config)
+            self._lines.append(here)
+        return self._lines[:count]
+
+
+def main() -> None:
+    """Make the trials that come over a line, one after the other."""
+    line, parent = Connection(int(sys.argv[1])), int(sys.argv[2])
+    die_with_parent(parent)
+    with Interrupt() as interrupt, suppress(EOFError):
+        config = line.recv()
+        while True:
+            job, cores = line.recv()
+            os.sched_setaffinity(0, cores)
+            try:
+                trial = run_trial(config, job.plan, f"camp-{os.getpid()}x", job.ticks, job.seconds, interrupt)
+                if not trial.is_interrupted:
+                    keep(Judged.of(trial), job.path)
+            except Exception as error:  # whatever it is, the campaign must hear of it
+                line.send(f"{type(error).__name__}: {error}")
+            else:
+                line.send("")
+
+
+if __name__ == "__main__":
+    main()
