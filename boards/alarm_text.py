@@ -73,8 +73,8 @@ def event_of(
 ) -> Event:
     """Return the event that an alarm makes: a row of `backplane.alarms.RECORD` from the ring of the task `owner`.
 
-    `geom` names a geom of the cell. An event's board is who found it; of a fault it is who has it, of a return it is who is back. Of an operator's
-    command the event is `boards.operating.text.command_event`'s.
+    `geom` names a geom of the cell. An event's board is who found it; of a fault it is who has it, of a return it is
+    who is back. Of an operator's command the event is `boards.operating.text.command_event`'s.
     """
     alarm, number, value = Alarm(row["code"]), int(row["subject"]), float(row["value"])
     kind, code, board, fault = KIND_OF.get(alarm, "detection"), alarm.name.lower(), owner, -1

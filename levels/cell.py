@@ -42,7 +42,8 @@ class Cell:
     - `bodies`: ids in the order of `scene.bodies`; `object_qpos`: first of 7 addresses an object; `mocap`: mocap id an
       obstacle; `supports`: geom ids.
     - `touch`: (ngeom, ngeom), True where a contact is one that no task means.
-    - `encoders`: what its sensors resolve. `bounds`: what the arm never exceeds; `limits`: what motion is planned within.
+    - `encoders`: what its sensors resolve.
+    - `bounds`: what the arm never exceeds; `limits`: what motion is planned within.
     """
 
     model: mujoco.MjModel

@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 
 
 class Sensed(NamedTuple):
-    """What the arm's sensors say, as coarse as they are: joints (joints,), rad and rad/s; gripper, m and m/s, 0 without one.
+    """What the arm's sensors say: joints (joints,), rad and rad/s; gripper, m and m/s, 0 without one.
 
-    `tick` is that of the sample.
+    Of the joints it is as coarse and noisy as their encoders. `tick` is that of the sample.
     """
 
     position: Array

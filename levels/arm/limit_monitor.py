@@ -17,8 +17,8 @@ class LimitMonitor:
     """Records position, velocity and torque, of motor and brake together, step by step; judges once a tick.
 
     `count` is the number of steps that broke a limit; `first` says which one the first of them broke. Steps in which
-    something struck pushes joints beyond limits of position or velocity, and no torque is beyond its own, are counted in
-    `pushed`: physics that no drive can prevent.
+    a blow pushes joints beyond limits of position or velocity, and no torque is beyond its own, are counted in
+    `pushed`: no drive can prevent them.
     """
 
     def __init__(self, cell: Cell, data: mujoco.MjData, substeps: int) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
 from backplane.message import Message, State
 from levels.arm import Arm, FaultyLink, Link, Sensed, SimulatedArm
 from levels.arm.faulty import KINDS
@@ -59,8 +58,9 @@ class ServoExecutor(Executor):
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._loop = ComputedTorque(cell, params)
         braking = cell.limits.acceleration
+        retry_cycles = round(params.retry / context.period_s)
         self.sensors = SensorMonitor(
-            cell.bounds, cell.encoders, braking, cell.home, context.tick_s, every, params.good_cycles
+            cell.bounds, cell.encoders, braking, cell.home, context.tick_s, every, params.good_cycles, retry_cycles
         )
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)

@@ -41,9 +41,10 @@ class SensorMonitor:
     `position`, `velocity` (joints,), rad, rad/s, are the sample's if it is good. Where it is not, they go on with the
     sensed velocity or, without one, as the brakes stop the arm; `doubt` (joints,), rad, is how far off that may be.
     A joint is good again where what it says fits to that, and from sample to sample to itself: an offset that is
-    greater than the doubt is never taken for the truth. `blamed`: joint, what it reads, rad, and how far that is off,
-    rad; -1 and the age, ticks, of a sample that does not come. `fresh`: there is a sample of this cycle. `faulty`: not yet
-    `good_cycles` in a row were good. `drivable`: velocities are known, so the arm could still be driven.
+    greater than the doubt is never taken for the truth. `blamed`: joint, what it reads, rad, and by how much that is
+    off, rad; -1 and the age, ticks, of a sample that does not come. `fresh`: there is a sample of this cycle. `faulty`:
+    not yet `good_cycles` in a row were good, or `retry_cycles` where a joint that was stuck shows no change at rest.
+    `drivable`: velocities are known, so the arm could still be driven.
     """
 
     def __init__(
@@ -55,9 +56,12 @@ class SensorMonitor:
         tick_s: float,
         every: int,
         good_cycles: int,
+        retry_cycles: int,
     ) -> None:
         """Judge joints that brake with `braking`, rad/s2, and start at `home`, rad, in cycles of `every` ticks."""
+        self._retry_cycles = max(retry_cycles, good_cycles)
         self._room, self._speed_room = ROOM_RAD + 2.0 * encoders.off, encoders.speed_off
+        self._coarse = not encoders.exact
         self._unshown = STUCK_STEPS * 2.0 * encoders.off
         self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
         self._fastest = BEYOND_SPEED * bounds.velocity
@@ -65,7 +69,8 @@ class SensorMonitor:
         joints = len(home)
         self.position, self.velocity, self.doubt = home.copy(), np.zeros(joints), np.zeros(joints)
         self._raw = (home.copy(), np.zeros(joints))
-        self._still, self._still_way = np.zeros(joints, dtype=int), np.zeros(joints)
+        self._still, self._still_way, self._claimed = np.zeros(joints, dtype=int), np.zeros(joints), np.zeros(joints)
+        self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
         self._tick: int | None = None
         self._streak = 0
@@ -104,7 +109,12 @@ class SensorMonitor:
             room += passed_s * 4.0 * self._every * self._tick_s * self._braking
         # Never true for what is no number.
         fits = np.abs(q - self.position - way) <= room + self.doubt
-        if self.faulty or np.count_nonzero(fits) < fits.size or not self._stirs(q, qd, change, wanted, passed_s):
+        stirs = self._stirs(q, qd, change, wanted, passed_s)
+        if self._coarse:
+            # Exact sensors that do not change show it in the next sample.
+            self._claim(q, qd, passed_s)
+            stirs = stirs and bool((self._claimed <= self._room).all())
+        if self.faulty or not stirs or np.count_nonzero(fits) < fits.size:
             self._doubtful(q, qd, way, fits, room, passed_s)
             return
         self._take(q, qd, change != 0.0)
@@ -132,6 +142,11 @@ class SensorMonitor:
         self._still_way *= still
         return not self._is_still().any()
 
+    def _claim(self, q: Array, qd: Array, passed_s: float) -> None:
+        """Add up where a sensor says that a joint is going while it shows no change: at the least that it may be."""
+        self._claimed += passed_s * np.maximum(np.abs(qd) - self._speed_room, 0.0)
+        self._claimed *= (q == self._raw[0]) & (qd == self._raw[1])
+
     def _is_still(self) -> Mask:
         return np.asarray((self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown))
 
@@ -141,8 +156,10 @@ class SensorMonitor:
         inside &= np.abs(qd) <= self._fastest
         last_q, last_qd = self._raw
         unchanged = (q == last_q) & (qd == last_qd)
-        frozen = unchanged & (np.abs(qd) * passed_s > self._room)
-        still = self._is_still()
+        if not self._coarse:
+            self._claim(q, qd, passed_s)
+        frozen = self._claimed > self._room
+        still, begins = self._is_still(), not self.faulty
         room += passed_s * np.abs(qd - last_qd)
         steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room
         self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
@@ -151,9 +168,12 @@ class SensorMonitor:
         good = fits & steady & inside & ~still & ~frozen
         self.drivable = bool((np.isfinite(qd) & ~frozen & ~still).all())
         self.doubt[still] += STUCK_RAD
-        # A sensor that shows no change beside one at fault may be stuck as well, since before that was found.
-        unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
-        np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged)
+        self._unproven |= still
+        self._unproven &= unchanged
+        if begins:
+            # A sensor that shows no change beside one at fault may be stuck as well, since before that was found.
+            unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
+            np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged)
         self._still[still] = 0
         self._blame(good, q, q - self.position - way)
         self._suspect |= ~good
@@ -228,9 +248,10 @@ class SensorMonitor:
     def _settled(self, good: bool) -> bool:
         """Count good samples in a row; say whether there are enough of them to end the episode."""
         self._streak = self._streak + 1 if good else 0
-        if self._streak < self._good_cycles:
+        if self._streak < (self._retry_cycles if self._unproven.any() else self._good_cycles):
             return False
         self.faulty, self._streak = False, 0
+        self._unproven[:] = False
         self._suspect[:] = False
         self._rung.clear()
         return True

@@ -25,7 +25,7 @@ def test_brake_closes_the_brakes_in_its_own_cycle() -> None:
     rig.run(1, move.at)
     status = rig.status
     assert (status.stopped, status.braked, status.holding, status.demand) == (1, 1, 1, Demand.BRAKE)
-    assert status.reason == "the safety of the rack demands: brake"
+    assert status.reason == "demand 'brake' on the arm, until boards and emergency stop are in order"
     assert not status.torque.any()
     rig.run(200, move.at)
     assert np.abs(rig.status.velocity).max() < 1e-3
