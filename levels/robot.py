@@ -8,8 +8,9 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 # No quantity of an arm in SI units, nor of its time, is beyond these: sums and squares of them stay finite.
-Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
-Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+# pydantic keeps one bound of a kind: fields that are narrower say so with `le` and `ge`.
+Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 
 
 class Table(BaseModel):

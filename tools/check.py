@@ -25,7 +25,7 @@ Percentile = Annotated[
     ),
 ]
 Fix = Annotated[
-    bool, typer.Option("--fix", help="print the config with the smallest changes that make it fit, and nothing else")
+    bool, typer.Option("--fix", help="print the config with the cheapest changes that make it fit, and nothing else")
 ]
 
 
@@ -45,13 +45,15 @@ def check(
     The timing comes from budgets, the longest that each part of a level's cycle may take, as processor time:
     [board.<name>.budget] in the config, with read_ms (R), process_ms (X), write_ms (W), exchange_ms (C, reading the
     plan), plan_ms (P), update_ms (U), and plan_within_ms, how soon a new plan is wanted; or measured, with --from RUN.
-    [timing] holds t_cs (context_switch_ms), the clock's time (clock_ms) and what is small in eq. 3.10 (small_share).
+    [timing] holds t_cs (context_switch_ms), the clock's time (clock_ms), what is small in eq. 3.10 (small_share), and a
+    goal for the system's response (response_ms).
 
     Every equation of the paper, 3.1 to 3.10, is put to every level that has a budget: both sides, the margin, ok or
     FAILS. Beyond the paper: the worst-case response time of every task among those on its core, and the core's load.
 
-    Where something fails it says what would do, each change tried on the whole rack, the smallest first: more cycles
-    for a plan, a planner on a core of its own, another core, a longer cycle. --fix prints the config with the first.
+    Where something fails it says what would do, each change tried on the whole rack, the cheapest first: another
+    priority or core, a planner on a board of its own, older plans, a longer cycle, of that board or of one that shares
+    its core; last what needs a core that this machine lacks. --fix prints the config with the first.
 
     Exit status: 0 all holds, or there is nothing to judge; 1 an equation fails, or nothing helps; 2 a bad config.
 

@@ -73,8 +73,8 @@ def too_large(layout: Layout) -> list[Mistake]:
     if whole <= LARGEST_BYTES:
         return []
     box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
-    why = f"keeps {box.depth} messages for its slowest reader, and the segment has {whole} bytes; "
-    return [Mistake(f"mailbox {box.name}", None, f"{why}permitted: {LARGEST_BYTES}; shorten cycles or within_cycles")]
+    why = f"keeps {box.depth} messages for its slowest reader, and the segment has {whole} bytes"
+    return [Mistake(f"mailbox {box.name}", None, f"{why}; permitted: {LARGEST_BYTES}; shorten cycles or within_cycles")]
 
 
 class Wiring:

@@ -25,6 +25,8 @@ TURN_NS = 4_000_000
 """Longest turn of an ordinary task while another one waits: a tick of a kernel of 250 Hz, Linux's own slice is 3 ms."""
 MISSED_OVER = 10
 """Deadlines behind which a response time is no longer searched for: near full load the search would creep on."""
+MOST_STEPS = 10_000
+"""Steps of one search: with a tick of 10 us below a plan of hours it would creep on before any deadline."""
 
 
 def response_time(
@@ -78,7 +80,9 @@ def _end_of_busy_time(
     work: int, guess: int, above: Sequence[Load], sharing: Sequence[Load], most: int, horizon: int
 ) -> int | None:
     """Return the smallest w not below `guess` for which `work` and all that is released until w is done at w."""
-    while guess <= horizon:
+    for _ in range(MOST_STEPS):
+        if guess > horizon:
+            break
         demand = work + sum(_released(guess, load) for load in above)
         demand += sum(min(_released(guess, load), most) for load in sharing)
         if demand <= guess:

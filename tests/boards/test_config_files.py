@@ -72,6 +72,90 @@ def test_an_arm_is_replaced_as_a_whole(write: Write) -> None:
     assert config.robot.model == model.resolve()
 
 
+def test_an_arm_without_a_model_of_its_own_is_merged_as_every_table_is(write: Write) -> None:
+    config = load(write("mine.toml", 'extends = ["nasrem"]\n[robot]\nsubsteps = 8\n[scene]\nclearance = 0.03\n'))
+    whole = load("nasrem")
+    assert config.robot == whole.robot.model_copy(update={"substeps": 8})
+    assert config.scene == whole.scene.model_copy(update={"clearance": 0.03})
+
+
+def test_an_arm_that_lacks_something_is_said_to_stand_alone(write: Write) -> None:
+    model = write("arm.xml", "<mujoco/>")
+    with pytest.raises(ConfigError) as error:
+        load(write("mine.toml", f'extends = ["nasrem"]\n[robot]\nmodel = "{model.name}"\n'))
+    alone = "a [robot] that names its model is another arm, and takes nothing from a file that it extends"
+    assert f"robot.jerk: missing; jerk limits of planned motion, rad/s3; {alone}" in lines(error)
+
+
+DEEP = {
+    "lists": "[task]\nx = " + "[" * 5000 + "]" * 5000,
+    "tables": "[task]\nx = " + "{ a = " * 3000 + "1" + " }" * 3000,
+    "dotted keys": "[task]\n" + ".".join(["a"] * 3000) + " = 1",
+    "a heading": "[" + ".".join(["a"] * 3000) + "]\nx = 1",
+    "just too deep": "[task]\nx = " + "[" * 31 + "]" * 31,
+}
+
+
+@pytest.mark.parametrize("text", DEEP.values(), ids=DEEP)
+def test_nesting_without_end_is_refused_in_one_line(write: Write, text: str) -> None:
+    with pytest.raises(ConfigError, match=r"^deep\.toml.*: nested too deep; permitted: 32 levels$") as error:
+        load(write("deep.toml", f'extends = ["fig2"]\n{text}\n'))
+    assert len(lines(error)) == 1
+    assert len(lines(error)[0]) < 200
+
+
+VALUES = {
+    "6000 digits": ("9" * 6000, "an integer is too long; permitted: 64 bits"),
+    "4000 digits": ("9" * 4000, "task.x = 9999.*: the integer is too long; permitted: 64 bits"),
+    "date": ("1990-03-01", 'task.x = "1990-03-01": no config has a date'),
+    "NUL": ('"a\\u0000b"', r'task.x = "a\?b": no text has a NUL'),
+}
+
+
+@pytest.mark.parametrize(("value", "told"), VALUES.values(), ids=VALUES)
+def test_values_that_no_config_has_are_refused_in_files_and_settings(
+    write: Write, small: Path, value: str, told: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"^odd.toml: {told}"):
+        load(write("odd.toml", f"[task]\nx = {value}\n"))
+    with pytest.raises(ConfigError, match=r"^--set = .*: (the|an|no) "):
+        load(small, [f"task.x={value}"])
+
+
+def test_a_chain_of_files_without_end_is_refused(write: Write) -> None:
+    for at in range(1200):
+        write(f"chain{at}.toml", f'extends = ["chain{at + 1}.toml"]\n')
+    with pytest.raises(ConfigError, match=r"chain32.toml: extends: the chain of files .* is too long; permitted: 32$"):
+        load(write("chain1200.toml", "").with_name("chain0.toml"))
+
+
+def test_a_file_that_many_extend_is_read_once(small: Path, write: Write) -> None:
+    # Every file has two bases, which have the same two: 2^24 ways from the first to the last.
+    for at in range(24):
+        for twin in "ab":
+            write(f"{twin}{at}.toml", f'extends = ["a{at + 1}.toml", "b{at + 1}.toml"]\n')
+    for twin in "ab":
+        write(f"{twin}24.toml", 'extends = ["small.toml"]\n')
+    assert load(small.with_name("a0.toml")).name == "small"
+
+
+def test_a_file_too_large_to_be_a_config_is_not_read(write: Write) -> None:
+    with pytest.raises(ConfigError, match=r"large.toml: has 1000002 bytes; permitted: 1000000$"):
+        load(write("large.toml", "#" * 1_000_002))
+
+
+@pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a" * 5000, "a/" * 3000, "x" * 300 + ".toml", "a\0b.toml"])
+def test_a_name_that_no_file_can_have_is_no_such_file(small: Path, write: Write, name: str) -> None:
+    with pytest.raises(ConfigError, match=r"^config = .*: no such file; by name: ") as error:
+        load(name)
+    assert len(lines(error)[0]) < 300
+    with pytest.raises(ConfigError, match=r"^--faults = .*: no such file"):
+        load(small, faults=name)
+    if "\0" not in name:
+        with pytest.raises(ConfigError, match=r"extends = .*: no such file"):
+            load(write("mine.toml", f'extends = ["{name}"]\n'))
+
+
 def test_a_config_that_extends_itself_is_refused(write: Write) -> None:
     write("a.toml", 'extends = ["b.toml"]')
     with pytest.raises(ConfigError, match=r"extends itself: b.toml -> a.toml -> b.toml"):
@@ -89,6 +173,9 @@ def test_every_missing_base_is_told(write: Write) -> None:
     [
         ("clock.mode=realtime", lambda c: c.clock.mode == "realtime"),
         ("board.upper.every = 4", None),
+        ('protocol.mailbox."lower.status"=lock', lambda c: c.protocol.mailbox == {"lower.status": "lock"}),
+        (" protocol . mailbox . 'lower.status' = lock", lambda c: c.protocol.mailbox == {"lower.status": "lock"}),
+        ('task."a = b"=1', lambda c: c.task == {"a = b": 1}),
         ("seed=7", lambda c: c.seed == 7),
         ('protocol.mailbox={"lower.status" = "lock"}', lambda c: c.protocol.mailbox == {"lower.status": "lock"}),
         ("board.lower.params.gains=[1, 2]", lambda c: c.board["lower"].params == {"gains": [1, 2]}),

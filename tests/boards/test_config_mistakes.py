@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from boards.config import load, wire
 from boards.errors import ConfigError
+
+Write = Callable[[str, str], Path]
 
 MISTAKES = {
     "unknown key": ("clock.periodms=1", "clock.periodms = 1: unknown key; did you mean 'period_ms'?"),
@@ -25,6 +28,23 @@ MISTAKES = {
     "rate above the clock": ("board.upper.rate_hz=1000", "nearest: 400 Hz (every 1 tick)"),
     "speed in lockstep": ("clock.speed=2", "clock.speed = 2.0: lockstep runs as fast as it can"),
     "neighbour": ("board.lower.above=uper", 'board.lower.above = "uper": no other board is called so; boards: upper'),
+    "circle below": (
+        "board.lower.below=upper",
+        'board.lower.below = "upper": the levels go round in a circle, upper -> lower -> upper; the lowest has none',
+    ),
+    "circle above": ("board.upper.above=lower", "a circle, upper -> lower -> upper; the highest has none"),
+    "truth for a number": ("clock.period_ms=true", "clock.period_ms = true: should be a valid number; one tick, ms"),
+    "text for a number": ("board.upper.core='1'", 'board.upper.core = "1": should be a valid integer'),
+    "number for a truth": ("board.upper.ends_run=1", "board.upper.ends_run = 1: should be a valid boolean"),
+    "very short tick": ("clock.period_ms=1e-6", "should be greater than or equal to 0.01; one tick, ms"),
+    "very fast": ("clock.speed=1e300", "clock.speed = 1e+300: should be less than or equal to 1000; real time runs"),
+    "very slow": ("clock.speed=1e-300", "clock.speed = 1e-300: should be greater than or equal to 0.001"),
+    "short tick in real time": (
+        "clock={ mode = 'realtime', speed = 500 }",
+        "clock.speed = 500.0: makes a tick of 0.005 ms in real time; permitted: 0.01 ms or more",
+    ),
+    "very long cycle": ("board.lower={ rate_hz = 1e-5 }", "makes a cycle of 40000000 ticks; permitted: 1000000"),
+    "rate near zero": ("board.lower={ rate_hz = 5e-324 }", "board.lower.rate_hz = 5e-324: should be greater than or"),
     "own neighbour": ("board.lower.above=lower", "no other board is called so"),
     "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose", as there is a planner'),
     "no planner": ("board.upper.coupling=tight", 'permitted: "none", as there is no planner'),
@@ -95,6 +115,80 @@ def test_all_mistakes_are_told_at_once_wherever_they_stand(small: Path) -> None:
         "board.lower.above",
         "board.lower.planner",
     }
+
+
+def test_mistakes_of_tables_model_scene_faults_and_commands_are_told_together(write: Write) -> None:
+    text = """
+extends = ["nasrem"]
+[clock]
+wake = "sleep"
+[robot]
+joints = ["j1", "j2", "j3", "j4", "j5", "j9"]
+tool = "palm"
+[scene]
+objects = ["block1", "block2", "peg", "cup"]
+supports = ["shelf"]
+[board.world]
+slot = 99
+[board.servo.params]
+bandwith = 3
+[[fault]]
+kind = 3
+[[fault]]
+kind = "explode"
+board = "servo"
+[[command]]
+level = 3
+[[command]]
+level = "task"
+what = "hold"
+home = true
+"""
+    with pytest.raises(ConfigError) as error:
+        load(write("mine.toml", text))
+    found = {mistake.place: mistake.why for mistake in error.value.mistakes}
+    # What a mistake of its own hides: nothing of the world board, of the first fault, of the first command follows.
+    assert set(found) == {
+        "clock.wake",
+        "robot.joints",
+        "robot.tool",
+        "scene.objects",
+        "scene.supports",
+        "board.world.slot",
+        "board.servo.params.bandwith",
+        "fault[0].kind",
+        "fault[0].board",
+        "fault[1].kind",
+        "command[0].level",
+        "command[0].what",
+        "command[1].home",
+    }
+    assert found["robot.joints"].startswith("no joint 'j9' in the model; it has: j1, j2, j3, j4, j5, j6")
+    assert found["scene.supports"].startswith("no geom 'shelf' in the model; it has: pedestal, floor, table")
+
+
+def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_told() -> None:
+    settings = [f"board.level.{setting}" for setting in ("slot=99", "params.plan_ms=1")]
+    with pytest.raises(ConfigError) as error:
+        load("fig2", [*settings, "timing.small_share=2", "scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]"])
+    assert {mistake.place for mistake in error.value.mistakes} == {
+        "board.level.slot",
+        "timing.small_share",
+        "scene.motion[0].body",
+    }
+
+
+def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(write("odd.toml", f'extends = ["fig2"]\n"two\\nlines\\u001b[31m" = 1\n"{"k" * 5000}" = 1\n'))
+    lines = str(error.value).splitlines()
+    assert len(lines) == 2
+    assert all(line.isprintable() and len(line) < 500 for line in lines)
+
+
+def test_a_segment_that_no_machine_has_room_for_is_refused(small: Path) -> None:
+    with pytest.raises(ConfigError, match=r"^mailbox upper.command: keeps \d+ messages .*; permitted: 1073741824; "):
+        wire(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
 
 
 def test_a_broken_board_does_not_make_its_neighbours_wrong(small: Path) -> None:

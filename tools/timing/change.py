@@ -11,7 +11,17 @@ from boards.config.timing import tick_ns
 from tools.timing.prediction import predict
 from tools.timing.trial import Trial
 
-TRIED = ("within_cycles", "coupling", "planner_slot", "planner_core", "core", "every", "rate_hz")
+TRIED = (
+    "priority",
+    "planner_priority",
+    "within_cycles",
+    "coupling",
+    "planner_slot",
+    "planner_core",
+    "core",
+    "every",
+    "rate_hz",
+)
 """Keys of a board's table that changes are made of."""
 
 
@@ -30,6 +40,20 @@ class Change:
         return {key: getattr(new, key) for key in TRIED if getattr(old, key) != getattr(new, key)}
 
     @property
+    def cost(self) -> tuple[bool, float, int, int]:
+        """What it costs, to be compared: a core that this machine lacks, then slower or older, then boards, then keys.
+
+        A longer cycle makes a level slower and its plans older: both factors count.
+        """
+        cores = set(self.after.cores.values()) - set(self.before.cores.values())
+        lacking = any(obtained_core(core) != core for core in cores)
+        old, new = self.before.level(self.board), self.after.level(self.board)
+        factor = new.cycle_ns / old.cycle_ns
+        if old.slice_ns is not None and new.slice_ns is not None:
+            factor *= max(new.slice_ns / old.slice_ns, 1.0)
+        return lacking, factor, 2 * len(cores) + ("planner_slot" in self.settings), len(self.settings)
+
+    @property
     def text(self) -> str:
         """The change in one line, with its numbers."""
         return f"board '{self.board}': {', '.join(self._parts())}"
@@ -41,6 +65,9 @@ class Change:
     def _parts(self) -> Iterator[str]:
         old, new = (trial.config.board[self.board] for trial in (self.before, self.after))
         changed = self.settings
+        for key in ("priority", "planner_priority"):
+            if key in changed:
+                yield f"{key} {getattr(old, key)} -> {changed[key]}"
         if "coupling" in changed:
             yield f"coupling {new.coupling}, planner_slot {new.planner_slot}"
         if "planner_core" in changed and new.planner_core is not None:

@@ -13,7 +13,7 @@ from tools.timing.verdict import Verdict
 
 @dataclass(frozen=True)
 class Repair:
-    """What makes a rack fit. `steps` have each a board's changes, the smallest first, which the next one rests on."""
+    """What makes a rack fit. `steps` have each the changes for a board, cheapest first, which the next one rests on."""
 
     steps: tuple[tuple[Change, ...], ...]
     end: Trial
@@ -28,11 +28,11 @@ class Repair:
         found: list[str] = []
         for changes in self.steps:
             start = "with the first of those, then" if found else "what would do"
-            found.append(f"{start}{', any one of them, the smallest first' if len(changes) > 1 else ''}:")
+            found.append(f"{start}{', any one of them, the cheapest first' if len(changes) > 1 else ''}:")
             found += [f"  {change.text}" for change in changes]
         if self.left:
             failing = ", ".join(dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left))
-            tried = f"more cycles for a plan, other cores, a cycle up to {LONGEST} times as long"
+            tried = f"other priorities and cores, plans and cycles up to {LONGEST} times as long, others' cycles too"
             found.append(f"nothing helps against {failing}; tried: {tried}")
         return found
 
@@ -45,7 +45,7 @@ class Repair:
 
 
 def repair(trial: Trial) -> Repair:
-    """Return the changes that make a rack fit: the smallest for one board, then with it those for the next one."""
+    """Return the changes that make a rack fit: the cheapest for one board, then with it those for the next one."""
     steps: list[tuple[Change, ...]] = []
     while trial.failing:
         found = next((changes for board in _ailing(trial) if (changes := changes_for(trial, board))), None)

@@ -139,6 +139,11 @@ def test_overload_has_no_bound(above: list[tuple[int, int, int]], period: int | 
     assert response_time(2, above, period=period) is None
 
 
+def test_a_search_that_creeps_is_given_up() -> None:
+    # A billionth of the core is left: the end lies 10^10 jobs ahead, and before the horizon.
+    assert response_time(500_000, [(9_999, 10_000, 0), (99_999, 10**9, 0)], horizon=10**15) is None
+
+
 def test_the_search_ends_at_its_horizon() -> None:
     above = [(5, 10, 0), (49_999, 100_000, 0)]
     assert response_time(7, above, horizon=100_000) is None

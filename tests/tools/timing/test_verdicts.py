@@ -60,6 +60,33 @@ def test_cycles_that_do_not_divide_each_other_can_break_the_bound_on_the_grid(ju
     assert sides(trial, "3.3", "system") == [(37.5, "<=", 40, True)]
 
 
+def test_a_goal_for_the_response_is_what_the_cycles_are_held_against(judge: Judge) -> None:
+    # 10 and 20 ms are 30, upwards 40 with the wait for the grid; R_max is half of the goal.
+    trial = judge("timing.response_ms=35")
+    assert sides(trial, "3.3", "system") == [(30, "<=", 35, True)]
+    assert sides(trial, "3.2", "system") == [(30, "<=", 35, True), (40, "<=", 35, False)]
+    assert sides(trial, "3.1", "upper") == [(20, "<=", 17.5, False), (4, "<=", 20, True)]
+    assert sides(trial, "3.1", "lower")[0] == (10, "<=", 17.5, True)
+    assert sides(trial, "3.4", "lower") == [(3, "<", 17.5, True)]
+    assert failing(judge("timing.response_ms=29")) == {("3.1", "upper"), ("3.2", "system"), ("3.3", "system")}
+    assert failing(judge("timing.response_ms=40")) == set()
+
+
+def test_a_goal_is_simulated_time(judge: Judge) -> None:
+    assert sides(judge("timing.response_ms=40", "clock.speed=2"), "3.3", "system") == [(15, "<=", 20, True)]
+
+
+SECOND = "executor = 'two_levels:Lower', above = 'upper', reads = { plan = 'lower.plan' }, budget = { process_ms = 1 }"
+
+
+def test_every_chain_of_levels_is_judged_and_has_one_longest_cycle(judge: Judge) -> None:
+    # A board a joint: the second joint is slower than the level above.
+    trial = judge(f"board.joint={{ slot = 9, core = 2, every = 16, {SECOND} }}")
+    assert sides(trial, "3.3", "system, lower") == [(30, "<=", 40, True)]
+    assert sides(trial, "3.3", "system, joint") == [(60, "<=", 80, True)]
+    assert {sides(trial, "3.4", board)[0][2] for board in ("upper", "lower", "joint")} == {40}
+
+
 def test_the_budgeted_rack_fits(judge: Judge) -> None:
     assert judge().failing == ()
 

@@ -1,0 +1,60 @@
+"""The command line before any command: arguments that none can use, paths that cannot be, completion by the shell."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.tools.test_commands import BOUND_S, ROOT, rack
+
+LONG = "a" * 5000
+COMMANDS = (
+    ("check", LONG),
+    ("run", "fig2", "--set", f"clock.speed={LONG}"),
+    ("run", "fig2", "--out", LONG),
+    ("check", "fig2", "--faults", LONG),
+    ("status", LONG),
+    ("command", LONG, "task", "hold"),
+    ("inject", "fig2", LONG, "kill"),
+    ("report", LONG),
+    ("bench", "partition", LONG),
+    (LONG,),
+)
+
+
+@pytest.mark.parametrize("arguments", COMMANDS, ids=lambda arguments: " ".join(arguments)[:20])
+def test_an_argument_without_end_is_refused_in_one_line(arguments: tuple[str, ...]) -> None:
+    done = rack(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("argument ")
+    assert done.stderr.endswith(" characters; at most 4096\n")
+    assert len(done.stderr) < 200
+
+
+@pytest.mark.parametrize("arguments", [("report",), ("analyze",), ("replay",), ("gantt",), ("run", "fig2", "--out")])
+def test_a_name_that_no_file_can_have_is_refused_in_one_line(arguments: tuple[str, ...]) -> None:
+    done = rack(*arguments, "a" * 300)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "aaaaaaaa" in done.stderr
+
+
+def test_bytes_that_are_no_text_are_refused() -> None:
+    command = [sys.executable, "-m", "tools.cli", "check", b"\xff"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": is no UTF-8\n')
+
+
+@pytest.mark.parametrize(
+    ("words", "found"), [("rack che", "check"), ("rack check fig", "fig2\nfig3\nfig4\nfig4-overload")]
+)
+def test_the_shell_completes_commands_and_configs(words: str, found: str) -> None:
+    asked = {"_RACK_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+    command = [sys.executable, "-m", "tools.cli"]
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | asked, capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, found)
