@@ -14,14 +14,21 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run,
 
 
 Against = Annotated[
-    Path | None, typer.Option(metavar="RUN", help="another run: tell the first tick at which what they wrote differs")
+    Path | None, typer.Option(metavar="RUN", help="another run: find the first tick at which the two diverge")
 ]
 
 
 def report(run: RunFolder, against: Against = None, as_json: Json = False) -> None:
     """Report on a run, from its recording.
 
-    Makes report.json and report.md anew. With --against the exit status is 1 when the runs part before any miss.
+    Writes report.json and report.md again. On a terminal the tables show as many columns as fit; report.md has all.
+
+    Exit status: 0 a report was made; 1 with --against the runs diverge before any miss; 2 the folder holds no run.
+
+    \b
+    Examples:
+      rack report runs/nasrem-20250101-120000
+      rack report runs/a --against runs/b
     """
     from tools.reporting.report import write_report
 

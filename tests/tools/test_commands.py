@@ -122,7 +122,7 @@ def test_check_shows_every_mailbox_at_its_bus_address(small: Path) -> None:
 
 
 def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], rack_name: str) -> None:
-    listed = {entry["name"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
+    listed = {entry["rack"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
     assert listed[rack_name] == "running"
     seen = json.loads(rack("status", rack_name, "--json").stdout)
     assert {task["task"] for task in seen["tasks"]} == {"upper", "lower", "lower.planner"}

@@ -188,7 +188,7 @@ def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, 
         {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
         {"level": "lower", "by": "operator", "why": "hold", "since_s": 0.755, "until_s": None, "lasted_s": 0.2425},
     ]
-    assert "## Held: 2 times" in text.splitlines()
+    assert "## Holds: 2" in text.splitlines()
     assert f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it." in text.splitlines()
 
 
