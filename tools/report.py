@@ -38,13 +38,13 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
 
 
 def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print a report as one JSON document; on a terminal what fits its width; elsewhere all of report.md."""
+    """Print a report: one JSON document; on a terminal as much as fits; elsewhere `text`, as for a run not recorded."""
     from tools.live_table import console
     from tools.reporting.markdown import show
 
     if as_json:
         print_json(data)
-    elif (terminal := console()).is_terminal:
+    elif (terminal := console()).is_terminal and data["folder"] is not None:
         show(data, terminal)
     else:
         print(text)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
+from tools.answer import ConfigName, Failure, Faults, Json, Settings
 
 Lockstep = Annotated[
     bool, typer.Option("--lockstep", help="begin a tick when every task due has finished: exact and repeatable")
@@ -66,12 +66,8 @@ def run(
         result = run_rack(found, seconds, folder, display, view)
     from tools.reporting.report import unrecorded, write_report
 
-    if folder is not None:
-        print_report(*write_report(folder), as_json)
-    elif as_json:
-        print_json(unrecorded(found, result.document()))
-    else:
-        print(result.text())
+    report, text = (unrecorded(found, result.document()), result.text()) if folder is None else write_report(folder)
+    print_report(report, text, as_json)
     if not result.worked:
         # Last, and by itself: whoever looks only at the end, or only at stderr, sees why.
         print(result.failure(), file=sys.stderr)
