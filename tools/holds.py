@@ -65,7 +65,7 @@ class Holds:
 
     def look(self) -> tuple[Hold, ...]:
         """Return what holds the rack now, the arm first; nothing once its run is over."""
-        if self._segment.words[System.STATE] == Run.STOPPED:
+        if self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive:
             return ()
         return (*self._stopped(), *(hold for level in self._statuses for hold in self._held(level)))
 

@@ -19,7 +19,7 @@ def status(
 
     State, cycles, misses, times, how far the work is, and what holds it: since when, what for, and how to release it.
 
-    Exit status: 0 it was shown, 1 there is no such rack, 2 RACK is needed because not exactly one rack runs.
+    Exit status: 0 it was shown, 1 there is no such rack, 2 RACK is missing and several racks run.
 
     \b
     Examples:
@@ -34,7 +34,8 @@ def status(
 
     running = racks()
     if rack is None and len(running) != 1:
-        raise Failure(f"which rack? racks: {', '.join(running) or 'none'}", 2)
+        names = ", ".join(running)
+        raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
     found = Viewer(Segment.attach(rack or running[0])).look()
     if as_json:
         print_json(asdict(found))

@@ -161,6 +161,9 @@ def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path)
 def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str], rack_name: str) -> None:
     running.kill()
     running.wait(BOUND_S)
+    seen = rack("status", rack_name)
+    assert seen.stdout.startswith(f"rack {rack_name}: dead, ")
+    assert "; its launcher is gone: 'rack clean' removes it" in seen.stdout.splitlines()[0]
     cleaned = json.loads(rack("clean", "--json").stdout)
     assert rack_name not in cleaned["in_use"]
     assert rack_name not in racks()

@@ -174,7 +174,8 @@ def _misses(report: Report) -> Iterator[str | Grid]:
     yield from ("", f"## Missed and skipped cycles: {late} and {skipped}{_first(misses, 'first')}", "")
     if (late, skipped) != (report["missed"], report["skipped"]):
         of_all = f"{report['missed']} and {report['skipped']}"
-        yield from (f"The tasks counted {of_all}; the recording holds no more than these.", "")
+        why = "the recorder lost rows" if report["rows_lost"] else "the recording does not hold all of it"
+        yield from (f"The tasks counted {of_all}; {why}.", "")
     rows = [
         [
             str(miss["tick"]),
