@@ -40,7 +40,7 @@ Settings = Annotated[
 ]
 
 Faults = Annotated[
-    str | None, typer.Option(metavar="FILE", help="script of faults by name, or a path; behind the config's own")
+    str | None, typer.Option(metavar="FILE", help="fault script, by name or path; added to the config's own faults")
 ]
 
 

@@ -1,4 +1,4 @@
-"""`rack command`: tell a level of a running rack what to do, as its operator."""
+"""`rack command`: command one level of a running rack, as its operator."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ Goals = Annotated[
 ]
 Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
 At = Annotated[float | None, typer.Option(metavar="S", help="instead of --tick: simulated time, s")]
-Wait = Annotated[bool, typer.Option("--wait", help="wait until it is done: the arm rests, or is at its goal")]
-List = Annotated[bool, typer.Option("--list", help="list what each level of the rack can be told")]
+Wait = Annotated[bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")]
+Timeout = Annotated[
+    float | None, typer.Option(metavar="S", min=0.0, help="with --wait: wall-clock seconds, then exit status 1")
+]
+List = Annotated[bool, typer.Option("--list", help="list each level, the commands that it takes, and what is in force")]
 
 EXAMPLES = """\b
 Examples:
@@ -35,7 +38,7 @@ Examples:
 
   rack command nasrem task goto position=0.45,0.1,0.95
 
-  rack command nasrem task goto home --tick 4000
+  rack command nasrem task goto home --tick 4000 --wait --timeout 60
 """
 
 
@@ -47,21 +50,24 @@ def command(
     tick: Tick = None,
     at: At = None,
     wait: Wait = False,
+    timeout: Timeout = None,
     is_list: List = False,
     as_json: Json = False,
 ) -> None:
-    """Tell a level of a running rack what to do, beside or instead of the level above it.
+    """Command one level of a running rack, overriding the level above it.
 
-    hold: the arm comes to rest on its way, and stays. setpoint (of the servo level) and goto: it moves to a goal, and
-    stays. resume: the level goes on with its own work. What was said stands until resume, through restarts of the
-    level's board too; an emergency stop comes before it.
+    hold: the arm comes to rest on its path and stays there. setpoint (servo level) and goto: it moves to a goal and
+    stays there. resume: the level goes on with its own work. A command stays in force until resume, even if the
+    level's board restarts. An emergency stop takes precedence.
 
-    A setpoint is followed straight in joint space: nobody looks for what is in the way.
+    A setpoint is followed on a straight line in joint space, without checking for collisions.
 
-    Exit status: 0 the level took it up (with --wait: it is done), 1 it refused, or gave no answer in time, 2 usage.
+    Exit status: 0 the level took the command up, with --wait: it is done; 1 it refused, or did not answer in time; 2
+    usage.
     """
     from tools.commanding.goals import goal_of
     from tools.commanding.live import LiveDesk
+    from tools.holds import resume_command
 
     desk = LiveDesk(rack)
     if is_list:
@@ -69,7 +75,11 @@ def command(
         return
     if level is None or what is None:
         raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
-    told = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait)
+    if timeout is not None and not wait:
+        raise Failure("--timeout is the bound of --wait; give both, or neither", 2)
+    told = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
     print_json(told.document()) if as_json else print(told.line)
     if not told.worked:
         raise typer.Exit(1)
+    if told.is_standing and what != "resume" and not as_json:
+        print(f"in force until: {resume_command(rack, level)}")

@@ -8,16 +8,23 @@ import typer
 
 from tools.answer import Failure, Json, RackName, print_json
 
-Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, if every input is good")]
+Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, provided every input is good")]
 
 OBEY_S = 2.0
 """Bound of the wait for the clock, which looks at the latch every tick."""
 
 
 def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
-    """Stop the arm at once: brakes closed, and kept closed until --reset.
+    """Stop the arm at once: the brakes are engaged, and stay engaged until --reset.
 
-    The run goes on with the arm held. A reset is refused while a board is lost, or holds SYSFAIL, or ACFAIL is set.
+    The run goes on with the arm braked. A reset is refused while a board is lost or holds SYSFAIL, or ACFAIL is set.
+
+    Exit status: 0 the latch is set, or with --reset clear; 1 the reset was refused, or there is no such rack.
+
+    \b
+    Examples:
+      rack estop nasrem
+      rack estop nasrem --reset
     """
     import time
 
@@ -40,5 +47,8 @@ def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
             raise Failure(f"rack '{rack}': the latch is {'clear' if reset else 'set'}; no tick has followed it")
         time.sleep(0.001)
     told = "reset" if reset else "latched"
+    how = "" if reset else f"; to release: rack estop {rack} --reset"
     document = {"rack": rack, "emergency_stop": not reset, "tick": words[System.TICK]}
-    print_json(document) if as_json else print(f"rack '{rack}': emergency stop {told} at tick {words[System.TICK]}")
+    print_json(document) if as_json else print(
+        f"rack '{rack}': emergency stop {told} at tick {words[System.TICK]}{how}"
+    )

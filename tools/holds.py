@@ -65,7 +65,7 @@ class Holds:
 
     def look(self) -> tuple[Hold, ...]:
         """Return what holds the rack now, the arm first; nothing once its run is over."""
-        if self._segment.words[System.STATE] == Run.STOPPED:
+        if self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive:
             return ()
         return (*self._stopped(), *(hold for level in self._statuses for hold in self._held(level)))
 
@@ -113,13 +113,14 @@ class Standstill:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
+        self._holds = Holds(segment)
         self._still_since: int | None = None
         self._told: set[tuple[str, int]] = set()
 
-    def look(self, holds: tuple[Hold, ...]) -> Iterator[Event]:
+    def look(self) -> Iterator[Event]:
         """Yield an event for each hold that somebody must end, told of for the first time."""
         tick = self._segment.words[System.TICK]
-        kept = [hold for hold in holds if hold.release]
+        kept = [hold for hold in self._holds.look() if hold.release]
         if not kept or not arm_of(self._segment).is_at_rest:
             self._still_since = None
             return

@@ -6,10 +6,7 @@ from tools.answer import Json, print_json
 
 
 def list_racks(as_json: Json = False) -> None:
-    """List the racks on this machine.
-
-    Those that run, and those that a killed launcher has left.
-    """
+    """List the racks on this machine: those that run, and those that a killed launcher left behind."""
     from backplane.segment import racks
     from tools.survey import describe
 
@@ -18,6 +15,6 @@ def list_racks(as_json: Json = False) -> None:
         print_json(found)
         return
     for rack in found:
-        print(f"{rack['name']:<24} {rack['state']:<10} {rack['detail']}")
+        print(f"{rack['rack']:<24} {rack['state']:<10} {rack['detail']}")
     if not found:
         print("no racks")

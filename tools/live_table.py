@@ -10,7 +10,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from tools.snapshot import LOST, Progress, Snapshot, TaskRow
+from tools.snapshot import DEAD, LOST, Progress, Snapshot, TaskRow
 from tools.text_table import fitting
 
 COLUMNS: dict[str, Callable[[TaskRow], str]] = {
@@ -94,6 +94,8 @@ def line_of(snapshot: Snapshot) -> str:
 
 def _head(snapshot: Snapshot) -> Text:
     line = Text(f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}")
+    if snapshot.run == DEAD:
+        line.append("; its launcher is gone: 'rack clean' removes it", style="bold red")
     if snapshot.clock_skipped:
         line.append(f", clock skipped {snapshot.clock_skipped} ticks", style="yellow")
     for name in [*snapshot.lines, *_demanded(snapshot)]:

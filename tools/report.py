@@ -14,14 +14,21 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run,
 
 
 Against = Annotated[
-    Path | None, typer.Option(metavar="RUN", help="another run: tell the first tick at which what they wrote differs")
+    Path | None, typer.Option(metavar="RUN", help="another run: find the first tick at which the two diverge")
 ]
 
 
 def report(run: RunFolder, against: Against = None, as_json: Json = False) -> None:
     """Report on a run, from its recording.
 
-    Makes report.json and report.md anew. With --against the exit status is 1 when the runs part before any miss.
+    Writes report.json and report.md again. On a terminal the tables show as many columns as fit; report.md has all.
+
+    Exit status: 0 a report was made; 1 with --against the runs diverge before any miss; 2 the folder holds no run.
+
+    \b
+    Examples:
+      rack report runs/nasrem-20250101-120000
+      rack report runs/a --against runs/b
     """
     from tools.reporting.report import write_report
 
@@ -31,13 +38,13 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
 
 
 def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print a report as one JSON document; on a terminal what fits its width; elsewhere all of report.md."""
+    """Print a report: one JSON document; on a terminal as much as fits; elsewhere `text`, as for a run not recorded."""
     from tools.live_table import console
     from tools.reporting.markdown import show
 
     if as_json:
         print_json(data)
-    elif (terminal := console()).is_terminal:
+    elif (terminal := console()).is_terminal and data["folder"] is not None:
         show(data, terminal)
     else:
         print(text)

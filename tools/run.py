@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
+from tools.answer import ConfigName, Failure, Faults, Json, Settings
 
-Lockstep = Annotated[bool, typer.Option("--lockstep", help="a tick begins when every task due has finished: exact")]
+Lockstep = Annotated[
+    bool, typer.Option("--lockstep", help="begin a tick when every task due has finished: exact and repeatable")
+]
 Seconds = Annotated[
     float | None, typer.Option(metavar="S", min=0.0, help="simulated time to run for; default: until the task ends")
 ]
 Speed = Annotated[
-    float | None, typer.Option(metavar="X", help="run this many times faster than real time, or slower: 0.5")
+    float | None, typer.Option(metavar="X", help="run this many times as fast as real time, as in 2 or 0.5")
 ]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
@@ -36,7 +38,16 @@ def run(
 ) -> None:
     """Run a rack until its task ends, and report on it.
 
-    The exit status is 0 when the task was done and no fault is latched.
+    On a terminal a live table shows every task, and what holds the rack; elsewhere a line a second does. --json prints
+    the report as one document, with the same keys whether the run was recorded or not; what only a recording
+    knows is null then.
+
+    Exit status: 0 the task was done, or --seconds are over, and no fault is latched; 1 otherwise; 2 usage or config.
+
+    \b
+    Examples:
+      rack run nasrem
+      rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
     """
     from boards.config import load
     from tools.display import display_for
@@ -55,12 +66,8 @@ def run(
         result = run_rack(found, seconds, folder, display, view)
     from tools.reporting.report import unrecorded, write_report
 
-    if folder is not None:
-        print_report(*write_report(folder), as_json)
-    elif as_json:
-        print_json(unrecorded(found, result.document()))
-    else:
-        print(result.text())
+    report, text = (unrecorded(found, result.document()), result.text()) if folder is None else write_report(folder)
+    print_report(report, text, as_json)
     if not result.worked:
         # Last, and by itself: whoever looks only at the end, or only at stderr, sees why.
         print(result.failure(), file=sys.stderr)

@@ -93,7 +93,7 @@ def run_rack(
                     raise Failure(recorder.finish())
                 sources = [recorder.told, *([] if port is None else [_window(port)])]
             started = time.monotonic()
-            outcome = _watch(rack, seconds, display, log, lambda: _hear(sources, rack.segment, log))
+            outcome = _watch(rack, seconds, display, _ears(sources, rack.segment, log))
             wall_s, segment = time.monotonic() - started, rack.segment
         recording = recorder.finish() if recorder is not None else "none"
         _hear(sources, segment, log)
@@ -112,14 +112,12 @@ def run_rack(
     return result
 
 
-def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, hear: Callable[[], None]) -> Outcome:
+def _watch(rack: Rack, seconds: float | None, display: Display, hear: Callable[[], None]) -> Outcome:
     with _stopped_by_signals(rack):
         rack.start(seconds)
-        viewer, standstill = Viewer(rack.segment), Standstill(rack.segment)
+        viewer = Viewer(rack.segment)
         while rack.watch(display.period_s):
-            display.show(seen := viewer.look())
-            for event in standstill.look(seen.holds):
-                log.add(event)
+            display.show(viewer.look())
             hear()
         display.show(viewer.look())
     if rack.outcome is None:
@@ -151,6 +149,18 @@ def _window(port: int) -> Callable[[], list[str]]:
     except Failure as failure:
         told = [f"no viewer: {failure}"]
         return lambda: [told.pop()] if told else []
+
+
+def _ears(sources: list[Callable[[], list[str]]], segment: Segment, log: EventLog) -> Callable[[], None]:
+    """Return what makes events of all that only the host side sees."""
+    standstill = Standstill(segment)
+
+    def hear() -> None:
+        _hear(sources, segment, log)
+        for event in standstill.look():
+            log.add(event)
+
+    return hear
 
 
 def _hear(sources: list[Callable[[], list[str]]], segment: Segment, log: EventLog) -> None:

@@ -18,6 +18,8 @@ from tools.holds import Hold, Holds
 
 LOST = "lost"
 """State of a task that is dead or hangs, until its new process has rejoined."""
+DEAD = "dead"
+"""What a rack says of its run when its launcher is gone: 'rack clean' removes it."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports how far the whole task is."""
 
@@ -105,7 +107,7 @@ class Viewer:
         tick = words[System.TICK]
         return Snapshot(
             rack=layout.rack,
-            run=Run(words[System.STATE]).name.lower(),
+            run=Run(words[System.STATE]).name.lower() if self._segment.launcher_is_alive else DEAD,
             tick=tick,
             time_s=tick * layout.clock_ns * 1e-9,
             clock_skipped=words[System.CLOCK_SKIPPED],

@@ -10,12 +10,21 @@ from tools.answer import Failure, Json, print_json
 
 
 def status(
-    rack: Annotated[str | None, typer.Argument(metavar="[RACK]", help="rack; may be left out when one runs")] = None,
+    rack: Annotated[
+        str | None, typer.Argument(metavar="[RACK]", help="running rack by name; not needed when only one runs")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Show every board of a running rack.
+    """Show every task of a running rack once.
 
-    State, cycles, misses, times, and how far the task is.
+    State, cycles, misses, times, how far the work is, and what holds it: since when, what for, and how to release it.
+
+    Exit status: 0 it was shown, 1 there is no such rack, 2 RACK is missing and several racks run.
+
+    \b
+    Examples:
+      rack status
+      rack status nasrem --json
     """
     from dataclasses import asdict
 
@@ -25,7 +34,8 @@ def status(
 
     running = racks()
     if rack is None and len(running) != 1:
-        raise Failure(f"which rack? racks: {', '.join(running) or 'none'}", 2)
+        names = ", ".join(running)
+        raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
     found = Viewer(Segment.attach(rack or running[0])).look()
     if as_json:
         print_json(asdict(found))

@@ -16,7 +16,13 @@ def stop(
 ) -> None:
     """End a run and wait until it is gone.
 
-    The run ends at its next tick, in order: its report is made.
+    The run ends in order at its next tick, and its report is made.
+
+    Exit status: 0 it has ended, 1 there is no such rack or it still runs after --wait.
+
+    \b
+    Examples:
+      rack stop nasrem --wait 30
     """
     from tools.stopping import stop_rack
 

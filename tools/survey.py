@@ -10,11 +10,11 @@ from backplane.words import Head, Run, System
 
 
 def describe(name: str) -> dict[str, str | int | float]:
-    """Return name, state and detail of a rack; state "dead" when its launcher is gone."""
+    """Return name, as "rack", state and detail of a rack; state "dead" when its launcher is gone."""
     try:
         segment = Segment.attach(name)
     except SegmentError as error:
-        return {"name": name, "state": "foreign", "detail": str(error)}
+        return {"rack": name, "state": "foreign", "detail": str(error)}
     words = segment.words
     age_s = time.time() - words[Head.CREATED_NS] * 1e-9
     launcher = words[Head.LAUNCHER_PID]
@@ -28,4 +28,4 @@ def describe(name: str) -> dict[str, str | int | float]:
     boards = len({task.board for task in segment.layout.tasks})
     detail = f"{boards} boards, tick {words[System.TICK]}, {by}"
     segment.close()
-    return {"name": name, "state": state, "detail": detail, "launcher": launcher, "age_s": round(age_s, 3)}
+    return {"rack": name, "state": state, "detail": detail, "launcher": launcher, "age_s": round(age_s, 3)}

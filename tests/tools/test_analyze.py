@@ -133,8 +133,22 @@ def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Pa
     assert (task["lateness_ms"]["max"], task["lateness_ms"]["p50"]) == (0.3, 0.1)
     assert task["largest_gap_ms"] == 4 * 2.5
     assert told["core_loads"] == {"core 0": pytest.approx(1.2 / 2.5)}
-    task = document(Analysis.of(recorded(tmp_path / "b", load(small), traces)))["tasks"]["lower"]
+    lockstep = Analysis.of(recorded(tmp_path / "b", load(small), traces))
+    task = document(lockstep)["tasks"]["lower"]
     assert (task["lateness_ms"], task["largest_gap_ms"], task["response_ms"]) == (None, None, None)
+    assert "late max" not in text(lockstep)
+    assert "lockstep: no deadlines, no lateness" in text(lockstep)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_tables_of_an_analysis_fit_the_terminal(small: Path, tmp_path: Path, width: int) -> None:
+    traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(8)] for name in ("lower", "upper")}
+    analysis = Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces))
+    lines = text(analysis, width).splitlines()
+    rows = [line for line in lines if line.startswith(("lower ", "upper ", "3.", "task ", "eq. ", "level "))]
+    assert len(rows) >= 20
+    assert max(map(len, rows)) <= width
+    assert max(map(len, text(analysis).splitlines())) > 120
 
 
 def test_a_run_in_lockstep_is_analyzed_with_its_system_response(small: Path, rack_name: str, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from tests.boards.told_racks import TOLD
 from tests.processes import wait_until
 from tools.answer import Failure
 from tools.commanding import patience
+from tools.commanding.answers import Answers
 from tools.commanding.goals import goal_of
 from tools.commanding.live import LiveDesk
 
@@ -82,6 +84,23 @@ def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
     assert rack("command", running, "upper", "resume").returncode == 0
 
 
+def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
+    running: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A level that never comes to an end with it.
+    monkeypatch.setattr(Answers, "look", lambda answers: replace(answers.told, fate="taken", taken_up=0))
+    still = f", not done; in force until: rack command {running} upper resume$"
+    with pytest.raises(Failure, match=f"^timed out after 0 s: command .*{still}"):
+        LiveDesk(running).give({"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0)
+    assert rack("command", running, "upper", "resume").returncode == 0
+
+
+def test_a_command_that_stays_in_force_says_how_to_end_it(running: str) -> None:
+    held = rack("command", running, "upper", "hold").stdout.splitlines()
+    assert held[1:] == [f"in force until: rack command {running} upper resume"]
+    assert len(rack("command", running, "upper", "resume").stdout.splitlines()) == 1
+
+
 def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
     done = rack("command", running, "upper", "goto", "home")
     assert done.returncode == 1
@@ -96,6 +115,10 @@ def test_what_can_be_told_to_whom_is_listed(running: str) -> None:
 
 REFUSED = {
     "no level": (("uper", "hold"), 'level = "uper": no level that can be commanded; levels: upper, lower'),
+    "no wait to bound": (
+        ("upper", "hold", "--timeout", "1"),
+        "--timeout is the bound of --wait; give both, or neither",
+    ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
     "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
     "not for this level": (("lower", "setpoint", "joints=1"), "'lower' takes no setpoint; it takes: hold, resume"),

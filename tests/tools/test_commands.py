@@ -122,7 +122,7 @@ def test_check_shows_every_mailbox_at_its_bus_address(small: Path) -> None:
 
 
 def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], rack_name: str) -> None:
-    listed = {entry["name"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
+    listed = {entry["rack"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
     assert listed[rack_name] == "running"
     seen = json.loads(rack("status", rack_name, "--json").stdout)
     assert {task["task"] for task in seen["tasks"]} == {"upper", "lower", "lower.planner"}
@@ -161,6 +161,9 @@ def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path)
 def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str], rack_name: str) -> None:
     running.kill()
     running.wait(BOUND_S)
+    seen = rack("status", rack_name)
+    assert seen.stdout.startswith(f"rack {rack_name}: dead, ")
+    assert "; its launcher is gone: 'rack clean' removes it" in seen.stdout.splitlines()[0]
     cleaned = json.loads(rack("clean", "--json").stdout)
     assert rack_name not in cleaned["in_use"]
     assert rack_name not in racks()

@@ -97,10 +97,10 @@ def test_nothing_holds_a_level_at_its_work_or_a_rack_whose_run_is_over(segment: 
 def test_a_standstill_is_one_event_for_each_hold(segment: Segment) -> None:
     give(segment, What.HOLD)
     answer(segment, What.HOLD, 1, Answer.DONE)
-    holds, standstill, told = Holds(segment), Standstill(segment), []
+    standstill, told = Standstill(segment), []
     for second in range(20):
         segment.words[System.TICK] = round(second / TICK_S)
-        told += list(standstill.look(holds.look()))
+        told += list(standstill.look())
     (event,) = told
     assert (event.kind, event.code, event.subject, event.since) == ("held", "standstill", "upper", 100)
     # Held since 0.25 s, looked at every second.

@@ -155,7 +155,10 @@ def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folde
     assert "## Missed and skipped cycles: 1 and 3" in lines
     assert "The tasks counted" not in markdown(report)
     fewer = markdown({**report, "missed": 2, "skipped": 7})
-    assert "The tasks counted 2 and 7; the recording holds no more than these." in fewer
+    assert "The tasks counted 2 and 7; the recording does not hold all of it." in fewer
+    lossy = markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
+    assert "The tasks counted 2 and 7; the recorder lost rows." in lossy
+    assert "- the recorder lost rows: lower 4" in lossy.splitlines()
 
 
 @pytest.mark.parametrize("width", [80, 120])
@@ -188,7 +191,7 @@ def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, 
         {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
         {"level": "lower", "by": "operator", "why": "hold", "since_s": 0.755, "until_s": None, "lasted_s": 0.2425},
     ]
-    assert "## Held: 2 times" in text.splitlines()
+    assert "## Holds: 2" in text.splitlines()
     assert f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it." in text.splitlines()
 
 

@@ -165,3 +165,11 @@ def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
 def sim_times(run: Recording, entity: str) -> np.ndarray:
     chunks = RrdReader(str(run.folder / "run.rrd")).stream().filter(content=entity, has_timeline="tick").to_chunks()
     return np.concatenate([c.to_record_batch().column("sim_time").to_numpy().astype(np.int64) for c in chunks])
+
+
+def test_lockstep_shows_no_time_that_is_held_against_the_clock(run: Recording) -> None:
+    lateness, execution, deadline = read(run.folder / "run.rrd", "/times/servo").values.T
+    assert np.isnan([lateness, deadline]).all()
+    assert (execution > 0.0).all()
+    with pytest.raises(KeyError):
+        read(run.folder / "run.rrd", "/load/servo")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -19,6 +21,7 @@ from tools.answer import Failure
 from tools.commanding.answers import Answers, answering
 from tools.commanding.patience import SILENT_S, Patience
 from tools.commanding.told import Told
+from tools.holds import resume_command
 from tools.text_table import table
 
 ANSWER_CYCLES = 4
@@ -42,8 +45,10 @@ class LiveDesk:
         """Yield the same as a table."""
         yield from table(["level", "stands", "takes"], [list(row.values()) for row in self.levels()])
 
-    def give(self, given: Mapping[str, Any], wait: bool) -> Told:
+    def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Told:
         """Hand a command over and wait for its level to take it up, with `wait` until that is done.
+
+        `timeout_s` of wall-clock time is the bound of that wait; None: the end of the run is.
 
         Raises `ConfigError` with every mistake, and `Failure` when it is not given, or not answered in time.
         """
@@ -62,11 +67,11 @@ class LiveDesk:
         finally:
             # However the wait ends, nothing is left that would be given when nobody asks for it any more.
             self._table.withdraw(entry, ticket)
-        return self._await_answer(told, wait)
+        return self._await_answer(told, wait, timeout_s)
 
     def _await_giving(self, entry: RequestEntry, ticket: int, level: str, text: str) -> Told:
         about = f"'{level}', {text}"
-        patience = Patience(self._segment, f"{about}: waits for its tick, {max(0, entry[RequestWord.TICK])}")
+        patience = Patience(self._segment, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}")
         while entry[RequestWord.TICKET] == ticket:
             if entry.stage == RequestStage.GIVEN:
                 return Told(entry[RequestWord.SERIAL], level, text, entry[RequestWord.GIVEN_TICK])
@@ -76,14 +81,15 @@ class LiveDesk:
                 raise Failure(f"{about}: not given, the clock has given out no tick for {SILENT_S:g} s")
         raise Failure(f"{about}: given, but so many others since that its answer is lost")
 
-    def _await_answer(self, told: Told, wait: bool) -> Told:
+    def _await_answer(self, told: Told, wait: bool, timeout_s: float | None) -> Told:
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         status = answering(self._segment, told.level)
         if status is None:
             return told
         answers = Answers(self._segment, status, told)
         last = told.given + ANSWER_CYCLES * status.every
         patience = Patience(
-            self._segment, f"command {told.serial}: waits for '{told.level}', every {status.every} ticks"
+            self._segment, f"command {told.serial}: waiting for '{told.level}', which runs every {status.every} ticks"
         )
         # In this order: what a level says before the run ends is still heard.
         while True:
@@ -97,6 +103,9 @@ class LiveDesk:
                 raise Failure(
                     f"command {told.serial}: '{told.level}' has not answered in {ANSWER_CYCLES} of its cycles"
                 )
+            if time.monotonic() > deadline:
+                still = f"in force until: {resume_command(self._segment.rack, told.level)}"
+                raise Failure(f"timed out after {timeout_s:g} s: {told.line}, not done; {still}")
             if not patience.look_again():
                 raise Failure(f"command {told.serial}: the clock has given out no tick for {SILENT_S:g} s")
 

@@ -29,6 +29,11 @@ class Told:
         """Whether it was not refused."""
         return self.fate != "refused"
 
+    @property
+    def is_standing(self) -> bool:
+        """Whether its level has it in force, as far as is known."""
+        return self.fate in ("taken", "done")
+
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
         return {**asdict(self), "worked": self.worked}

@@ -76,7 +76,8 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from (f"- fault: {fault}" for fault in outcome["faults"])
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
-    yield from (f"- {count} rows of {name} were lost" for name, count in report["rows_lost"].items())
+    if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
+        yield f"- the recorder lost rows: {lost}"
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])
@@ -102,7 +103,7 @@ def _holds(report: Report) -> Iterator[str | Grid]:
     holds = report["holds"]
     if not holds:
         return
-    yield from ("", f"## Held: {len(holds)} times{_first(holds, 'longest')}", "")
+    yield from ("", f"## Holds: {len(holds)}{_first(holds, 'longest')}", "")
     longest = sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
     rows = [
         [
@@ -128,11 +129,11 @@ def _against(against: Report | None) -> Iterator[str]:
         return
     parting = against["first_difference"]
     if parting is None:
-        yield f"- all messages are those of {against['folder']}"
+        yield f"- every message equals that of {against['folder']}"
         return
     missed = against["first_miss_tick"]
     why = f"the first miss is at tick {missed}" if missed is not None else "neither run has a miss"
-    yield f"- parts from {against['folder']} at tick {parting['tick']}, in {parting['mailbox']}; {why}"
+    yield f"- diverges from {against['folder']} at tick {parting['tick']}, first in {parting['mailbox']}; {why}"
 
 
 def _faults(report: Report) -> Iterator[str | Grid]:
@@ -173,7 +174,8 @@ def _misses(report: Report) -> Iterator[str | Grid]:
     yield from ("", f"## Missed and skipped cycles: {late} and {skipped}{_first(misses, 'first')}", "")
     if (late, skipped) != (report["missed"], report["skipped"]):
         of_all = f"{report['missed']} and {report['skipped']}"
-        yield from (f"The tasks counted {of_all}; the recording holds no more than these.", "")
+        why = "the recorder lost rows" if report["rows_lost"] else "the recording does not hold all of it"
+        yield from (f"The tasks counted {of_all}; {why}.", "")
     rows = [
         [
             str(miss["tick"]),

@@ -109,16 +109,16 @@ class Response:
         figures = {"measured": len(self.measured), "beyond": len(self.beyond), "off_prediction": len(self.off)}
         return {**head, **figures, "levels": self.rows(), "each": commands}
 
-    def text(self) -> str:
-        """Return the figures as text for people."""
-        return "\n".join(self._lines())
+    def text(self, width: int | None = None) -> str:
+        """Return the figures as text for people, the table into `width`."""
+        return "\n".join(self._lines(width))
 
-    def _lines(self) -> Iterator[str]:
+    def _lines(self, width: int | None) -> Iterator[str]:
         yield f"response to {len(self.measured)} commands of an operator, ms of simulated time, to the end of the cycle"
         yield "whose torque rests on it: from its giving, and from the release that reads it"
         head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
         head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
-        yield from table(head, [[*self._cells(row)] for row in self.rows()])
+        yield from table(head, [[*self._cells(row)] for row in self.rows()], width, ("min", "sum, eq. 3.3", "median"))
         others = [command for command in self.commands if command.acts is None]
         if others:
             told = ", ".join(f"{c.serial} to {c.level} ({c.fate})" for c in others)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from tools.answer import Failure, print_json
+from tools.live_table import print_wrapped, terminal_width
 from tools.recording import Recording
 from tools.responding.plot import plot
 from tools.responding.response import response_of
@@ -27,5 +28,6 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
     if as_json:
         print_json(document)
     else:
-        print(f"{response.text()}\n\n{folder}/response.json, {', '.join(path.name for path in paths)}")
+        files = f"{folder}/response.json, {', '.join(path.name for path in paths)}"
+        print_wrapped(f"{response.text(terminal_width())}\n\n{files}")
     return response.held

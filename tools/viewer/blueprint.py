@@ -41,7 +41,7 @@ def blueprint(layout: Layout, config: RackConfig, cell: Cell | None, live: bool)
     right = rrb.Vertical(
         _joints(names) if names else _curves("signals", [_all(SIGNALS)]),
         lanes_view("boards, cycle by cycle", [_all(BOARDS)], CYCLES_S),
-        rrb.Horizontal(_load(), _ages(layout), _log(), column_shares=[3, 3, 4]),
+        rrb.Horizontal(_load(config), _ages(layout), _log(), column_shares=[3, 3, 4]),
         row_shares=[4, 5, 3],
     )
     return rrb.Blueprint(
@@ -78,7 +78,9 @@ def _joint(name: str, quantity: str) -> rrb.View:
     return _curves(name, [path(JOINTS, name, quantity), path(JOINTS, name, quantity, "limits")], legend=False)
 
 
-def _load() -> rrb.Container:
+def _load(config: RackConfig) -> rrb.Container | rrb.View:
+    if config.clock.mode == "lockstep":
+        return _curves("execution, ms; no deadlines in lockstep", [_all(load.TIMES)])
     use = _curves("use of the time slice, %", [_all(load.LOAD)])
     return rrb.Tabs(use, _curves("lateness and execution, ms", [_all(load.TIMES)]))
 

@@ -54,7 +54,11 @@ class ViewSink:
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
         self._of_task: dict[str, list[Part]] = {
-            task.name: [Gantt(stream, task, speed, lockstep), Load(stream, task, slice_ns), Misses(stream, task)]
+            task.name: [
+                Gantt(stream, task, speed, lockstep),
+                Load(stream, task, slice_ns, lockstep),
+                Misses(stream, task),
+            ]
             for task in layout.tasks
         }
         # An operator's mailbox has no age: commands come now and then.

@@ -1,0 +1,40 @@
+"""Plain tables, as wide as they are or as a terminal permits."""
+
+from __future__ import annotations
+
+import pytest
+
+from tools.text_table import fitting, table
+
+HEAD = ("task", "count", "what it says of itself")
+ROWS = (("servo", "12", "torque of j3 is NaN, and rejected"), ("elemental_move", "7", "idle"))
+
+
+def test_numbers_stand_to_the_right_and_texts_to_the_left() -> None:
+    assert list(table(HEAD, ROWS)) == [
+        "task            count  what it says of itself",
+        "servo              12  torque of j3 is NaN, and rejected",
+        "elemental_move      7  idle",
+    ]
+
+
+@pytest.mark.parametrize("width", [30, 40, 55, 56, 80])
+def test_a_table_fits_its_width_with_long_cells_wrapped(width: int) -> None:
+    lines = list(table(HEAD, ROWS, width))
+    assert max(map(len, lines)) <= width
+    assert (len(lines) == 3) == (width >= 56)
+    assert " ".join(" ".join(lines).split()).count("12") == 1
+
+
+def test_columns_that_may_be_missing_go_before_anything_is_wrapped() -> None:
+    assert list(table(HEAD, ROWS, 40, ("what it says of itself", "count"))) == [
+        "task            count",
+        "servo              12",
+        "elemental_move      7",
+    ]
+    assert fitting(HEAD, ROWS, 56, ("count",)) == [0, 1, 2]
+    assert fitting(HEAD, ROWS, 55, ("count",)) == [0, 2]
+
+
+def test_a_table_without_rows_is_its_head() -> None:
+    assert list(table(HEAD, [], 80)) == ["task  count  what it says of itself"]
