@@ -11,8 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-import posix_ipc
-
 from backplane.byte_lock import ByteLock
 from backplane.double_buffer import DoubleBufferWriter
 from backplane.mailbox import Reader, Reading
@@ -46,9 +44,7 @@ class MailboxLock:
 
     def acquire(self) -> bool:
         """Take the lock within its bound; False when its holder lives and keeps it."""
-        try:
-            self._semaphore.acquire(self._wait_s)
-        except posix_ipc.BusyError:
+        if not self._semaphore.acquire(self._wait_s):
             self._look_at_holder()
         # After a wait that ran out: free when whoever took the semaphore is dead: of several waiters one gets it. Else
         # not free when such a waiter came between the two steps: it is the owner then.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import posix_ipc
-
 from backplane.alarms import AlarmWriter
 from backplane.clock_driver import ClockDriver, Ended
 from backplane.process import is_alive
@@ -74,14 +72,13 @@ class LockstepDriver(ClockDriver):
 
     def _wait(self, condition: Callable[[], bool]) -> bool:
         while not condition():
-            try:
-                self._done.acquire(CHECK_S)
-            except posix_ipc.BusyError:
-                if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
-                    return False
-                # Somebody may have stopped one with a signal: time must not wait for that.
-                for task in self.tasks:
-                    task.look_whether_stopped()
+            if self._done.acquire(CHECK_S):
+                continue
+            if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
+                return False
+            # Somebody may have stopped one with a signal: time must not wait for that.
+            for task in self.tasks:
+                task.look_whether_stopped()
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:

@@ -2,16 +2,64 @@
 
 The Rack makes them, the crate opens them before it forks the boards, and the names are removed at
 once: the boards keep the open semaphores, and nothing is left behind however they end.
+
+`posix_ipc` waits by the wall clock: set back by an hour, a bound of 2 ms would end an hour later. The C library has a
+wait by CLOCK_MONOTONIC too (glibc 2.30). Alternatives considered: a futex by hand, and an eventfd with `poll`, are
+slower to wake up.
 """
 
 from __future__ import annotations
+
+import ctypes
+import time
+from functools import partial
 
 import posix_ipc
 
 from backplane.layout import Layout
 from backplane.segment import PREFIX, SHM_FOLDER
 
-_OPEN: dict[str, posix_ipc.Semaphore] = {}
+_libc = ctypes.CDLL(None)
+_sem_open, _sem_clockwait = _libc.sem_open, _libc.sem_clockwait
+_sem_open.argtypes, _sem_open.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
+_sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
+
+
+class Semaphore(posix_ipc.Semaphore):
+    """An open semaphore whose waits no step of the wall clock makes longer or shorter.
+
+    `wait()` waits until what `bind` has set, and returns 0 when it has obtained the semaphore: it is the C library's
+    own function, for whoever must be awake at once. A signal may end it early.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Open the semaphore of that name. Raises `posix_ipc.ExistentialError`."""
+        super().__init__(name)
+        # The same one: the C library opens a name once in a process.
+        address = _sem_open(name.encode(), 0)
+        # A struct timespec, which the C library reads where it is.
+        self._deadline = (ctypes.c_int64 * 2)()
+        self.wait = partial(_sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline))
+
+    def bind(self, timeout_s: float) -> int:
+        """Have waits end in `timeout_s` from now; return when that is, CLOCK_MONOTONIC, ns."""
+        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
+        return deadline_ns
+
+    def acquire(self, timeout_s: float) -> bool:
+        """Wait for that long at most; False when it was in vain."""
+        try:
+            super().acquire(0)
+        except posix_ipc.BusyError:
+            deadline_ns = self.bind(timeout_s)
+            while self.wait():
+                if time.monotonic_ns() >= deadline_ns:
+                    return False
+        return True
+
+
+_OPEN: dict[str, Semaphore] = {}
 """Semaphores open in this process; forked boards inherit them."""
 
 
@@ -33,7 +81,7 @@ def create(layout: Layout) -> None:
 def open_all(layout: Layout) -> None:
     """Open every semaphore of a rack in this process."""
     for name in names(layout):
-        _OPEN[name] = posix_ipc.Semaphore(name)
+        _OPEN[name] = Semaphore(name)
 
 
 def unlink(layout: Layout) -> None:
@@ -49,24 +97,24 @@ def unlink_all(rack: str) -> None:
         _unlink(f"/{path.name.removeprefix('sem.')}")
 
 
-def wake_semaphore(rack: str, task: str) -> posix_ipc.Semaphore:
+def wake_semaphore(rack: str, task: str) -> Semaphore:
     """Return the open semaphore that wakes a task."""
     return _opened(_wake(rack, task))
 
 
-def clock_semaphore(rack: str) -> posix_ipc.Semaphore:
+def clock_semaphore(rack: str) -> Semaphore:
     """Return the open semaphore on which lockstep waits for tasks to finish."""
     return _opened(_clock(rack))
 
 
-def lock_semaphore(rack: str, mailbox: str) -> posix_ipc.Semaphore:
+def lock_semaphore(rack: str, mailbox: str) -> Semaphore:
     """Return the open semaphore that guards a mailbox."""
     return _opened(_lock(rack, mailbox))
 
 
-def _opened(name: str) -> posix_ipc.Semaphore:
+def _opened(name: str) -> Semaphore:
     if name not in _OPEN:
-        _OPEN[name] = posix_ipc.Semaphore(name)
+        _OPEN[name] = Semaphore(name)
     return _OPEN[name]
 
 

@@ -7,10 +7,7 @@ too large a part of its cycle and it has a core of its own.
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from time import monotonic_ns
-
-import posix_ipc
 
 from backplane.alarms import Alarm, AlarmWriter
 from backplane.clock import SystemClock
@@ -85,13 +82,12 @@ class NextCycle:
         return release
 
     def _block_on_semaphore(self) -> bool:
-        try:
-            self._semaphore.acquire(CHECK_S if self._clock_alarms is None else self._patience_s())
-        except posix_ipc.BusyError:
-            if self._clock_alarms is not None and self._last >= 0:
-                self._look_at_clock(self._clock_alarms)
-            return is_alive(*self._launcher)
-        return True
+        self._semaphore.bind(CHECK_S if self._clock_alarms is None else self._patience_s())
+        if not self._semaphore.wait():
+            return True
+        if self._clock_alarms is not None and self._last >= 0:
+            self._look_at_clock(self._clock_alarms)
+        return is_alive(*self._launcher)
 
     def _patience_s(self) -> float:
         """Return how long to wait for the next release, s, before the clock is looked at."""
@@ -126,9 +122,8 @@ class NextCycle:
     def _take_posts(self, count: int) -> None:
         """Take what a task that does not wait on its semaphore is sent all the same: over weeks it would overflow."""
         # The newest post may be a moment behind its release: the next cycle takes it.
-        with suppress(posix_ipc.BusyError):
-            for _ in range(count):
-                self._semaphore.acquire(0)
+        while count and self._semaphore.acquire(0):
+            count -= 1
 
     def hold_until(self, tick: int) -> None:
         """Take no release before `tick`: a planner that works on a plan keeps its time slice."""

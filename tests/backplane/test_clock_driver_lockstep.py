@@ -21,9 +21,9 @@ pytestmark = pytest.mark.filterwarnings(FORKS)
 HISTORY = 8
 
 
-def serve(segment: Segment, name: str, log: list[tuple[str, str, int]], work_s: float, poll: bool) -> None:
+def serve(segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, str, int]], work_s: float) -> None:
     """Do a task's cycles, slowly, and tell the clock of each."""
-    cycle, block = NextCycle(segment, name, poll), segment.block(name)
+    block = segment.block(name)
     while (tick := cycle.wait()) is not None:
         log.append(("begin", name, tick))
         time.sleep(work_s)
@@ -45,8 +45,10 @@ def lockstep(
         return stop if tick >= stop else None
 
     segment.words[System.LOCKSTEP] = 1
+    # There before the first release: a task that comes later waits for the next one.
+    cycles = {t.name: NextCycle(segment, t.name, poll) for t in segment.layout.tasks}
     threads = [
-        threading.Thread(target=serve, args=(segment, t.name, log, 0.002 * t.slot, poll), daemon=True)
+        threading.Thread(target=serve, args=(segment, t.name, cycles[t.name], log, 0.002 * t.slot), daemon=True)
         for t in segment.layout.tasks
     ]
     for thread in threads:
@@ -116,7 +118,8 @@ def test_lockstep_waits_for_its_recorder(make_bus: MakeBus) -> None:
             time.sleep(0.0005)
 
     segment.words[System.LOCKSTEP] = 1
-    with in_thread(lambda: serve(segment, "fast", [], 0, False)), in_thread(record):
+    cycle = NextCycle(segment, "fast")
+    with in_thread(lambda: serve(segment, "fast", cycle, [], 0)), in_thread(record):
         LockstepDriver(segment, ended, False, HISTORY).run()
     assert len(ahead) == 101
     assert max(ahead) <= HISTORY + 1

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
 
 from backplane import semaphores
+from backplane.lock import MailboxLock
+from backplane.lockstep_driver import LockstepDriver
 from backplane.segment import SHM_FOLDER, Segment
+from backplane.wake import NextCycle
+from backplane.words import Block
 from tests.backplane.bus import NAME, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, forked, wait_until
+
+FUTEX_WAIT_BITSET, FUTEX_CLOCK_REALTIME = 9, 256
+"""From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the wall clock."""
 
 
 @pytest.fixture
@@ -59,3 +71,46 @@ def test_removing_names_twice_is_no_error(bus: Segment) -> None:
     semaphores.unlink(bus.layout)
     semaphores.unlink_all(bus.rack)
     assert named(bus.rack) == 0
+
+
+def test_a_wait_lasts_as_long_as_it_says(bus: Segment) -> None:
+    semaphore = semaphores.wake_semaphore(bus.rack, "writer")
+    start = time.monotonic()
+    assert not semaphore.acquire(0.02)
+    assert time.monotonic() - start >= 0.02
+    semaphore.release()
+    assert semaphore.acquire(0.02)
+
+
+def wait_for_release(segment: Segment) -> None:
+    NextCycle(segment, "writer").wait()
+
+
+def wait_for_lock(segment: Segment) -> None:
+    MailboxLock(segment, NAME, 60).acquire()
+    MailboxLock(segment, NAME, 60).acquire()
+
+
+def wait_for_tasks(segment: Segment) -> None:
+    segment.block("writer")[Block.RELEASED] = 0
+    LockstepDriver(segment, lambda tick: None, False, 8).run()
+
+
+def futex_call(pid: int) -> int:
+    """Return the operation of the futex call in which a process waits, as the kernel tells it; 0: it is in no such."""
+    call = Path(f"/proc/{pid}/syscall").read_text().split()
+    operation = int(call[2], 16) if len(call) > 2 else 0
+    return operation if operation & ~FUTEX_CLOCK_REALTIME == FUTEX_WAIT_BITSET else 0
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("wait", [wait_for_release, wait_for_lock, wait_for_tasks])
+def test_no_step_of_the_wall_clock_moves_the_bound_of_a_wait(bus: Segment, wait: Callable[[Segment], None]) -> None:
+    # Nobody sets this machine's clock for a test. The kernel says by which clock a process waits.
+    seen = [0]
+    with forked(lambda: wait(bus)) as pid:
+        try:
+            wait_until(lambda: seen.append(futex_call(pid)) or seen[-1])
+        except PermissionError:
+            pytest.skip("this machine does not show in which call a process waits")
+    assert not seen[-1] & FUTEX_CLOCK_REALTIME

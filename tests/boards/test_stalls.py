@@ -11,7 +11,6 @@ from types import FrameType
 import pytest
 
 from backplane.layout import PROTOCOLS, Protocol
-from backplane.lock import MailboxLock
 from backplane.protocols import open_observer
 from tests.backplane.bus import CLOCK_NS, NAME
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
@@ -49,27 +48,12 @@ class Stalls:
         self._arm()
 
 
-def pend_in_waits() -> None:
-    """Have signals wait while a lock is waited for: there `posix_ipc` would end the wait. They come right behind it."""
-    acquire = MailboxLock.acquire
-
-    def quiet(lock: MailboxLock) -> bool:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
-        try:
-            return acquire(lock)
-        finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})
-
-    MailboxLock.acquire = quiet  # type: ignore[method-assign]
-
-
 def cycle(every: int, epoch: int, seed: int, work: Callable[[int, Callable[[], int]], object]) -> bool:
     """Do `work` on the grid until the time is over; releases that passed are skipped. Say whether there were stalls."""
 
     def now() -> int:
         return (time.monotonic_ns() - epoch) // CLOCK_NS
 
-    pend_in_waits()
     stalls, last = Stalls(seed), -1
     while (tick := now()) * CLOCK_NS < SECONDS * 1e9:
         release = tick - tick % every
