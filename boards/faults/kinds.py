@@ -195,7 +195,8 @@ KINDS: tuple[Kind, ...] = (
         "sensor-stuck",
         "arm",
         "position and velocity stay",
-        (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL),
+        # Torques that move a joint whose velocity stays look like a motor that gives nothing.
+        (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL, Alarm.ACTUATOR),
         "20 cycles",
         (_joint(),),
     ),

@@ -22,6 +22,8 @@ Seen = Literal["detected", "missed", "not struck"]
 Bound = Callable[[Strike, str | None], int | None]
 """Ticks in which a fault must be found, by a reader or, None, by whoever else."""
 
+LATCHED = "latched"
+"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
 SETTLE_S = 0.25
 """Simulated time behind a fault's bounds in which its traces may still be found."""
 
@@ -154,8 +156,9 @@ class _Judge:
 
     def _horizon(self, place: int, last: int) -> int:
         """Return the tick up to which reactions are of this fault: the next one strikes then, or it is long over."""
-        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick]
-        return min([*later, last + 1])
+        # One that was too slight to count may have been reacted to all the same.
+        begins = [s.tick if s.tick >= 0 else s.began for s in self._strikes]
+        return min([*(tick for tick in begins[place + 1 :] if tick > begins[place]), last + 1])
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
         after = aftermath(strike, self._events, horizon)
@@ -197,7 +200,7 @@ class _Judge:
     def _is_latched(self, strike: Strike, after: Aftermath) -> bool:
         """Say whether the task has ended with an error because of a fault that may end it so."""
         may = consequence(table_kind(strike.kind)).latches and self._run.has_failed
-        return may and not after.is_undone
+        return may and LATCHED in after.reactions
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
         """Say whether no fault explains a detection, a death or a miss."""
