@@ -8,7 +8,7 @@ PACKAGES := backplane boards levels tools
 CONFIG ?= nasrem
 
 .DEFAULT_GOAL := help
-.PHONY: help run test lint lock clean
+.PHONY: help run test mutants lint lock clean
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 14
@@ -18,6 +18,9 @@ run: $(STAMP) ## run the rack CONFIG (default: nasrem); ARGS="--lockstep" and th
 
 test: $(STAMP) ## run the tests; ARGS="-k segment" and the like are passed on
 	$(BIN)/python -m pytest $(ARGS)
+
+mutants: $(STAMP) ## check that a campaign notices when a detector is switched off
+	$(BIN)/python -m tests.mutants
 
 lint: $(STAMP) ## check style and types
 	$(BIN)/ruff check .

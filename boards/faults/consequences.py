@@ -40,7 +40,7 @@ _BRAKED = ("brakes_closed",)
 _DEATH = Consequence(own=(Alarm.STALE, Alarm.MUTE, Alarm.CLOCK_STOPPED), reactions=("restart",), ends_process=True)
 _SENSOR = Consequence(arm=SENSOR_ALARMS, reactions=_BRAKED, undone_s=1.0, latches=True)
 # A motor is tried again every half second, and for 20 cycles more before it is trusted.
-_MOTOR = Consequence(arm=(Alarm.ACTUATOR,), reactions=_BRAKED, undone_s=1.0)
+_MOTOR = Consequence(arm=(Alarm.ACTUATOR,), reactions=_BRAKED, undone_s=1.0, latches=True)
 _COMMAND = Consequence(reactions=_BRAKED)
 # What is damaged may be any word of the message's head: its serial, its ticks, its writer.
 _DAMAGE = Consequence(own=(Alarm.GAP, Alarm.HELD_BACK, Alarm.DISORDER, Alarm.MASQUERADE, Alarm.MUTE))
@@ -52,7 +52,7 @@ CONSEQUENCES: Mapping[str, Consequence] = {
     "clock-stop": Consequence(reactions=("restart",), ends_process=True),
     "drop": Consequence(own=(Alarm.MUTE,)),
     # The first messages on time overtake the last ones held back.
-    "delay": Consequence(own=(Alarm.MUTE, Alarm.DISORDER)),
+    "delay": Consequence(own=(Alarm.DISORDER,)),
     "reorder": Consequence(own=(Alarm.MUTE, Alarm.HELD_BACK)),
     "corrupt": _DAMAGE,
     "babble": Consequence(own=(Alarm.DISORDER, Alarm.GAP)),

@@ -111,7 +111,8 @@ KINDS: tuple[Kind, ...] = (
         "delay",
         "writer",
         "messages are held back",
-        (Alarm.HELD_BACK,),
+        # Until the first comes there is none.
+        (Alarm.HELD_BACK, Alarm.MUTE),
         "the delay + 1 read",
         (Parameter("by", "cycles", "writer's cycles for which they are held", 2, 1, 50, is_whole=True),),
         takes_mailbox=True,
@@ -195,7 +196,8 @@ KINDS: tuple[Kind, ...] = (
         "sensor-stuck",
         "arm",
         "position and velocity stay",
-        (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL),
+        # Torques that move a joint whose velocity stays look like a motor that gives nothing.
+        (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL, Alarm.ACTUATOR),
         "20 cycles",
         (_joint(),),
     ),
@@ -222,7 +224,7 @@ KINDS: tuple[Kind, ...] = (
         "arm",
         "a motor gives no more than a part of its torque",
         (Alarm.ACTUATOR,),
-        "5 cycles",
+        "20 cycles",
         (Parameter("part", "1", "of its largest torque", 0.1, 0.0, 0.9), _joint(1)),
     ),
     Kind("command-nan", "arm", "a torque is no number", (Alarm.COMMAND_INVALID,), "0 cycles", (_joint(),)),

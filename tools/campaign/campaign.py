@@ -31,7 +31,7 @@ LAUNCH_S = 2.0
 """What a launch and an end take, about: the progress bar's guess."""
 SHORTEST_S = 1.0
 """Faultless time is not cut finer."""
-ROUNDS = 5
+ROUNDS = 8
 """A fault that has not struck is drawn again so often, at another instant; then it is missing."""
 ORDER, TRIALS = "order.json", "trials"
 """What of a campaign's folder tells what it is, and where its trials are."""

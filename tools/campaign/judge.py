@@ -22,6 +22,8 @@ Seen = Literal["detected", "missed", "not struck"]
 Bound = Callable[[Strike, str | None], int | None]
 """Ticks in which a fault must be found, by a reader or, None, by whoever else."""
 
+LATCHED = "latched"
+"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
 SETTLE_S = 0.25
 """Simulated time behind a fault's bounds in which its traces may still be found."""
 
@@ -95,9 +97,12 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
 
 class _Judge:
     def __init__(self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> None:
-        self._strikes = sorted(strikes, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
         self._events, self._run, self._layout = events, run, run.layout
+        shown = [_shown(strike, events) for strike in strikes]
+        self._strikes = sorted(shown, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
         self._bound = _bound_in(run.layout)
+        planners = [task.name for task in run.layout.tasks if task.role == "planner"]
+        self._slices = {name: cycle_ticks(run.layout, name) for name in planners}
         self._left_out = LeftOut(events)
         self._last = max((event.tick for event in events), default=0)
         self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
@@ -119,6 +124,9 @@ class _Judge:
     def _window(self, strike: Strike) -> tuple[int, int]:
         """Return the first and the last tick in which an event may come of a fault."""
         first = strike.tick if strike.tick >= 0 else strike.began
+        if _takes_mailbox(strike) and self._layout.task(strike.board).role == "planner":
+            # Its writer may be the one to find what is wrong with a plan, when it makes the next.
+            return first - 1, self._last
         over = max(self._ends(strike), first + (self._bound(strike, None) or 0))
         undone = recovery_ticks(table_kind(strike.kind), strike.board, self._layout, self._run.restart_s)
         return first - 1, over + undone + last_read(strike.mailboxes, self._layout) + self._settle
@@ -197,20 +205,33 @@ class _Judge:
     def _is_latched(self, strike: Strike, after: Aftermath) -> bool:
         """Say whether the task has ended with an error because of a fault that may end it so."""
         may = consequence(table_kind(strike.kind)).latches and self._run.has_failed
-        return may and not after.is_undone
+        return may and LATCHED in after.reactions
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
         """Say whether no fault explains a detection, a death or a miss."""
         if event.kind not in ("detection", "died", "miss"):
             return False
-        around = [s for s, (first, last) in zip(self._strikes, windows, strict=True) if first <= event.tick <= last]
-        return not any(_explains(strike, event) for strike in around if strike.began >= 0)
+        # A planner's event has the tick of its release, and may come of anything in its slice.
+        until = event.tick + self._slices.get(event.board, 0)
+        windowed = zip(self._strikes, windows, strict=True)
+        around = [strike for strike, (first, last) in windowed if first <= until and event.tick <= last]
+        return not any(_explains(strike, event) for strike in around if strike.tick >= 0)
+
+
+def _shown(strike: Strike, events: Sequence[Event]) -> Strike:
+    """Return a fault of the arm as having struck, at the latest, when it was found.
+
+    One counts as acting from a certain difference to the truth on; who finds a smaller one is right as well.
+    """
+    if strike.began < 0 or KINDS[NUMBERS[table_kind(strike.kind)]].where != "arm":
+        return strike
+    begun = replace(strike, tick=strike.began)
+    last = strike.tick if strike.tick >= 0 else strike.ends
+    found = min((e.tick for e in events if fits(e, begun) and (last < 0 or e.tick <= last)), default=strike.tick)
+    return strike if found == strike.tick else replace(strike, tick=found, count=max(1, strike.count))
 
 
 def _explains(strike: Strike, event: Event) -> bool:
-    if strike.tick < 0:
-        # It was too slight to count as an injection, and may have been found all the same.
-        return fits(event, replace(strike, tick=strike.began))
     # Whoever takes one task's cycles may take those of any task on its core.
     return takes_cycles(strike) if event.kind == "miss" else explains(strike, event)
 
