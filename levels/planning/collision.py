@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from levels.cell import Cell
-from levels.gripper import set_opening
 from levels.scene import SceneConfig
 from levels.touches import geom_name
 
@@ -61,8 +60,8 @@ class CollisionChecker:
 
     def open_gripper(self, opening: float) -> None:
         """Set the gripper to `opening`, m or rad; at first it is as open as it goes, its widest."""
-        if self.cell.gripper_qpos is not None:
-            set_opening(self._model, self._data.qpos, self.cell.gripper_qpos, opening)
+        if self.cell.linkage is not None:
+            self.cell.linkage.set(self._data.qpos, opening)
 
     def hold(self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)) -> None:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
@@ -151,6 +150,8 @@ class CollisionChecker:
         own = np.union1d(arm, self._carriers())
         for some, others in ((arm, own), (own, arm)):
             required[np.ix_(some, others)] = np.where(collide[np.ix_(some, others)], 0.0, NO_MATTER)
+        # Links of a gripper meet in their pins, and its motion is not planned.
+        required[np.ix_(self.cell.gripper_geoms, self.cell.gripper_geoms)] = NO_MATTER
         return required
 
     def _carriers(self) -> NDArray[np.int_]:
