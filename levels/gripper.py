@@ -3,8 +3,8 @@
 MuJoCo writes every equality, be it a gear, a loop closed by `connect` or `weld`, or a coupled tendon, as rows of
 residual and Jacobian, and every joint stop that is passed as well. Gauss-Newton over them, with the springs of the
 joints as weak rows, finds where the linkage settles. It is solved once for a number of openings; a pose in between is
-interpolated, so that it costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order: equal models give
-equal poses.
+interpolated, so that it costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order: equal models
+give equal poses.
 """
 
 from __future__ import annotations

@@ -45,6 +45,7 @@ class CollisionChecker:
         self._row_geoms = [np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b) for b in cell.bodies]
         self._offset = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
         self._tool_quaternion = np.zeros(4)
+        self._short = np.zeros(0)
         self._contype = self._filter_to_arm()
         self._base = self._required_distances()
         self._required = self._base.copy()
@@ -92,7 +93,12 @@ class CollisionChecker:
 
     def why(self, q: Array, clearance: float | None = None) -> str:
         """Name the pair that is nearest its bound or beyond it, with distance and bound; empty when `q` is free."""
-        short = self._shortfalls(q, clearance)
+        self._shortfalls(q, clearance)
+        return self.nearest()
+
+    def nearest(self) -> str:
+        """Name the same pair of the configuration that was checked last."""
+        short = self._short
         if not np.any(short > 0):
             return ""
         worst = int(np.argmax(short))
@@ -116,7 +122,8 @@ class CollisionChecker:
         required = self._required[pairs[:, 0], pairs[:, 1]]
         if clearance is not None:
             np.minimum(required, clearance, out=required)
-        return np.asarray(required - contact.dist)
+        self._short = np.asarray(required - contact.dist)
+        return self._short
 
     def _carry(self, row: int) -> None:
         d, address = self._data, self.cell.object_qpos[row]

@@ -60,6 +60,7 @@ class PathWork:
         self.fault: Fault | None = None
         self.blocked = False
         self.astray = False
+        self._off_rad = 0.0
         self._guard = guard
         self._rules = rules
         self._quiet = rules.quiet()
@@ -82,7 +83,8 @@ class PathWork:
         self._fresh = False
         self._clear_cycles = 0
         self._quiet = self._rules.quiet()
-        self.astray = self.motion.rest_near(position, progress) > self._rules.params.astray
+        self._off_rad = self.motion.rest_near(position, progress)
+        self.astray = self._off_rad > self._rules.params.astray
         self.blocked = self.astray
 
     def step(self, hold: bool, trajectory: Trajectory | None, world: Message, now_s: float, duration_s: float) -> None:
@@ -119,6 +121,13 @@ class PathWork:
         """Where on the path a trajectory is to begin, in rad; None when the motion needs none."""
         motion = self.motion
         return motion.s if motion.resting and not motion.finished and not self.astray else None
+
+    @property
+    def obstacle(self) -> str:
+        """What is in the way while the motion is blocked."""
+        if self.astray:
+            return f"the arm is {self._off_rad:.3f} rad off its path"
+        return self._guard.obstacle
 
     @property
     def progress(self) -> float:
