@@ -37,7 +37,8 @@ class Cell:
       arm at home, the gripper open.
     - `qpos`, `dof`, `actuators`: the arm's joints in qpos, in qvel, and their motors in ctrl.
     - `home`: joint positions at the start, rad. `tool`: site id.
-    - `gripper_*`: None for an arm without one; `gripper_open` and `gripper_closed` are joint positions, m or rad.
+    - `gripper_*`: None for an arm without one; `gripper_open` and `gripper_closed` are joint positions, m or rad, and
+      `gripper_stiffness` is that of its position loop, N/m or N m/rad.
     - `linkage`: where all joints of the gripper are, by its opening.
     - `arm_geoms`: geoms that the arm moves, gripper included; `gripper_geoms`: hand and fingers alone.
     - `bodies`: ids in the order of `scene.bodies`; `object_qpos`: first of 7 addresses an object; `mocap`: mocap id an
@@ -57,6 +58,7 @@ class Cell:
     gripper_actuator: int | None
     gripper_open: float | None
     gripper_closed: float | None
+    gripper_stiffness: float | None
     linkage: Linkage | None
     arm_geoms: NDArray[np.int_]
     gripper_geoms: NDArray[np.int_]
@@ -167,6 +169,7 @@ def index(
         gripper_actuator=None if gripper is None else int(model.actuator(gripper.actuator).id),
         gripper_open=None if gripper is None else gripper.open,
         gripper_closed=None if gripper is None else gripper.closed,
+        gripper_stiffness=None if gripper is None else gripper.stiffness,
         linkage=None
         if gripper is None or joint is None
         else solve_linkage(model, joint, moved, (gripper.open, gripper.closed)),

@@ -14,6 +14,7 @@ from levels.planning.line import straight_line
 from levels.planning.move import NAMES, Move
 from levels.planning.path import Path
 from levels.planning.path_planner import SEARCHES, PathPlanner
+from levels.planning.payload import Payloads
 from levels.planning.pose import Pose
 from levels.planning.situation import Situation
 from levels.scene import SceneConfig
@@ -35,6 +36,7 @@ class MotionPlanner:
         self.ik = InverseKinematics(cell, seed)
         self.checker = CollisionChecker(cell, scene)
         self.paths = PathPlanner(cell, scene.clearance, seed)
+        self.payloads = Payloads(cell, scene.objects)
 
     def plan(
         self,
