@@ -64,10 +64,10 @@ class TaskExecutor(Executor):
         if not self._error:
             self._follow(plan, below)
             self._keep_time(plan, tick)
+        self._done = self._detour.step(self._orders, plan, self._done, below, self._window)
         kept_from = self._kept_from(read.status)
         if self._state(plan) == State.EXECUTING:
             self._keep_going(read, kept_from, tick)
-        self._done = self._detour.step(self._orders, plan, self._done, below, self._window)
         self._hand_down(plan, write.command)
         self._report(plan, kept_from, write.status)
         self._answer(below, write)
