@@ -153,7 +153,8 @@ def index(
     gripper, joint = robot.gripper, cell_index.gripper_joint(model, robot, moved)
     bodies = cell_index.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects, obstacles = bodies[: len(scene.objects)], bodies[len(scene.objects) :]
-    arm_geoms, gripper_geoms = geoms_of(model, moved), cell_index.hand_geoms(model, joint, joints)
+    hand = cell_index.hand(model, joint, joints)
+    arm_geoms, gripper_geoms = geoms_of(model, moved), geoms_of(model, hand)
     object_geoms = geoms_of(model, below(model, objects))
     supports = cell_index.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     bounds = joint_bounds(model, joints, robot, torque)
@@ -172,7 +173,7 @@ def index(
         gripper_stiffness=None if gripper is None else gripper.stiffness,
         linkage=None
         if gripper is None or joint is None
-        else solve_linkage(model, joint, moved, (gripper.open, gripper.closed)),
+        else solve_linkage(model, joint, hand, (gripper.open, gripper.closed)),
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,

@@ -30,6 +30,8 @@ SPRING_PART = 1e-6
 """Weight of the stiffest spring against an equality."""
 DAMPING = 1e-9
 """Weight of staying in place: for joints that nothing determines."""
+FREE_PART = 0.01
+"""Share of staying in place, among all that holds a joint, above which the joint is free."""
 RESIDUAL = 1e-3
 """An equality that stays open by more than this, in m or rad, is not solved."""
 NOT_POSED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
@@ -55,13 +57,13 @@ class Linkage:
             qpos[address] = np.interp(opening, self.openings, positions)
 
 
-def solve_linkage(model: mujoco.MjModel, joint: int, moved: NDArray[np.bool_], ends: tuple[float, float]) -> Linkage:
-    """Return the linkage driven by `joint`, carried by the bodies `moved` (nbody,), between the openings `ends`.
+def solve_linkage(model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_], ends: tuple[float, float]) -> Linkage:
+    """Return the linkage driven by `joint` in the bodies `hand` (nbody,), between the openings `ends`.
 
-    Joints of the arm itself have motors already and are not part of it. Raises `RobotError` with the equality that
-    cannot be kept.
+    Joints that have a motor of their own do not follow. Raises `RobotError` with the equality that cannot be kept, or
+    the joint that nothing determines.
     """
-    solver = _Solver(model, joint, moved)
+    solver = _Solver(model, joint, hand)
     openings = np.linspace(*sorted(ends), OPENINGS)
     rest = float(model.qpos0[solver.driven])
     first = int(np.argmin(np.abs(openings - rest)))
@@ -74,6 +76,7 @@ def solve_linkage(model: mujoco.MjModel, joint: int, moved: NDArray[np.bool_], e
             qpos = solver.settle(qpos, float(openings[k]))
             solver.check(float(openings[k]))
             positions[:, k] = qpos[solver.joints]
+    solver.check_all_follow()
     follows = np.any(positions != model.qpos0[solver.joints][:, None], axis=1)
     return Linkage(solver.driven, openings, solver.joints[follows], positions[follows])
 
@@ -81,14 +84,17 @@ def solve_linkage(model: mujoco.MjModel, joint: int, moved: NDArray[np.bool_], e
 class _Solver:
     """Finds the joints of one linkage at one opening."""
 
-    def __init__(self, model: mujoco.MjModel, joint: int, moved: NDArray[np.bool_]) -> None:
+    def __init__(self, model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_]) -> None:
         self._model = copy.copy(model)
         self._model.opt.disableflags |= int(NOT_POSED)
         self._data = mujoco.MjData(self._model)
         motors = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
-        carried = moved[model.jnt_bodyid] & np.isin(model.jnt_type, SCALAR_JOINTS)
+        carried = hand[model.jnt_bodyid]
+        # The body that carries the linkage may be moved by a joint of the arm itself: that has a motor.
         carried[motors] = carried[joint] = False
-        follow = np.flatnonzero(carried)
+        self._others = np.flatnonzero(carried & ~np.isin(model.jnt_type, SCALAR_JOINTS))
+        follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
+        self._follow, self._loose = follow, np.ones(len(follow), dtype=bool)
         self.driven = int(model.jnt_qposadr[joint])
         self.joints = model.jnt_qposadr[follow].astype(int)
         self._dof, self._driven_dof = model.jnt_dofadr[follow], int(model.jnt_dofadr[joint])
@@ -114,6 +120,10 @@ class _Solver:
             data.qpos[self.joints] -= step
             if float(np.max(np.abs(step))) < STEP_TOLERANCE:
                 break
+        for k in np.flatnonzero(self._loose):
+            # Where a joint is free to move, staying in place is all that resists.
+            mujoco.mju_cholSolve(step, matrix, DAMPING * np.eye(count)[k])
+            self._loose[k] = step[k] > FREE_PART
         return np.array(data.qpos)
 
     def check(self, opening: float) -> None:
@@ -131,6 +141,16 @@ class _Solver:
             raise RobotError(
                 f"robot.gripper: equality {name} is {away:.4f} m or rad off with the gripper at {opening:g}; "
                 f"at most {RESIDUAL:g} can be planned with"
+            )
+
+    def check_all_follow(self) -> None:
+        """Raise `RobotError` for a joint that neither an equality nor a spring determines: nobody knows where it is."""
+        for joint in (*self._others, *self._follow[self._loose]):
+            name = (
+                self._model.joint(int(joint)).name or f"of body {self._model.body(self._model.jnt_bodyid[joint]).name}"
+            )
+            raise RobotError(
+                f"robot.gripper: joint '{name}' follows nothing; give it an equality with the driven joint, or a spring"
             )
 
     def _rows(self) -> tuple[Array, Array]:

@@ -75,6 +75,8 @@ class Orders:
 
     def keeps(self, board: str) -> str:
         """Return the reason for which level `board` does not do its own work; empty: no operator keeps it from that."""
+        if self.answer is Answer.REFUSED and self.basis == self.serial:
+            return f"{board} held, `resume` goes on: {self._objection}"
         doing = DOING.get(self.standing)
         return f"{board} {doing} by the operator: `resume` releases it" if doing else ""
 

@@ -98,6 +98,8 @@ class PrimitiveExecutor(Executor):
         self._sight.update(read.world, read.status.value.position, tick)
         if self._tracking.in_step:
             self._go_on(read, serials, tick, passed_s)
+        elif read.status.value.state == State.ERROR:
+            self._fault = Fault(Error(read.status.value.error), read.status.value.reason)
         elif self._tracking.silent_cycles > self._rules.cycles(self._params.silent):
             self._fault = Fault(Error.BELOW, f"no status from below for {self._tracking.silent_cycles} cycles")
         self._write_set_point(write.command, tick)

@@ -72,6 +72,7 @@ def test_joint_on_a_spring_is_posed_at_its_stop(tmp_path: Path) -> None:
     arm = tmp_path / "puma560.xml"
     text = arm.read_text().replace('name="loop_left"', 'name="loop_left" active="false"')
     spring = '<joint name="tip_left" range="-10 20" stiffness=".5" springref="40" '
+    text = text.replace('<joint name="rod_left" ', '<joint name="rod_left" stiffness=".1" ')
     arm.write_text(text.replace('<joint name="tip_left" ', spring))
     made = build_cell(robot, scene, CLOCK_NS)
     assert made.linkage is not None
@@ -92,6 +93,12 @@ def test_linkage_that_cannot_move_as_wanted_is_refused_by_the_name_of_its_equali
 ) -> None:
     with pytest.raises(RobotError, match=words):
         built(tmp_path, old, new)
+
+
+@pytest.mark.parametrize(("equality", "joint"), [("gear", "crank_right"), ("loop_right", "tip_right")])
+def test_joint_that_nothing_determines_is_refused_by_name(tmp_path: Path, equality: str, joint: str) -> None:
+    with pytest.raises(RobotError, match=rf"robot\.gripper: joint '{joint}' follows nothing"):
+        built(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')
 
 
 def test_task_with_a_gripper_of_closed_loops_is_done(tmp_path: Path) -> None:
