@@ -17,7 +17,7 @@ from levels.task.finish import Rehearsed
 
 Array = NDArray[np.float64]
 
-LOAD_STEP_RAD = 0.1
+LOAD_STEP_RAD = 0.25
 """Spacing of the configurations at which the motors must carry what is held."""
 
 
