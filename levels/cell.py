@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from levels import cell_index
 from levels.errors import RobotError
-from levels.gripper import set_opening
+from levels.gripper import Linkage, solve_linkage
 from levels.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
 from levels.mjcf import compile_spec, load_spec
 from levels.motors import fit_gripper, fit_motors, listed
@@ -37,7 +37,9 @@ class Cell:
       arm at home, the gripper open.
     - `qpos`, `dof`, `actuators`: the arm's joints in qpos, in qvel, and their motors in ctrl.
     - `home`: joint positions at the start, rad. `tool`: site id.
-    - `gripper_*`: None for an arm without one; `gripper_open` and `gripper_closed` are joint positions, m or rad.
+    - `gripper_*`: None for an arm without one; `gripper_open` and `gripper_closed` are joint positions, m or rad, and
+      `gripper_stiffness` is that of its position loop, N/m or N m/rad.
+    - `linkage`: where all joints of the gripper are, by its opening.
     - `arm_geoms`: geoms that the arm moves, gripper included; `gripper_geoms`: hand and fingers alone.
     - `bodies`: ids in the order of `scene.bodies`; `object_qpos`: first of 7 addresses an object; `mocap`: mocap id an
       obstacle; `supports`: geom ids.
@@ -57,6 +59,8 @@ class Cell:
     gripper_actuator: int | None
     gripper_open: float | None
     gripper_closed: float | None
+    gripper_stiffness: float | None
+    linkage: Linkage | None
     arm_geoms: NDArray[np.int_]
     gripper_geoms: NDArray[np.int_]
     bodies: NDArray[np.int_]
@@ -154,7 +158,8 @@ def index(
     gripper, joint = robot.gripper, cell_index.gripper_joint(model, robot, moved)
     bodies = cell_index.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects, obstacles = bodies[: len(scene.objects)], bodies[len(scene.objects) :]
-    arm_geoms, gripper_geoms = geoms_of(model, moved), cell_index.hand_geoms(model, joint)
+    hand = cell_index.hand(model, joint, joints)
+    arm_geoms, gripper_geoms = geoms_of(model, moved), geoms_of(model, hand)
     object_geoms = geoms_of(model, below(model, objects))
     supports = cell_index.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     bounds = joint_bounds(model, joints, robot, torque)
@@ -170,6 +175,10 @@ def index(
         gripper_actuator=None if gripper is None else int(model.actuator(gripper.actuator).id),
         gripper_open=None if gripper is None else gripper.open,
         gripper_closed=None if gripper is None else gripper.closed,
+        gripper_stiffness=None if gripper is None else gripper.stiffness,
+        linkage=None
+        if gripper is None or joint is None
+        else solve_linkage(model, joint, hand, (gripper.open, gripper.closed)),
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,
@@ -184,11 +193,11 @@ def index(
 
 
 def start_qpos(cell: Cell) -> NDArray[np.float64]:
-    """Return qpos of the start: arm at home, gripper and the fingers geared to it open, the rest as in the model."""
+    """Return qpos of the start: arm at home, gripper and all that follows it open, the rest as in the model."""
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = cell.home
-    if cell.gripper_qpos is not None and cell.gripper_open is not None:
-        set_opening(cell.model, qpos, cell.gripper_qpos, cell.gripper_open)
+    if cell.linkage is not None and cell.gripper_open is not None:
+        cell.linkage.set(qpos, cell.gripper_open)
     return qpos
 
 

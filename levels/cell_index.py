@@ -76,11 +76,17 @@ def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.b
     return joint
 
 
-def hand_geoms(model: mujoco.MjModel, gripper: int | None) -> NDArray[np.int_]:
-    """Return the geoms of the body that carries the gripper's joint, and of all that hangs on that body."""
+def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Mark (nbody,) the body that carries the gripper's linkage, and all that hang on it.
+
+    The driven joint may be anywhere in the linkage; the joints `arm` are not part of it.
+    """
     if gripper is None:
-        return np.zeros(0, dtype=int)
-    return geoms_of(model, below(model, model.body_parentid[model.jnt_bodyid[[gripper]]]))
+        return np.zeros(model.nbody, dtype=bool)
+    body = model.jnt_bodyid[gripper]
+    while (parent := model.body_parentid[body]) and model.body_jntnum[parent] and parent not in model.jnt_bodyid[arm]:
+        body = parent
+    return below(model, model.body_parentid[[body]])
 
 
 def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:

@@ -117,12 +117,15 @@ TASK_STATUS = status(
     Field("detour", "u4", "1", "id of the move that an operator wants, in place of those; 0: none"),
 )
 
+OPERATED = Field("operated", "u1", "1", "1: an operator keeps this level, or one below it, from its own work")
+
 MOVE_STATUS = status(
     "move_status",
-    2,
+    3,
     *ANSWER,
     Field("done", "u4", "1", "newest elemental move done; 0: none yet"),
     Field("current", "u4", "1", "elemental move under way; 0: none"),
+    Field("progress", "f8", "1", "part of its path behind, 0 to 1"),
     Field("verb", "u1", "Verb", "of the move under way"),
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
     Field("planned", "u4", "1", "newest elemental move whose path is at hand; 0: none yet"),
@@ -130,6 +133,7 @@ MOVE_STATUS = status(
     Field("replan", "u4", "1", "open request to plan the current move anew from `start`; 0: none is open"),
     Field("start", "f8", "rad", "joint positions where that motion holds", ("joints",)),
     Field("replans", "u4", "1", "plans made anew because something was in the way"),
+    OPERATED,
     Field("resting", "u1", "1", "1: the arm rests, and whoever moves it has heard the newest command of an operator"),
 )
 
@@ -177,13 +181,14 @@ MOVE_COMMAND = command(
 
 PRIMITIVE_STATUS = status(
     "primitive_status",
-    2,
+    3,
     *ANSWER,
     Field("done", "u4", "1", "newest segment done; 0: none yet"),
     Field("current", "u4", "1", "segment under way; 0: none"),
     Field("progress", "f8", "1", "part of the segment's path behind, 0 to 1"),
     Field("blocked", "u1", "1", "1: motion holds because something is in the way"),
     Field("resting", "u1", "1", "1: commanded velocity is zero"),
+    OPERATED,
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
     Field("opening", "f8", "m", "gripper joint position, measured"),
     Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),

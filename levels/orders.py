@@ -11,6 +11,12 @@ from backplane.mailbox import Reading
 from backplane.message import Message
 from levels.operator import Answer, Commands, Goal, What, listed, told
 
+DOING = {What.HOLD: "held", What.SETPOINT: "kept at a set point", What.GOTO: "diverted"}
+"""What an operator does to a level, in words."""
+HELD_FROM_ABOVE = "held by the level above"
+"""Reason of a level that is held from above. Above it is no news, and not passed on."""
+ABOVE_LOST = "no command from the level above: held until its board is back"
+
 
 class Orders:
     """The operator's commands to one level. `standing` is what it is to do: HOLD, SETPOINT or GOTO; NONE: its own work.
@@ -66,6 +72,13 @@ class Orders:
         """Say that what was asked for is done; it stands on."""
         if self.answer is Answer.TAKEN:
             self._answer(Answer.DONE)
+
+    def keeps(self, board: str) -> str:
+        """Return the reason for which level `board` does not do its own work; empty: no operator keeps it from that."""
+        if self.answer is Answer.REFUSED and self.basis == self.serial:
+            return f"{board} held, `resume` goes on: {self._objection}"
+        doing = DOING.get(self.standing)
+        return f"{board} {doing} by the operator: `resume` releases it" if doing else ""
 
     def _answer(self, answer: Answer, why: str = "") -> None:
         self.answer, self._objection, self._is_told = answer, why, False

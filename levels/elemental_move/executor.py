@@ -11,7 +11,7 @@ from backplane.message import Message, MessageType, State
 from levels.elemental_move.params import ElementalMoveParams
 from levels.elemental_move.plans import PlansAtHand, joins
 from levels.elemental_move.segments import SegmentWindow
-from levels.level import Executor, Input, LevelContext, Ports
+from levels.level import Executor, Input, LevelContext, Ports, Reading
 from levels.messages import (
     MOVE_COMMAND,
     MOVE_PLAN,
@@ -23,7 +23,7 @@ from levels.messages import (
     Verb,
 )
 from levels.operator import OPERATOR_COMMAND, Commands, What
-from levels.orders import Orders
+from levels.orders import ABOVE_LOST, HELD_FROM_ABOVE, Orders
 from levels.params import read_params
 
 
@@ -58,6 +58,7 @@ class ElementalMoveExecutor(Executor):
         self._handed_down = 0
         self._request = 0
         self._replans = 0
+        self._replans_of_move = 0
         self._waiting_since: int | None = None
         self._error = Error.NONE
         self._reason = ""
@@ -80,7 +81,7 @@ class ElementalMoveExecutor(Executor):
         if self._error:
             segments.clear()
         write.command.hold = self._request > 0 or self._error > 0 or read.command.is_lost or self._is_told_to(read)
-        self._report(read.command.value, status, segments, write.status)
+        self._report(read.command, status, segments, write.status)
         self._answer(read, write)
 
     def _go_on(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
@@ -114,7 +115,7 @@ class ElementalMoveExecutor(Executor):
     def _take_done(self, status: Message, segments: SegmentWindow) -> None:
         """Count segments that are done; a grasp must have found something."""
         while (taken := segments.take_done(status.done)) is not None:
-            self._done = int(taken["move"])
+            self._done, self._replans_of_move = int(taken["move"]), 0
             gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
             if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
                 self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm, without object")
@@ -138,6 +139,8 @@ class ElementalMoveExecutor(Executor):
         )
         if not blocked:
             self._close_request()
+        elif not self._request and self._replans_of_move >= self._params.replans:
+            self._fail(Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}")
         elif not self._request:
             # The cycle's number: no request of an earlier life of this board has the same.
             self._request = tick // self.context.every
@@ -153,6 +156,7 @@ class ElementalMoveExecutor(Executor):
             self._handed_down = int(plan.move)
             self._close_request()
             self._replans += 1
+            self._replans_of_move += 1
 
     def _close_request(self) -> None:
         if self._request:
@@ -214,13 +218,23 @@ class ElementalMoveExecutor(Executor):
             self._error, self._reason = error, reason
             self._request = 0
 
-    def _report(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
+    def _report(self, command: Reading, status: Message, segments: SegmentWindow, report: Message) -> None:
+        report.echo = command.value.id
+        report.state = self._state(command.value)
+        kept_from = self._kept_from(command, status) if report.state == State.EXECUTING else ""
+        if kept_from:
+            report.state = State.HOLDING
+        report.error, report.reason = self._error, self._reason if self._error else kept_from
+        report.operated = status.operated or self._orders.standing is not What.NONE
+        self._report_work(command.value, status, segments, report)
+
+    def _report_work(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
+        """Say what is done, and how far the move under way has come."""
         under_way = segments.first if segments.count else None
-        report.echo = command.id
-        report.state = self._state(command)
-        report.error, report.reason = self._error, self._reason
         report.done, report.held, report.replans = self._done, status.held, self._replans
         report.current = int(under_way["move"]) if under_way is not None else 0
+        is_begun = under_way is not None and under_way["id"] == status.current
+        report.progress = status.progress if is_begun else 0.0
         under_way_at = np.flatnonzero(command.moves["id"][: command.count] == report.current)
         report.verb = int(command.moves["verb"][under_way_at[0]]) if report.current and under_way_at.size else Verb.NONE
         self._report_plans(command, status, report)
@@ -249,6 +263,18 @@ class ElementalMoveExecutor(Executor):
         if write.status.resting:
             self._orders.done()
         self._orders.report(write.status, above)
+
+    def _kept_from(self, command: Reading, status: Message) -> str:
+        """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
+        if self._orders.standing is not What.NONE:
+            return self._orders.keeps(self.context.board)
+        if command.is_lost:
+            return ABOVE_LOST
+        if self._reason:
+            return self._reason
+        if status.state == State.HOLDING and status.reason != HELD_FROM_ABOVE:
+            return str(status.reason)
+        return HELD_FROM_ABOVE if command.value.hold else ""
 
     def _state(self, command: Message) -> State:
         if self._error:

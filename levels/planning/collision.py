@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from levels.algebra import mat_vec
 from levels.cell import Cell
-from levels.gripper import set_opening
 from levels.scene import SceneConfig
 from levels.touches import geom_name
 
@@ -47,6 +46,7 @@ class CollisionChecker:
         self._row_geoms = [np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b) for b in cell.bodies]
         self._offset = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
         self._tool_quaternion = np.zeros(4)
+        self._short = np.zeros(0)
         self._contype = self._filter_to_arm()
         self._base = self._required_distances()
         self._required = self._base.copy()
@@ -62,8 +62,8 @@ class CollisionChecker:
 
     def open_gripper(self, opening: float) -> None:
         """Set the gripper to `opening`, m or rad; at first it is as open as it goes, its widest."""
-        if self.cell.gripper_qpos is not None:
-            set_opening(self._model, self._data.qpos, self.cell.gripper_qpos, opening)
+        if self.cell.linkage is not None:
+            self.cell.linkage.set(self._data.qpos, opening)
 
     def hold(self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)) -> None:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
@@ -94,7 +94,12 @@ class CollisionChecker:
 
     def why(self, q: Array, clearance: float | None = None) -> str:
         """Name the pair that is nearest its bound or beyond it, with distance and bound; empty when `q` is free."""
-        short = self._shortfalls(q, clearance)
+        self._shortfalls(q, clearance)
+        return self.nearest()
+
+    def nearest(self) -> str:
+        """Name the same pair of the configuration that was checked last."""
+        short = self._short
         if not np.any(short > 0):
             return ""
         worst = int(np.argmax(short))
@@ -118,7 +123,8 @@ class CollisionChecker:
         required = self._required[pairs[:, 0], pairs[:, 1]]
         if clearance is not None:
             np.minimum(required, clearance, out=required)
-        return np.asarray(required - contact.dist)
+        self._short = np.asarray(required - contact.dist)
+        return self._short
 
     def _carry(self, row: int) -> None:
         d, address = self._data, self.cell.object_qpos[row]
@@ -152,6 +158,8 @@ class CollisionChecker:
         own = np.union1d(arm, self._carriers())
         for some, others in ((arm, own), (own, arm)):
             required[np.ix_(some, others)] = np.where(collide[np.ix_(some, others)], 0.0, NO_MATTER)
+        # Links of a gripper meet in their pins, and its motion is not planned.
+        required[np.ix_(self.cell.gripper_geoms, self.cell.gripper_geoms)] = NO_MATTER
         return required
 
     def _carriers(self) -> NDArray[np.int_]:

@@ -14,6 +14,7 @@ from levels.planning.line import straight_line
 from levels.planning.move import NAMES, Move
 from levels.planning.path import Path
 from levels.planning.path_planner import SEARCHES, PathPlanner
+from levels.planning.payload import Payloads
 from levels.planning.pose import Pose
 from levels.planning.situation import Situation
 from levels.scene import SceneConfig
@@ -35,6 +36,7 @@ class MotionPlanner:
         self.ik = InverseKinematics(cell, seed)
         self.checker = CollisionChecker(cell, scene)
         self.paths = PathPlanner(cell, scene.clearance, seed)
+        self.payloads = Payloads(cell, scene.objects)
 
     def plan(
         self,
@@ -83,7 +85,12 @@ class MotionPlanner:
         clearance = self._clearance_at(start)
         path = self.paths.plan(start, goal, lambda q: self.checker.free(q, clearance), attempt, searches)
         if path is None:
-            why = self.checker.why(start, clearance) or self.checker.why(goal, clearance) or "no free path was found"
+            why = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
+            if not why:
+                straight = Path(np.array([start, goal]), np.zeros(2))
+                blocked = self.paths.first_blocked(straight, lambda q: self.checker.free(q, clearance))
+                found = self.checker.why(blocked, clearance) if blocked is not None else ""
+                why = f"no path found around {found}" if found else "no path found"
             raise Refused(Error.NO_PATH, f"{NAMES[move.verb]} to {at(self.ik.tool_at(goal))}: {why}")
         return path
 

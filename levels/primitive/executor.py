@@ -18,7 +18,7 @@ from levels.messages import (
     SegmentKind,
 )
 from levels.operator import OPERATOR_COMMAND, What
-from levels.orders import Orders
+from levels.orders import ABOVE_LOST, HELD_FROM_ABOVE, Orders
 from levels.params import read_params
 from levels.primitive.fault import Fault
 from levels.primitive.gripper_work import GripperWork
@@ -30,7 +30,7 @@ from levels.primitive.path_work import PathWork, WorkRules
 from levels.primitive.plans import Plans
 from levels.primitive.segment import Segment, read_segment, window
 from levels.primitive.sight import Sight
-from levels.primitive.tracking import Straying, Tracking
+from levels.primitive.tracking import Straying, Tracking, awaited
 
 Work = PathWork | GripperWork
 
@@ -99,6 +99,8 @@ class PrimitiveExecutor(Executor):
         self._sight.update(read.world, read.status.value.position, tick)
         if self._tracking.in_step:
             self._go_on(read, serials, tick, passed_s)
+        elif read.status.value.state == State.ERROR:
+            self._fault = Fault(Error(read.status.value.error), read.status.value.reason)
         elif self._tracking.silent_cycles > self._rules.cycles(self._params.silent):
             self._fault = Fault(Error.BELOW, f"no status from below for {self._tracking.silent_cycles} cycles")
         if read.status.is_there and read.status.value.state == State.ERROR:
@@ -139,7 +141,7 @@ class PrimitiveExecutor(Executor):
         if self._fault is None:
             self._fault = work.fault or self._plans.refusal(work.segment.id) or self._straying.fault
         if isinstance(work, PathWork):
-            hold = hold or withdrawn or self._fault is not None or self._straying.strays or not self._sight.is_enough
+            hold = hold or withdrawn or self._fault is not None or self._straying.strays or bool(self._sight.lacks)
             plan = self._plans.trajectory(work.segment.id, work.motion.s)
             due_s = (tick + self.context.every) * self.context.tick_s
             work.step(hold, plan, read.world.value, due_s, passed_s)
@@ -232,7 +234,10 @@ class PrimitiveExecutor(Executor):
         work, memory, fault = self._work, self._memory or Memory(), self._fault
         status.echo = read.command.value.id
         status.state = self._state(serials, memory)
-        status.error, status.reason, status.earliest = fault or (0, "", 0.0)
+        kept_from = self._kept_from(read) if status.state == State.EXECUTING else ""
+        if kept_from:
+            status.state = State.HOLDING
+        status.error, status.reason, status.earliest = fault or (0, kept_from, 0.0)
         status.done, status.held = memory.done, memory.held if memory.held is not None else -1
         interrupted = memory.interrupted if memory.interrupted in serials else 0
         status.current = work.segment.id if work is not None else interrupted
@@ -241,11 +246,29 @@ class PrimitiveExecutor(Executor):
         status.position[:] = self._position
         path_work = work if isinstance(work, PathWork) else None
         status.progress = path_work.progress if path_work is not None else memory.progress * bool(interrupted)
+        status.operated = self._orders.standing is not What.NONE or read.status.value.standing > 0
         # Out of step it is not for the world that motion holds.
         status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
         status.resting = path_work is None or path_work.motion.resting
         status.ends = path_work.ends_s((tick + 2 * self.context.every) * self.context.tick_s) if path_work else 0.0
         status.wants, status.begin = self._wanted(read, serials)
+
+    def _kept_from(self, read: Ports) -> str:
+        """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
+        work, command = self._work, read.command
+        if not self._tracking.in_step:
+            return awaited(read.status.value, self._tracking.silent_cycles)
+        if isinstance(work, GripperWork):
+            return ""
+        if self._orders.standing is not What.NONE:
+            return self._orders.keeps(self.context.board)
+        if work is not None:
+            blocked = f"blocked: {work.obstacle}" if work.blocked else ""
+            if reason := self._straying.place or blocked or self._sight.lacks:
+                return reason
+        if command.is_lost:
+            return ABOVE_LOST
+        return HELD_FROM_ABOVE if command.value.hold else ""
 
     def _answer(self, write: Ports, above: int) -> None:
         """Answer the operator, and hand down what this cycle rests on."""

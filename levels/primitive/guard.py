@@ -52,6 +52,7 @@ class Guard:
         self._obstructed: float | None = None
         self._least = self._clearance
         self._ahead = np.zeros((self._rows, 3))
+        self.obstacle = ""  # the pair of geoms found too close last, with distance and bound
 
     def carry(self, row: int, q: Array, world: Message) -> None:
         """Take object `row` along with the tool, from where it is while the arm is at `q` (joints,), rad."""
@@ -71,6 +72,7 @@ class Guard:
         self._least = min(self._clearance, max(room, 0.0) * CLEARANCE_PART)
         self._obstructed = None
         self._cursor = 0.0
+        self.obstacle = ""
 
     def is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message) -> bool:
         """Say, within a cycle's share of the checks, whether nothing is in the way of an arm `time_s` along."""
@@ -115,7 +117,10 @@ class Guard:
         return True
 
     def _free(self, path: BlendedPath, s: float) -> bool:
-        return self._checker.free(path.evaluate(s).q, self._least)
+        if self._checker.free(path.evaluate(s).q, self._least):
+            return True
+        self.obstacle = self._checker.nearest()
+        return False
 
     def _place(self, world: Message) -> None:
         self._checker.place(world.position, world.quaternion)

@@ -60,6 +60,7 @@ class PathWork:
         self.fault: Fault | None = None
         self.blocked = False
         self.astray = False
+        self.obstacle = ""  # what was in the way when the motion was blocked last
         self._guard = guard
         self._rules = rules
         self._quiet = rules.quiet()
@@ -82,8 +83,9 @@ class PathWork:
         self._fresh = False
         self._clear_cycles = 0
         self._quiet = self._rules.quiet()
-        self.astray = self.motion.rest_near(position, progress) > self._rules.params.astray
-        self.blocked = self.astray
+        away = self.motion.rest_near(position, progress)
+        self.astray = self.blocked = away > self._rules.params.astray
+        self.obstacle = f"the arm is {away:.3f} rad off its path"
 
     def step(self, hold: bool, trajectory: Trajectory | None, world: Message, now_s: float, duration_s: float) -> None:
         """Go on by one cycle of `duration_s`; `trajectory` is the plan from where the motion rests, if there is one.
@@ -93,7 +95,7 @@ class PathWork:
         motion = self.motion
         if motion.trajectory is not None and not motion.stopping:
             clear = self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, world)
-            self.blocked = not clear
+            self._block(not clear)
             if hold or self.blocked:
                 motion.hold()
         elif motion.resting and trajectory is not None and not motion.finished and not self.astray:
@@ -135,7 +137,7 @@ class PathWork:
     def _set_out(self, hold: bool, clear: bool, trajectory: Trajectory, now_s: float) -> None:
         self._clear_cycles = self._clear_cycles + 1 if clear else 0
         wanted = self._rules.cycles(self._rules.params.clear) if self.blocked else 1
-        self.blocked = self._clear_cycles < wanted
+        self._block(self._clear_cycles < wanted)
         if hold or self.blocked:
             return
         timed = self._timed(trajectory, now_s)
@@ -143,6 +145,11 @@ class PathWork:
             self.motion.follow(timed)
             self._fresh = False
             self._clear_cycles = 0
+
+    def _block(self, blocked: bool) -> None:
+        if blocked and not self.blocked:
+            self.obstacle = self._guard.obstacle
+        self.blocked = blocked
 
     def _timed(self, trajectory: Trajectory, now_s: float) -> Trajectory | None:
         """Stretch the trajectory to end just in time; refuse one that is too late before anything has moved."""

@@ -42,6 +42,8 @@ class Sight:
             self._waiting = None
 
     @property
-    def is_enough(self) -> bool:
-        """True when motion may go by what is seen."""
-        return not self._blind and self._waiting is None
+    def lacks(self) -> str:
+        """What must be seen before motion may go on; empty: nothing."""
+        if self._blind:
+            return "world model is stale: waiting for a new scene"
+        return "waiting for a scene that shows what is held" if self._waiting is not None else ""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from backplane.message import Message
+from backplane.message import Message, State
 from levels.level import Reading
 from levels.messages import Error
 from levels.primitive.fault import Fault
@@ -49,6 +49,17 @@ class Tracking:
         return True
 
 
+def awaited(servo: Message, silent_cycles: int) -> str:
+    """Say what is awaited of a servo level that is out of step."""
+    if silent_cycles > MISSED_STATUSES:
+        return f"waiting for servo: no status for {silent_cycles} cycles"
+    if servo.state == State.HOLDING and servo.reason:
+        return f"waiting for servo: {servo.reason}"
+    if servo.standing:
+        return "waiting for servo: held by the operator until `resume`"
+    return f"waiting for servo: {'brakes engaged' if servo.braked else 'it does not follow set points'}"
+
+
 class Straying:
     """Counts cycles in which the arm is not where the servo wants it: a few may be, and motion holds meanwhile."""
 
@@ -57,6 +68,7 @@ class Straying:
         self._permitted_rad = permitted_rad
         self._permitted_cycles = permitted_cycles
         self._cycles = 0
+        self.place = ""  # which joint is how far away; empty: none is
         self.fault: Fault | None = None
 
     @property
@@ -66,7 +78,7 @@ class Straying:
 
     def forget(self) -> None:
         """Begin to count anew."""
-        self._cycles, self.fault = 0, None
+        self._cycles, self.place, self.fault = 0, "", None
 
     def update(self, servo: Message) -> None:
         """Take in one status; `fault` is set when a joint has been too far away for too long."""
@@ -75,10 +87,10 @@ class Straying:
             self.forget()
             return
         self._cycles += 1
+        joint = int(away.argmax())
+        self.place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
         if self._cycles > self._permitted_cycles:
-            joint = int(away.argmax())
-            place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
-            self.fault = Fault(Error.FOLLOWING, f"{place}; at most {self._permitted_rad} is valid")
+            self.fault = Fault(Error.FOLLOWING, f"{self.place}; at most {self._permitted_rad} is valid")
 
 
 class Quiet:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -47,16 +48,24 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
     """Return the whole program as moves, rehearsed. Raises `Refused` that names action, place and what is possible."""
     rehearsal = start
     for k, action in enumerate(program.action):
-        try:
-            if isinstance(action, Transfer):
-                rehearsal = transfer(rehearsal, k, action, scene)
-            elif isinstance(action, Goto):
+        if isinstance(action, Transfer):
+            rehearsal = transfer(rehearsal, k, action, scene)
+            continue
+        with _naming(f"action {k}, {action}"):
+            if isinstance(action, Goto):
                 rehearsal = goto(rehearsal, k, action)
             elif isinstance(action, Home):
                 rehearsal = rehearsal.then(k, Verb.MOVE_JOINTS, joints=rehearsal.motion.cell.home)
-        except Refused as refused:
-            raise Refused(refused.code, f"action {k}, {action}: {refused}") from refused
     return rehearsal
+
+
+@contextmanager
+def _naming(what: str) -> Iterator[None]:
+    """Say in a refusal what was refused."""
+    try:
+        yield
+    except Refused as refused:
+        raise Refused(refused.code, f"{what}: {refused}") from refused
 
 
 def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
@@ -79,33 +88,42 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
 
 
 def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:
-    """Return the rehearsal behind a transfer. Raises `Refused`."""
+    """Return the rehearsal behind a transfer. Raises `Refused` that says whether it is to pick or to place."""
     row = scene.objects.index(action.object)
-    standing_goals = [
-        standing(rehearsal.motion.cell, rehearsal.situation, action.object, row, goal)
-        for goal in goals(action, rehearsal.situation.object_pose(row))
-    ]
-    ways = _ways(rehearsal, row, standing_goals, action.lift)
-    return _first(ways[:WAYS], lambda way: _transferred(rehearsal, k, row, way, action.lift))
+    pick = f"action {k}, pick {action.object}"
+    place = f"action {k}, place {action.object} at {list(action.to)}"
+    with _naming(place):
+        standing_goals = [
+            standing(rehearsal.motion.cell, rehearsal.situation, action.object, row, goal)
+            for goal in goals(action, rehearsal.situation.object_pose(row))
+        ]
+    with _naming(pick):
+        takes = _takes(rehearsal, row, action.lift)
+    with _naming(place):
+        ways = _ways(rehearsal, row, takes, standing_goals, action.lift)
+
+    def transferred(way: Way) -> Rehearsal:
+        with _naming(pick):
+            taken = _moved(rehearsal, k, row, way.take, action.lift, Verb.GRASP)
+        with _naming(place):
+            return _moved(taken, k, row, way.put, action.lift, Verb.RELEASE)
+
+    return _first(ways[:WAYS], transferred)
 
 
-def _transferred(rehearsal: Rehearsal, k: int, row: int, way: Way, lift: float) -> Rehearsal:
-    """Return the rehearsal behind the eight moves of a transfer. Raises `Refused`."""
-    take, put = way
-    for spot, verb, carried in ((take, Verb.GRASP, None), (put, Verb.RELEASE, row)):
-        above = spot.tool.raised(lift)
-        rehearsal = rehearsal.then(k, Verb.MOVE, above, carried, spot.above)
-        rehearsal = rehearsal.then(k, Verb.APPROACH, spot.tool, row)
-        rehearsal = rehearsal.then(k, verb, spot.tool, row)
-        rehearsal = rehearsal.then(k, Verb.DEPART, above, row)
-    return rehearsal
+def _moved(rehearsal: Rehearsal, k: int, row: int, spot: Spot, lift: float, verb: Verb) -> Rehearsal:
+    """Return the rehearsal behind the four moves of a grasp or a release. Raises `Refused`."""
+    above = spot.tool.raised(lift)
+    rehearsal = rehearsal.then(k, Verb.MOVE, above, None if verb is Verb.GRASP else row, spot.above)
+    rehearsal = rehearsal.then(k, Verb.APPROACH, spot.tool, row)
+    rehearsal = rehearsal.then(k, verb, spot.tool, row)
+    return rehearsal.then(k, Verb.DEPART, above, row)
 
 
-def _ways(rehearsal: Rehearsal, row: int, standing_goals: list[Pose], lift: float) -> list[Way]:
+def _ways(rehearsal: Rehearsal, row: int, takes: list[Spot], standing_goals: list[Pose], lift: float) -> list[Way]:
     """Return ways to do a transfer, the quickest to move first. Raises `Refused` when there is none."""
     motion, situation, here = rehearsal.motion, rehearsal.situation, rehearsal.q
     seen = situation.object_pose(row)
-    takes = _takes(rehearsal, row, lift)
     ways: list[Way] = []
     puts: list[tuple[Pose, list[Spot]]] = []
     for take in takes:
@@ -124,18 +142,35 @@ def _ways(rehearsal: Rehearsal, row: int, standing_goals: list[Pose], lift: floa
 
 
 def _takes(rehearsal: Rehearsal, row: int, lift: float) -> list[Spot]:
-    """Return where object `row` can be taken, at the lowest height at which it can. Raises `Refused`."""
+    """Return where object `row` can be taken and held, at the lowest height at which it can. Raises `Refused`."""
     motion, situation, here = rehearsal.motion, rehearsal.situation, rehearsal.q
     refusal: Refused | None = None
     for tools in grasps(motion.cell, situation, row):
         takes = [spot for tool in tools for spot in _spots(motion, situation, row, tool, here, lift)]
         if takes:
-            return takes
+            return _held(motion, situation, row, takes)
         refusal = refusal or _nothing_at(motion, [place for t in tools for place in (t, t.raised(lift))], here)
         if refusal.code == Error.UNREACHABLE:
             break
     assert refusal is not None, "there is at least one height"
     raise refusal
+
+
+def _held(motion: MotionPlanner, situation: Situation, row: int, takes: list[Spot]) -> list[Spot]:
+    """Return where gripper and motors can hold object `row`. Raises the `Refused` of the first spot when none is."""
+    held: list[Spot] = []
+    refusals: list[Refused] = []
+    for take in takes:
+        grip = take.tool.inverse() @ situation.object_pose(row)
+        try:
+            motion.payloads.check_grip(row, grip)
+            motion.payloads.check_motors(row, grip, take.above[None, :])
+            held.append(take)
+        except Refused as refused:
+            refusals.append(refused)
+    if not held:
+        raise refusals[0]
+    return held
 
 
 def _spots(motion: MotionPlanner, situation: Situation, row: int, tool: Pose, here: Array, lift: float) -> list[Spot]:

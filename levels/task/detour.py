@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from backplane.message import Message, State
 from levels.messages import Verb
-from levels.operator import Goal, What
+from levels.operator import Answer, Goal, What, told
 from levels.orders import Orders, joints_of
 from levels.planning.move import Move
 from levels.planning.pose import pointing, pose
@@ -40,6 +40,12 @@ class Detour:
     def is_known(self) -> bool:
         """Whether the goal of the move is known: not where this board has died and a hold came after the goto."""
         return self._goal is not None
+
+    def told(self, orders: Orders) -> str:
+        """Return, as a reason, what the goto that stands has come to, and what ends it."""
+        goal = told(What.GOTO, self._goal.goal) if self._goal is not None else "goto"
+        stage = "done" if orders.answer is Answer.DONE else "under way"
+        return f"diverted by the operator: {goal} {stage}; `resume` goes on"
 
     def begin(self, message: Message, orders: Orders, is_new: bool) -> None:
         """Take up a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new goes on under the id that it has."""

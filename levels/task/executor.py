@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from backplane.message import Message, MessageType, State
-from levels.level import Executor, Input, LevelContext, Ports
+from levels.level import Executor, Input, LevelContext, Ports, Reading
 from levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
 from levels.operator import OPERATOR_COMMAND, Commands, Goal, What
-from levels.orders import Orders
+from levels.orders import HELD_FROM_ABOVE, Orders
+from levels.params import read_params
 from levels.task.detour import Detour
+from levels.task.params import TaskParams
 from levels.task.program import read_program
 from levels.task.window import ShownWindow
 
@@ -48,6 +50,9 @@ class TaskExecutor(Executor):
         self._done = 0
         self._error = Error.NONE
         self._reason = ""
+        self._stalled_s = read_params(TaskParams, context.params).stalled_s
+        self._mark: tuple[float, ...] = ()  # all that changes where anything moves
+        self._moved_at = 0
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take up what is done below, and what an operator says; hand down what comes next."""
@@ -60,8 +65,11 @@ class TaskExecutor(Executor):
             self._follow(plan, below)
             self._keep_time(plan, tick)
         self._done = self._detour.step(self._orders, plan, self._done, below, self._window)
+        kept_from = self._kept_from(read.status)
+        if self._state(plan) == State.EXECUTING:
+            self._keep_going(read, kept_from, tick)
         self._hand_down(plan, write.command)
-        self._report(plan, write.status)
+        self._report(plan, kept_from, write.status)
         self._answer(below, write)
 
     def _go_on(self, read: Ports) -> None:
@@ -99,6 +107,32 @@ class TaskExecutor(Executor):
                 reason = f"action {k}, {self._actions[k]}, was not done by {by_s:g} s"
                 self._error, self._reason = Error.TOO_LATE, reason
 
+    def _kept_from(self, below: Reading) -> str:
+        """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
+        orders = self._orders
+        if orders.standing is What.GOTO:
+            return self._detour.told(orders)
+        if orders.standing is not What.NONE:
+            return orders.keeps(self.context.board)
+        if below.is_lost:
+            return "no status from the level below: waiting for its board"
+        is_held = below.value.state == State.HOLDING and below.value.reason != HELD_FROM_ABOVE
+        return str(below.value.reason) if is_held else ""
+
+    def _keep_going(self, read: Ports, kept_from: str, tick: int) -> None:
+        """Fail where nothing has moved for too long, unless an operator wants it so."""
+        plan, below = read.plan.value, read.status.value
+        mark = (plan.id, self._done, below.done, below.planned, below.current, below.progress, self._detour.move)
+        operated = below.operated or self._orders.standing is not What.NONE
+        if operated or mark != self._mark:
+            self._mark, self._moved_at = mark, tick
+        elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
+            waits = (
+                f"move {below.current} is under way" if plan.id else "no plan; do all objects rest, is the arm seen?"
+            )
+            self._error = Error.STALLED
+            self._reason = f"nothing has moved for {self._stalled_s:g} s: {kept_from or waits}"
+
     def _actions_done(self, plan: Message) -> int:
         if not plan.count:
             return 0
@@ -114,10 +148,13 @@ class TaskExecutor(Executor):
         else:
             window.show(plan, self._done, command, plan.count if detour.until is None else detour.until)
 
-    def _report(self, plan: Message, status: Message) -> None:
+    def _report(self, plan: Message, kept_from: str, status: Message) -> None:
         status.echo = plan.id
         status.state = self._state(plan)
-        status.error, status.reason = self._error, self._reason
+        if kept_from and status.state == State.EXECUTING:
+            status.state = State.HOLDING
+        status.error = self._error
+        status.reason = self._reason if self._error else kept_from if status.state == State.HOLDING else ""
         status.action, status.actions = self._actions_done(plan), len(self._actions)
         status.moves_done, status.moves = self._done, plan.count
         status.first, status.detour = self._window.first, self._detour.move

@@ -70,7 +70,7 @@ def test_task_waits_while_its_goal_is_blocked_and_goes_on_when_it_is_free() -> N
     rack = WholeRack(arm="puma560_crossing", actions=[TRANSFER], motion=motion)
     rack.run(11.0)
     assert rack.primitive.done == 0
-    assert rack.move.state == State.EXECUTING
+    assert rack.move.state == State.HOLDING
     assert "'post'" in rack.move.reason
     assert rack.run_to_end(30.0).state == State.DONE
     assert rack.move.reason == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from backplane.message import Message, State
 from levels.elemental_move import ElementalMoveExecutor
 from levels.messages import MOVE_PLAN, PRIMITIVE_STATUS, TASK_COMMAND, Error, SegmentKind, Verb
+from levels.orders import ABOVE_LOST
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
 
@@ -22,8 +24,9 @@ PICK = (Verb.MOVE, Verb.APPROACH, Verb.GRASP, Verb.DEPART, Verb.MOVE)
 class Bench(Lockstep):
     """The executor between mailboxes that the test writes."""
 
-    def __init__(self) -> None:
-        board = BoardSpec("elemental_move", EVERY, ElementalMoveExecutor, above="task", below="primitive")
+    def __init__(self, **params: Any) -> None:
+        places = {"above": "task", "below": "primitive"}
+        board = BoardSpec("elemental_move", EVERY, ElementalMoveExecutor, **places, params=params)
         robot, scene = config("puma560")
         outside = {"task.command": TASK_COMMAND, "primitive.status": PRIMITIVE_STATUS, "elemental_move.plan": MOVE_PLAN}
         super().__init__([board], robot, scene, outside=outside)
@@ -81,9 +84,9 @@ class Bench(Lockstep):
         return [(int(s["id"]), int(s["move"])) for s in window]
 
 
-def planned_bench() -> Bench:
+def planned_bench(**params: Any) -> Bench:
     """A bench with paths for the motions of `PICK`."""
-    bench = Bench()
+    bench = Bench(**params)
     bench.order()
     for move in (1, 2, 4, 5):
         bench.plan(move)
@@ -189,6 +192,40 @@ def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> No
     assert bench.status.replans == 1
 
 
+def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_is_there() -> None:
+    # As where the guard sees a collision that the planner does not: every path is free, and none can be gone.
+    bench, why = planned_bench(replans=3), "blocked: 'pad_left' and 'block1' are -7.1 mm apart; valid: 0.0 mm"
+    for _ in range(3):
+        serial = bench.segments()[0][0]
+        bench.cycle(2, current=serial, blocked=1, state=State.HOLDING, reason=why)
+        assert (bench.status.state, bench.status.reason) == (State.HOLDING, why)
+        bench.plan(1, bench.home, replan=bench.status.replan)
+    bench.cycle(2, current=bench.segments()[0][0])
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.BLOCKED)
+    assert bench.status.reason == f"3 other paths tried, still {why}"
+    assert bench.segments() == []
+
+
+def test_next_move_may_take_as_many_other_paths_again() -> None:
+    bench = planned_bench(replans=1)
+    bench.cycle(2, current=1, blocked=1)
+    bench.plan(1, bench.home, replan=bench.status.replan)
+    bench.cycle(2, current=3, blocked=0)
+    bench.cycle(2, done=3, current=4, blocked=1)
+    assert (bench.status.error, bench.status.replan > 0) == (Error.NONE, True)
+
+
+def test_who_keeps_the_level_below_from_its_work_is_passed_on() -> None:
+    bench = planned_bench()
+    bench.cycle(
+        2, current=1, progress=0.25, operated=1, state=State.HOLDING, reason="waiting for servo: brakes engaged"
+    )
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "waiting for servo: brakes engaged")
+    assert (bench.status.progress, bench.status.operated) == (0.25, 1)
+    bench.cycle(2, operated=0, state=State.EXECUTING, reason="")
+    assert (bench.status.state, bench.status.reason, bench.status.operated) == (State.EXECUTING, "", 0)
+
+
 def test_answer_to_an_older_request_is_not_taken() -> None:
     bench = planned_bench()
     bench.cycle(2, current=1, blocked=1)
@@ -232,7 +269,7 @@ def test_move_without_a_path_for_now_waits_and_says_why() -> None:
     bench.order()
     bench.plan(1, error=Error.NO_PATH)
     bench.cycle(3)
-    assert (bench.status.state, bench.status.reason) == (State.EXECUTING, "something is there")
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "something is there")
     bench.plan(1)
     bench.cycle(2)
     assert bench.segments() == [(1, 1)]
@@ -270,6 +307,7 @@ def test_arm_is_held_while_the_board_above_is_lost() -> None:
     bench.boxes["task.command"].lost = True
     bench.cycle(2)
     assert bench.command.hold == 1
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, ABOVE_LOST)
     assert bench.segments() == [(1, 1), (2, 2)]
     bench.boxes["task.command"].lost = False
     bench.cycle(2)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from backplane.message import Message
+from backplane.message import Message, State
 from levels.cell import Cell
 from levels.messages import WORLD_MODEL, SegmentKind
 from levels.primitive.guard import Guard
@@ -90,6 +90,9 @@ def test_held_arm_says_when_the_way_is_free_again() -> None:
     sweep(rack)
     rack.run(3.0)
     assert rack.status.blocked
+    assert rack.status.state == State.HOLDING
+    assert "blocked: '" in rack.status.reason
+    assert "'post'" in rack.status.reason
     rack.command(path(1, [rack.home, NEAR]), path(2, [NEAR, NEAR + SWEEP]), hold=True)
     rack.run(3.0)
     assert not rack.status.blocked

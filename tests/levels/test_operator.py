@@ -48,6 +48,13 @@ def test_a_level_that_was_held_in_motion_goes_on_to_the_end_of_the_task(level: s
     # It has gone all the way down, and no level above knows of it.
     above = LEVELS.index(level)
     assert [rack.read(f"{name}.status").operator for name in LEVELS] == above * [0] + (4 - above) * [serial]
+    # But every one of them says that it is kept from its work, and by whom.
+    statuses = [rack.read(f"{name}.status") for name in LEVELS[: min(above, 2) + 1]]
+    for status in [s for s in statuses if s.state != State.DONE]:
+        assert status.state == State.HOLDING
+        assert f"{level}" in status.reason
+        assert "held by the operator" in status.reason
+    assert level == "task" or rack.move.operated
     operator.say(level, What.RESUME)
     assert rack.run_to_end(30.0).state == State.DONE
 
@@ -77,6 +84,8 @@ def test_a_goto_leaves_a_free_motion_and_the_program_goes_on_behind_it() -> None
     scene = rack.read("servo.scene")
     assert np.abs(scene.tool_position - ASIDE).max() < 5e-3
     assert rack.task.detour > 0
+    assert rack.task.state == State.HOLDING
+    assert rack.task.reason == "diverted by the operator: goto direction done; `resume` goes on"
     rack.run(2.0)
     assert np.abs(rack.read("servo.scene").tool_position - ASIDE).max() < 5e-3
     operator.say("task", What.RESUME)
@@ -120,7 +129,7 @@ def test_a_goto_that_cannot_be_is_refused_and_the_task_goes_on_behind_it() -> No
     serial = operator.goto("task", [3.0, 0.0, 0.5], DOWN)
     assert rack.run(20.0, answers("task", Answer.REFUSED, serial))
     assert "cannot bring the tool to" in rack.task.objection
-    assert (rack.task.standing, rack.task.state) == (What.HOLD, State.EXECUTING)
+    assert (rack.task.standing, rack.task.state) == (What.HOLD, State.HOLDING)
     operator.say("task", What.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from backplane.message import State
 from levels.level import Demand
 from levels.messages import Error
 from levels.primitive.path import BlendedPath
 from levels.primitive.path_motion import PathMotion
 from levels.primitive.speed import BrakingLimits
-from tests.levels.disturbances import mute
+from tests.levels.disturbances import Shown, mute
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive_rack import PrimitiveRack, gripper, path
 
@@ -91,6 +92,22 @@ def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
     assert rack.status.error == 0
 
 
+def test_error_of_the_servo_level_goes_up_with_its_reason() -> None:
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    rack.run(0.3)
+
+    def failed(visible_at: int, data: bytes) -> Shown:
+        status = rack.message("servo.status")
+        status.raw[:] = data
+        status.state, status.error, status.reason, status.stopped = State.ERROR, Error.SENSORS, "sensor of j2", 1
+        return ((visible_at, bytes(status.raw)),)
+
+    rack.disturb("servo.status", failed, seconds(0.3))
+    rack.run(0.25)
+    assert (rack.status.state, rack.status.error, rack.status.reason) == (State.ERROR, Error.SENSORS, "sensor of j2")
+
+
 def seconds(time_s: float) -> int:
     """Return that time in ticks."""
     return round(time_s * 1e9 / CLOCK_NS)
@@ -131,7 +148,8 @@ def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) ->
     rack.run(0.4)
     rack.stop(demand, seconds(2.0))
     rack.run(1.9)
-    assert rack.status.error == 0
+    assert (rack.status.state, rack.status.error) == (State.HOLDING, 0)
+    assert rack.status.reason.startswith("waiting for servo: ")
     assert rack.set_points[-1]["due"] == 0
     assert rack.run_until_done(2)
     assert np.abs(rack.servo.position - rack.home).max() < 1e-3

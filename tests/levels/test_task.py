@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from backplane.message import REASON_BYTES, Message, State
 from levels.errors import Refused
 from levels.messages import MOVE_STATUS, TASK_PLAN, WINDOW, Error, Verb
 from levels.planning.motion import MotionPlanner
+from levels.planning.pose import Pose
 from levels.planning.situation import Situation
 from levels.task import TaskExecutor, read_program
 from levels.task.actions import rehearse
@@ -111,6 +113,14 @@ def test_what_cannot_be_done_is_refused_with_what_can(
     assert words in str(refused)
 
 
+def test_refused_transfer_says_whether_to_pick_or_to_place_is_blocked(start: Rehearsal) -> None:
+    on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
+    buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))
+    assert "action 0, pick block1: '" in str(refusal(buried, TRANSFER))
+    taken = replace(start, situation=start.situation.with_body(BLOCK2, Pose(np.array(TRANSFER["to"]), on_block1[1])))
+    assert "action 0, place block1 at [0.5, -0.2, 0.475]: '" in str(refusal(taken, TRANSFER))
+
+
 def test_place_named_as_reachable_is_reachable(start: Rehearsal) -> None:
     text = str(refusal(start, {"do": "goto", "position": [1.5, 0.0, 0.6]}))
     place = [float(x) for x in text.partition("in reach: [")[2].partition("]")[0].split(",")]
@@ -173,8 +183,8 @@ def test_arm_takes_the_time_that_it_is_given() -> None:
 class Bench(Lockstep):
     """The task executor alone; the test plays its planner and the level below."""
 
-    def __init__(self, *actions: Mapping[str, Any]) -> None:
-        board = BoardSpec("task", 400, TaskExecutor, below="elemental_move")
+    def __init__(self, *actions: Mapping[str, Any], **params: Any) -> None:
+        board = BoardSpec("task", 400, TaskExecutor, below="elemental_move", params=params)
         outside = {"task.plan": TASK_PLAN, "elemental_move.status": MOVE_STATUS}
         super().__init__([board], ROBOT, SCENE, {"action": list(actions)}, outside=outside)
 
@@ -246,6 +256,48 @@ def test_action_that_is_late_is_an_error() -> None:
     bench.cycle()
     assert (bench.status.state, bench.status.error) == (State.ERROR, Error.TOO_LATE)
     assert bench.status.reason == "action 0, home, was not done by 5 s"
+
+
+def test_task_that_stands_still_ends_with_who_is_in_the_way() -> None:
+    bench, below = Bench(HOME, stalled_s=5.0), {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
+    bench.plan([0])
+    bench.cycle(current=1, progress=0.1)
+    assert bench.status.state == State.EXECUTING
+    bench.cycle(current=1, progress=0.2, **below)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, below["reason"])
+    for _ in range(2):
+        bench.cycle(current=1, progress=0.2, **below)
+    assert bench.status.state == State.HOLDING
+    bench.cycle(current=1, progress=0.2, **below)
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
+    assert bench.status.reason == f"nothing has moved for 5 s: {below['reason']}"
+
+
+def test_task_that_moves_slowly_does_not_stand_still() -> None:
+    bench = Bench(HOME, stalled_s=5.0)
+    bench.plan([0])
+    for k in range(8):
+        bench.cycle(current=1, progress=0.01 * k)
+    assert bench.status.state == State.EXECUTING
+
+
+def test_task_without_a_plan_ends_and_says_so() -> None:
+    bench = Bench(HOME, stalled_s=5.0)
+    for _ in range(4):
+        bench.cycle()
+    assert bench.status.error == Error.STALLED
+    assert "no plan" in bench.status.reason
+
+
+def test_task_that_an_operator_holds_stands_still_as_long_as_that_lasts() -> None:
+    bench, below = Bench(HOME, stalled_s=5.0), {"state": State.HOLDING, "reason": "primitive held by the operator"}
+    bench.plan([0])
+    for _ in range(10):
+        bench.cycle(current=1, operated=1, **below)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, below["reason"])
+    for _ in range(4):
+        bench.cycle(current=1)
+    assert bench.status.error == Error.STALLED
 
 
 def test_restarted_executor_remembers_what_was_done() -> None:

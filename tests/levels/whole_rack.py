@@ -8,7 +8,8 @@ from typing import Any
 
 from backplane.message import Message, State
 from boards.config import RackConfig, load
-from levels.scene import MotionConfig
+from levels.robot import RobotConfig
+from levels.scene import MotionConfig, SceneConfig
 from tests.levels.arms import config as arm_config
 from tests.levels.lockstep import BoardSpec, Lockstep
 
@@ -19,13 +20,14 @@ class WholeRack(Lockstep):
     def __init__(
         self,
         name: str = "nasrem",
-        arm: str | None = None,
+        arm: str | tuple[RobotConfig, SceneConfig] | None = None,
         actions: Sequence[Mapping[str, Any]] | None = None,
         motion: Sequence[MotionConfig] = (),
         params: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
         config = load(name)
-        robot, scene = arm_config(arm) if arm is not None else (config.robot, config.scene)
+        found = arm_config(arm) if isinstance(arm, str) else arm
+        robot, scene = found or (config.robot, config.scene)
         assert robot is not None
         task = config.task if actions is None else {"action": list(actions)}
         boards = [board(config, name, (params or {}).get(name, {})) for name in config.board]

@@ -1,0 +1,173 @@
+"""Whether the arm can carry an object: its weight against the friction of the grip and the torques of the motors.
+
+The grip is known where a straight line through the tool's origin, along its y axis, meets the object and a finger on
+either side, as in every grasp that the task level plans. The force there follows from the actuator's by virtual work
+over the linkage, whatever that is. Where the line meets nothing, the grip is not known and only the motors are checked.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from levels.cell import Cell
+from levels.dynamics import Dynamics, Payload
+from levels.errors import Refused
+from levels.messages import Error
+from levels.planning.pose import Pose, pose
+
+Array = NDArray[np.float64]
+
+GRIP_FACTOR = 1.5
+"""Grip wanted for the weight of an object, for it to be held while the arm accelerates: the PUMA loses one at 1.22."""
+MOTOR_PART = 0.9
+"""Part of a motor's torque that weights may take: what is left moves the arm."""
+REACH_M = 1.0
+"""Fingers and surfaces are looked for this far from the tool."""
+SIDES = (1.0, -1.0)
+
+
+class Jaws(NamedTuple):
+    """The fingers at one opening, m or rad: their `gap`, m, the actuator's `length`, and the geoms that meet."""
+
+    opening: float
+    gap: float
+    length: float
+    geoms: tuple[int, int]
+
+
+class Payloads:
+    """Checks what one arm may carry. `names` are the objects by their rows."""
+
+    def __init__(self, cell: Cell, names: tuple[str, ...]) -> None:
+        self._cell, self._names = cell, names
+        self._dynamics = Dynamics(cell)
+        self._data = cell.start()
+        self._rest = np.zeros(len(cell.home))
+        model = cell.model
+        self._objects = [np.flatnonzero(model.body_rootid[model.geom_bodyid] == body) for body in cell.bodies]
+        self._jaws = self._closing()
+
+    def check_grip(self, row: int, grip: Pose) -> None:
+        """Raise `Refused` with both forces when friction does not hold object `row` at `grip` in the tool's frame."""
+        needed = GRIP_FACTOR * self._mass(row) * self._gravity
+        holds = self._holding_force(row, grip)
+        if holds is not None and holds < needed:
+            why = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
+            raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
+
+    def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
+        """Raise `Refused` with both torques when a motor cannot carry object `row` at one of (k, joints), rad."""
+        model = self._cell.model
+        centre = grip @ pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
+        payload, limit = Payload(self._mass(row), centre.position), MOTOR_PART * self._cell.bounds.torque
+        for q in configurations:
+            load = np.abs(self._dynamics.terms(q, self._rest, payload).bias)
+            worst = int(np.argmax(load - limit))
+            if load[worst] > limit[worst]:
+                joint = model.joint(int(model.dof_jntid[self._cell.dof[worst]])).name
+                why = f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
+                raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
+
+    @property
+    def _gravity(self) -> float:
+        return float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
+
+    def _mass(self, row: int) -> float:
+        return float(self._cell.model.body_subtreemass[self._cell.bodies[row]])
+
+    def _named(self, row: int) -> str:
+        return f"'{self._names[row]}' {self._mass(row):.3g} kg"
+
+    def _holding_force(self, row: int, grip: Pose) -> float | None:
+        """Return the friction, N, that can carry object `row`; None where that is not known."""
+        surfaces = self._surfaces(row, grip)
+        wide, narrow = self._around(surfaces[0] + surfaces[1]) if surfaces is not None else (None, None)
+        if surfaces is None or wide is None or narrow is None or wide.gap <= narrow.gap:
+            return None
+        model, cell = self._cell.model, self._cell
+        assert cell.gripper_closed is not None, "there are jaws"
+        assert cell.gripper_stiffness is not None, "there are jaws"
+        most = float(model.actuator_forcerange[cell.gripper_actuator, 1])
+        force = min(most, cell.gripper_stiffness * abs(narrow.opening - cell.gripper_closed))
+        normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
+        parts = self._objects[row]
+        return normal * sum(max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms)
+
+    def _around(self, width: float) -> tuple[Jaws | None, Jaws | None]:
+        """Return the last jaws wider than `width`, m, and the first that are not; None: there are none."""
+        for wide, narrow in zip(self._jaws, self._jaws[1:], strict=False):
+            if wide.gap > width >= narrow.gap:
+                return wide, narrow
+        return None, None
+
+    def _surfaces(self, row: int, grip: Pose) -> tuple[float, float] | None:
+        """Return how far the object reaches from the tool to either side, m; None: the line passes by it."""
+        cell, data = self._cell, self._data
+        address = cell.object_qpos[row]
+        data.qpos[address : address + 7] = np.concatenate(self._tool() @ grip)
+        mujoco.mj_kinematics(cell.model, data)
+        found = []
+        for side in SIDES:
+            distance, _ = self._nearest(self._objects[row], REACH_M * side, -side)
+            found.append(REACH_M - distance)
+        return (found[0], found[1]) if all(np.isfinite(found)) else None
+
+    def _closing(self) -> list[Jaws]:
+        """Return the jaws from open to closed, as long as there is a gap and a finger on either side."""
+        cell, data = self._cell, self._data
+        if cell.linkage is None:
+            return []
+        openings = cell.linkage.openings
+        hand = cell.model.jnt_bodyid[cell.model.jnt_qposadr == cell.gripper_qpos]
+        fingers = np.setdiff1d(
+            cell.gripper_geoms, np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand])
+        )
+        jaws: list[Jaws] = []
+        for opening in openings if openings[0] == cell.gripper_open else openings[::-1]:
+            cell.linkage.set(data.qpos, float(opening))
+            mujoco.mj_fwdPosition(cell.model, data)
+            sides = [self._nearest(fingers, 0.0, side) for side in SIDES]
+            gap = sides[0][0] + sides[1][0]
+            # Closed, the tool's origin is in a finger, and the line leaves it on the far side.
+            if not np.isfinite(gap) or (jaws and gap >= jaws[-1].gap):
+                break
+            length = float(data.actuator_length[cell.gripper_actuator])
+            jaws.append(Jaws(float(opening), gap, length, (sides[0][1], sides[1][1])))
+        return jaws
+
+    def _nearest(self, geoms: NDArray[np.int_], start: float, way: float) -> tuple[float, int]:
+        """Return distance, m, and geom that the tool's y axis meets first, from `start`, m, on; inf: none."""
+        model, data, tool = self._cell.model, self._data, self._cell.tool
+        axis = data.site_xmat[tool].reshape(3, 3)[:, 1].copy()
+        begin, along = data.site_xpos[tool] + start * axis, way * axis
+        found = (np.inf, -1)
+        for geom in geoms:
+            kind = int(model.geom_type[geom])
+            if kind == mujoco.mjtGeom.mjGEOM_MESH:
+                distance = mujoco.mj_rayMesh(model, data, int(geom), begin, along)
+            else:
+                at, turned = data.geom_xpos[geom], data.geom_xmat[geom]
+                distance = mujoco.mju_rayGeom(at, turned, model.geom_size[geom], begin, along, kind)
+            if 0.0 <= distance < found[0]:
+                found = (float(distance), int(geom))
+        return found
+
+    def _tool(self) -> Pose:
+        data, turned = self._data, np.zeros(4)
+        mujoco.mju_mat2Quat(turned, data.site_xmat[self._cell.tool])
+        return pose(data.site_xpos[self._cell.tool], turned)
+
+
+def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
+    """Return the sliding friction of a contact of two geoms, as MuJoCo mixes it; 0: they do not touch, or slip."""
+    if model.geom_priority[one] == model.geom_priority[other]:
+        mixed = [one, other]
+    else:
+        mixed = [one if model.geom_priority[one] > model.geom_priority[other] else other]
+    if max(model.geom_condim[k] for k in mixed) == 1:
+        return 0.0
+    return float(max(model.geom_friction[k, 0] for k in mixed))
