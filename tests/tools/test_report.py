@@ -31,6 +31,12 @@ MS = 1_000_000
 PARTS = ("min", "p50", "p99", "p99_9", "max")
 
 
+class Watchful(SilentDisplay):
+    """Looks often: a run in lockstep is soon over."""
+
+    period_s = 0.02
+
+
 def cycle(tick: int, late: float, read: float, process: float, write: float) -> tuple[int, ...]:
     """Return a trace record of a cycle of a 10 ms task, of times in ms."""
     release = tick * 10 * MS
@@ -185,14 +191,24 @@ def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, 
         "level='upper', what='resume', tick=203",
         "level='lower', what='hold', tick=301",
     )
-    run_rack(load(tmp_path / "told.toml", [f"name={rack_name}", told]), 1.0, tmp_path / "run", SilentDisplay())
+    run_rack(load(tmp_path / "told.toml", [f"name={rack_name}", told]), 12.0, tmp_path / "run", Watchful())
     report, text = write_report(tmp_path / "run")
     assert report["holds"] == [
         {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
-        {"level": "lower", "by": "operator", "why": "hold", "since_s": 0.755, "until_s": None, "lasted_s": 0.2425},
+        {"level": "lower", "by": "operator", "why": "hold", "since_s": 0.755, "until_s": None, "lasted_s": 11.2425},
     ]
     assert "## Holds: 2" in text.splitlines()
     assert f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it." in text.splitlines()
+    (told,) = standstills(tmp_path / "run")
+    assert told.startswith("nothing has moved for ")
+    assert told.endswith(
+        f": lower held by the operator (hold), since 0.75 s; to release: rack command {rack_name} lower resume"
+    )
+
+
+def standstills(folder: Path) -> list[str]:
+    """Return what the events say of a rack that is held and stands still."""
+    return [event["text"] for event in Recording(folder).events if event.get("code") == "standstill"]
 
 
 def test_the_reason_that_ended_a_run_is_its_headline(folder: Path) -> None:

@@ -43,7 +43,7 @@ class LiveDesk:
 
     def text(self) -> Iterator[str]:
         """Yield the same as a table."""
-        yield from table(["level", "stands", "takes"], [list(row.values()) for row in self.levels()])
+        yield from table(["level", "in force", "takes"], [list(row.values()) for row in self.levels()])
 
     def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Told:
         """Hand a command over and wait for its level to take it up, with `wait` until that is done.

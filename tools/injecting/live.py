@@ -144,7 +144,8 @@ class LiveRack:
             back = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
             return f"{self._described(entry)}: armed, waits for {self._awaited(entry)}; {back}"
         if entry.stage == Stage.OVER:
-            return f"{self._described(entry)}: ticks {begun} to {until - 1}, acted {entry[Entry.COUNT]} time(s)"
+            acted = "once" if entry[Entry.COUNT] == 1 else f"{entry[Entry.COUNT]} times"
+            return f"{self._described(entry)}: ticks {begun} to {until - 1}, acted {acted}"
         end = "to the end of the run" if until == NEVER else f"to tick {until - 1}"
         return f"{self._described(entry)}: from tick {begun} {end}"
 
