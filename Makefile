@@ -8,7 +8,7 @@ PACKAGES := backplane boards levels tools
 CONFIG ?= nasrem
 
 .DEFAULT_GOAL := help
-.PHONY: help run test lint lock clean
+.PHONY: help run test golden lint lock clean
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 14
@@ -18,6 +18,9 @@ run: $(STAMP) ## run the rack CONFIG (default: nasrem); ARGS="--lockstep" and th
 
 test: $(STAMP) ## run the tests; ARGS="-k segment" and the like are passed on
 	$(BIN)/python -m pytest $(ARGS)
+
+golden: $(STAMP) ## write the digests of the shipped racks anew, after a change of what they do
+	$(BIN)/python -m tests.golden
 
 lint: $(STAMP) ## check style and types
 	$(BIN)/ruff check .
