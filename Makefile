@@ -8,7 +8,7 @@ PACKAGES := backplane boards levels tools
 CONFIG ?= nasrem
 
 .DEFAULT_GOAL := help
-.PHONY: help run test mutants lint lock clean
+.PHONY: help run test mutants golden lint lock clean
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 14
@@ -21,6 +21,9 @@ test: $(STAMP) ## run the tests; ARGS="-k segment" and the like are passed on
 
 mutants: $(STAMP) ## check that a campaign notices when a detector is switched off
 	$(BIN)/python -m tests.mutants
+
+golden: $(STAMP) ## write the digests of the shipped racks anew, after a change of what they do
+	$(BIN)/python -m tests.golden
 
 lint: $(STAMP) ## check style and types
 	$(BIN)/ruff check .

@@ -15,6 +15,11 @@ from boards.errors import LaunchError
 PROJECT = Path(__file__).resolve().parent.parent
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """The crate must not have threads when it forks, and a board's mathematics belong on its own core."""
+TUNABLES = "GLIBC_TUNABLES"
+SAME_LIBM = "glibc.cpu.hwcaps=-FMA,-FMA4"
+"""The C library has `sin`, `exp` and the like twice, with fused multiply-add and without, takes what the processor has,
+and the two differ in the last bit. MuJoCo, OMPL, ruckig and Python's `math` call them: boards take those without, which
+every processor has. (It is read when a process starts, so the Rack's environment is the only place for it.)"""
 
 
 class CrateLine:
@@ -33,7 +38,7 @@ class CrateLine:
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
             stderr=self._printed,
-            env={**os.environ, **SINGLE_THREADED, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])},
+            env=environment(),
         )
         theirs.close()
         self.line = Channel(ours)
@@ -72,3 +77,10 @@ class CrateLine:
             self._process.wait()
         os.close(self.attention)
         os.close(self._printed)
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of the crate and its boards: the Rack's own, and what keeps a run repeatable."""
+    tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
+    path = os.pathsep.join([str(PROJECT), *sys.path])
+    return {**os.environ, **SINGLE_THREADED, TUNABLES: tunables, "PYTHONPATH": path}

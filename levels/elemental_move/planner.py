@@ -59,7 +59,7 @@ class ElementalMovePlanner(Planner):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        # mink and OMPL take a second and much memory to import: the process of a planner pays, no other.
+        # OMPL takes time and memory to import: the process of a planner pays, no other.
         from levels.planning.motion import MotionPlanner
 
         self._params = read_params(ElementalMoveParams, context.params)

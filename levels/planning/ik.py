@@ -19,9 +19,9 @@ from levels.planning.reach import sampling_range
 
 Array = NDArray[np.float64]
 
-RESTARTS = 40
-"""Random starts for one pose, at most: of 200 random poses of the PUMA, 20 starts missed one."""
-PATIENCE = 8
+RESTARTS = 60
+"""Random starts for one pose, at most: of 300 random poses of the K-1607, 40 starts missed one."""
+PATIENCE = 12
 """Starts in a row that bring no new solution and end the search, once there is one."""
 MOST_SOLUTIONS = 8
 """Solutions of one pose, at most: a redundant arm has infinitely many."""

@@ -59,11 +59,12 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: JointLimits) -> bool:
     speed = np.maximum(ds[:-1], ds[1:])
     first, second, third = _bounds_over(path, s)
     speed, most, jerk = speed[:, None], most[:, None], jerk[:, None]
+    cubed = speed * speed * speed  # of an array, ** 3 is not the same on every processor
     return bool(
         (ds > -ROUNDING).all()  # a jerk too small to take back the deceleration there is would turn the motion round
         and (first * speed <= limits.velocity * (1.0 + ROUNDING)).all()
         and (second * speed**2 + first * most <= limits.acceleration * (1.0 + ROUNDING)).all()
-        and (third * speed**3 + 3.0 * second * speed * most + first * jerk <= limits.jerk * (1.0 + ROUNDING)).all()
+        and (third * cubed + 3.0 * second * speed * most + first * jerk <= limits.jerk * (1.0 + ROUNDING)).all()
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -117,7 +118,7 @@ def _fastest(run: _Run, limits: JointLimits) -> list[Section]:
         for marks, bounds in run.ways():
             stretches = [speed_limits(*each, limits, share) for each in zip(*bounds, strict=True)]
             rows = list(_sections(marks, stretches))
-            time_s = sum(row[0] for row in rows)
+            time_s = math.fsum(row[0] for row in rows)  # exact: `sum` rounds otherwise from Python 3.12 on
             if time_s < least and len(rows) <= run.most_sections:
                 best, least = rows, time_s
     return best

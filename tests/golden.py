@@ -1,0 +1,79 @@
+"""The digests of the shipped racks, which every machine must come to, in golden.toml.
+
+    make golden         runs each of RUNS in lockstep and writes the file anew
+
+That is due whenever a change alters what a rack does, and after `make lock`. The file names what else the bits depend
+on: the libraries, and the C library's `sin`, `exp` and the like, which the lock file does not pin.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+from boards.config import load
+from boards.crate_line import environment
+from boards.rack import Rack
+
+FILE = Path(__file__).with_suffix(".toml")
+RUNS = (
+    "nasrem --seconds 14",
+    "crossing --seconds 14",
+    "k1607",
+    "nasrem --faults bad-sensors --seconds 8",
+    "nasrem --faults bad-motors --seconds 8",
+    "nasrem --faults noisy-bus --seconds 9",
+    "nasrem --faults kill-each-board --seconds 9",
+)
+"""As one would call `rack run`, but for --lockstep. The script `overload` needs real time."""
+LIBRARIES = ("daqp", "mujoco", "numpy", "ompl", "ruckig")
+PROBE = """
+import hashlib, math
+of = (math.sin, math.cos, math.tan, math.exp, math.atan, math.tanh, math.asinh, math.sinh, math.cbrt, math.log1p)
+values = [f(0.01 * k) for f in of for k in range(1, 1000)]
+values += [f(0.001 * k) for f in (math.asin, math.acos, math.log) for k in range(1, 1000)]
+values += [math.atan2(0.01 * k, 1.0) + (0.01 * k) ** 3.0 for k in range(1, 1000)]
+print(hashlib.sha256(repr(values).encode()).hexdigest()[:16])
+"""
+
+
+def digest(run: str, name: str) -> str:
+    """Return the digest of one of `RUNS`, run as the rack `name`."""
+    words = shlex.split(run)
+    options = dict(zip(words[1::2], words[2::2], strict=True))
+    config = load(words[0], [f"name={name}", "clock.mode=lockstep"], options.get("--faults"))
+    with Rack(config) as rack:
+        seconds = options.get("--seconds")
+        return rack.run(None if seconds is None else float(seconds)).digest
+
+
+def machine() -> dict[str, str]:
+    """Return what the bits depend on, in the environment of the boards."""
+    libm = subprocess.run(
+        [sys.executable, "-c", PROBE], env=environment(), capture_output=True, text=True, check=True, timeout=60
+    )
+    return {**{library: version(library) for library in LIBRARIES}, "libm": libm.stdout.strip()}
+
+
+def read() -> dict[str, dict[str, str]]:
+    """Return the file: `digests` by run, and the `machine` that they were made on."""
+    return tomllib.loads(FILE.read_text())
+
+
+def main() -> None:
+    """Write the file anew."""
+    tables = {"machine": machine(), "digests": {run: digest(run, "golden") for run in RUNS}}
+    lines = ["# Made by `make golden`, see golden.py; no line is meant to be written by hand."]
+    for name, table in tables.items():
+        # A JSON string is a TOML string.
+        lines += ["", f"[{name}]", *(f"{json.dumps(key)} = {json.dumps(value)}" for key, value in table.items())]
+    FILE.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
