@@ -64,7 +64,7 @@ def solve_linkage(model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_], en
     the joint that nothing determines.
     """
     solver = _Solver(model, joint, hand)
-    openings = np.linspace(*sorted(ends), OPENINGS)
+    openings = np.linspace(min(ends), max(ends), OPENINGS)
     rest = float(model.qpos0[solver.driven])
     first = int(np.argmin(np.abs(openings - rest)))
     positions = np.zeros((len(solver.joints), OPENINGS))
