@@ -81,10 +81,11 @@ class ServoExecutor(Executor):
         """Let time pass to `tick`, sense, interpolate, drive; report."""
         missed = self._catch_up(read.before.value if read.before.is_there else None, tick)
         sensed, sensors = self._link.sense(), self.sensors
-        sensors.look(sensed, tick, None if missed or self._left else self._wanted.velocity)
+        contact = self.arm.contact
+        sensors.look(sensed, tick, None if missed or self._left else self._wanted.velocity, contact is not None)
         self.standing.take(read.operator)
-        if self.arm.contact is not None:
-            self.stopping.struck(self.arm.contact, self.arm.named(self.arm.contact), tick)
+        if contact is not None:
+            self.stopping.struck(contact, self.arm.named(contact), tick)
         reaction = self.stopping.decide(self.demand, sensors, tick)
         self._take_findings()
         if reaction is Reaction.BRAKE:
@@ -156,7 +157,7 @@ class ServoExecutor(Executor):
         grip_force = 0.0 if self._grip is None else self._grip.force(command, sensed.opening, sensed.opening_velocity)
         refused = self._link.drive(torque, grip_force)
         if refused is not None:
-            return self._refuse(refused)
+            return self._refuse(refused, tick)
         self._wanted, self._left, self.stopping.refused = wanted, False, None
         return self.motors.begin(velocity, terms, self.arm.torque)
 
@@ -176,12 +177,12 @@ class ServoExecutor(Executor):
             self.findings.append(finding)
         return self.stopping.motor_fails(finding.subject, finding.value, tick)
 
-    def _refuse(self, finding: Finding) -> None:
+    def _refuse(self, finding: Finding, tick: int) -> None:
         """Take in that the arm did not let a torque through and has closed its brakes."""
         refused = self.stopping.refused
         if refused is None or finding.alarm is not refused.alarm:
             self.findings.append(finding)
-        self.stopping.refused = finding
+        self.stopping.refuse(finding, tick)
         self._brake()
 
     def _report(self, status: Message, command: Message, sensed: Sensed, reaction: Reaction) -> None:

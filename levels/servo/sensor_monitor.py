@@ -31,6 +31,8 @@ UNSEEN_S = 0.05
 """Time for which a joint may have moved off while its sensor, unnoticed, did not."""
 BRAKE_TAIL_S2 = 1e-3
 """What a joint needs beyond v^2 / 2 a until the brake has stopped it, for every rad/s2 of its braking."""
+STRUCK_SPEED = 5.0
+"""Multiple of that velocity up to which a blow may throw a joint about, within a cycle and without any model."""
 SILENT_CYCLES = 2
 """Cycles without a new sample after which the sensors are silent."""
 
@@ -89,8 +91,10 @@ class SensorMonitor:
         """Fill in what `recall` wants to know."""
         state.position, state.velocity, state.doubt = self.position, self.velocity, self.doubt
 
-    def look(self, sensed: Sensed, tick: int, wanted: Array | None) -> None:
+    def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
         """Judge a sample at `tick`; `wanted`: velocities, rad/s, that the arm was driven with, None: it was not.
+
+        `struck`: something has touched the arm since the last cycle.
 
         What is wrong is added to `findings`, once an episode.
         """
@@ -107,6 +111,10 @@ class SensorMonitor:
         if passed > self._every:
             # Driven on for a while, then braked: faster in between than at both ends.
             room += passed_s * 4.0 * self._every * self._tick_s * self._braking
+        fastest = self._fastest
+        if struck:
+            fastest = STRUCK_SPEED * fastest
+            room += passed_s * fastest
         # Never true for what is no number.
         fits = np.abs(q - self.position - way) <= room + self.doubt
         stirs = self._stirs(q, qd, change, wanted, passed_s)
@@ -115,7 +123,7 @@ class SensorMonitor:
             self._claim(q, qd, passed_s)
             stirs = stirs and bool((self._claimed <= self._room).all())
         if self.faulty or not stirs or np.count_nonzero(fits) < fits.size:
-            self._doubtful(q, qd, way, fits, room, passed_s)
+            self._doubtful(q, qd, way, fits & (np.abs(qd) <= fastest), room, passed_s)
             return
         self._take(q, qd, change != 0.0)
 
@@ -153,7 +161,6 @@ class SensorMonitor:
     def _doubtful(self, q: Array, qd: Array, way: Array, fits: Mask, room: Array, passed_s: float) -> None:
         """Name what is wrong with a sample, take what is right, and go on from what is known for the rest."""
         finite, inside = np.isfinite(q) & np.isfinite(qd), (q >= self._low) & (q <= self._high)
-        inside &= np.abs(qd) <= self._fastest
         last_q, last_qd = self._raw
         unchanged = (q == last_q) & (qd == last_qd)
         if not self._coarse:

@@ -89,7 +89,13 @@ class Stopping:
         self._retry_at = tick + self._retry_ticks
         text = f"motor of '{self._joints[joint]}' does not give the torque commanded"
         self._motor = Cause(Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}")
+        self._wait_for(self._motor, tick)
         return self._standing
+
+    def refuse(self, finding: Finding, tick: int) -> None:
+        """Take in that the arm did not let a torque through."""
+        self.refused = finding
+        self._wait_for(self._about_torque(finding), tick)
 
     def struck(self, contact: tuple[int, int], named: str, tick: int) -> None:
         """Take in that something touches the arm."""
@@ -113,11 +119,15 @@ class Stopping:
                 return self._latch(cause)
         if demand:
             self.reason = f"demand '{demand.name.lower()}' on the arm, until boards and emergency stop are in order"
+        elif cause is not None:
+            self._wait_for(cause, tick)
         else:
             self.reason = ""
-            if cause is not None:
-                self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
         return max(reaction, DEMANDED[demand])
+
+    def _wait_for(self, cause: Cause, tick: int) -> None:
+        """Say what must be over, and until when."""
+        self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
     def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
         """Return what faults make the arm do, and the one to name."""
