@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -23,7 +24,7 @@ from boards.rack import Rack
 from levels.operator import Answer, Goal, What
 from tests.boards.conftest import MakeConfig
 from tests.boards.told_racks import TOLD, commands
-from tests.processes import wait_until
+from tests.processes import FORKS, forked, kill, wait_until
 
 HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
 UPPER, LOWER = 8, 1
@@ -163,6 +164,25 @@ def test_a_program_commands_its_rack_while_it_runs(told: Callable[..., RackConfi
         assert second[RequestWord.GIVEN_TICK] >= later
         rack.stop("tried")
         watch(rack, lambda: rack.segment.words[System.STATE] == Run.STOPPED)
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_command_is_given_only_while_its_client_lives(told: Callable[..., RackConfig], is_killed: bool) -> None:
+    with Rack(told(commands("level='upper', what='hold', tick=50"))) as rack:
+        table = OperatorTable(rack.segment)
+        wanted = Request(table.entries[0][RequestWord.MAILBOX], bytes(table.entries[0].message), 100)
+
+        def wait() -> None:
+            with OperatorTable(rack.segment).claim(wanted):
+                time.sleep(60)
+
+        with forked(wait) as pid:
+            wait_until(lambda: len(table.waiting()) == 2)
+            if is_killed:
+                kill(pid)
+            assert rack.run(1.0).worked
+        assert mailbox_ring(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
 
 
 def test_what_a_program_says_must_fit_the_rack(told: Callable[..., RackConfig]) -> None:
