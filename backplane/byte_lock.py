@@ -32,6 +32,13 @@ class ByteLock:
             return False
         return True
 
+    @staticmethod
+    def is_taken(segment: Segment, address: int) -> bool:
+        """Say whether somebody has the lock on the byte at a bus address, without taking it."""
+        asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
+        kind: int = _FLOCK.unpack(fcntl.fcntl(segment.fd, fcntl.F_OFD_GETLK, asked))[0]
+        return kind != fcntl.F_UNLCK
+
     def give_back(self) -> None:
         """Release the lock; it may be taken again."""
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._give_back)

@@ -37,12 +37,14 @@ class Verdict(IntEnum):
 class Reading(NamedTuple):
     """What a read gave: the message, all zero before the first one, and the verdict.
 
-    `is_lost`: its writer is dead, hangs, or has been silent for longer than a writer of its period may be.
+    `is_lost`: its writer is dead, hangs, or has been silent for longer than a writer of its period may be. `earlier`:
+    where every message counts, those before it that have not been read yet, oldest first.
     """
 
     value: Message
     verdict: Verdict
     is_lost: bool = False
+    earlier: tuple[Message, ...] = ()
 
     @property
     def is_new(self) -> bool:

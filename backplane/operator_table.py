@@ -3,10 +3,15 @@
 Whoever commands adds a request, at any time. The clock alone gives it, at the beginning of a tick: it publishes the
 message in the level's mailbox, whose only writer it is, so that every task of the tick sees the same and a run in
 lockstep repeats with its commands. What a command means is known above: here are the bytes of a message.
+
+A request belongs to the run, or to a client that waits for it: then it is withdrawn when the client's process ends,
+however that ends. The client holds a lock of the kernel's meanwhile, so that the clock can tell in a microsecond.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -15,6 +20,9 @@ from backplane.byte_lock import ByteLock
 from backplane.errors import OperatorTableError
 from backplane.segment import Segment
 from backplane.words import System
+
+_CLAIMS = 1 << 40
+"""Address of the byte that the client of ticket 0 locks: beyond any segment, for a lock needs no byte there."""
 
 
 class RequestStage(IntEnum):
@@ -34,6 +42,7 @@ class RequestWord(IntEnum):
     TICK = 3  # tick at which it is to be given; -1: at once
     SERIAL = 4  # of the command, rising over all levels in the order in which they are given; 0: not yet
     GIVEN_TICK = 5  # -1: not yet
+    HAS_CLIENT = 6  # 1: it is given only as long as its client lives
 
 
 @dataclass(frozen=True)
@@ -82,20 +91,43 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all of them wait for their ticks.
         """
+        entry, claim = self._add(request)
+        claim.close()
+        return entry
+
+    @contextmanager
+    def claim(self, request: Request) -> Iterator[RequestEntry]:
+        """Add a request for a block, as its client; what was not given by its end, or that of the process, never is.
+
+        Raises `OperatorTableError` when all entries wait for their ticks.
+        """
+        entry, claim = self._add(request, has_client=True)
+        ticket = entry[RequestWord.TICKET]
+        try:
+            yield entry
+        finally:
+            self.withdraw(entry, ticket)
+            claim.close()
+
+    def _add(self, request: Request, has_client: bool = False) -> tuple[RequestEntry, ByteLock]:
         lock = ByteLock(self._segment, self._segment.map.operator)
         try:
             # The bound of this wait is the time in which another process fills an entry.
             while not lock.take():
                 continue
-            settled = [entry for entry in self.entries if entry.stage != RequestStage.WAITING]
+            settled = [entry for entry in self.entries if not self.is_waiting(entry)]
             if not settled:
                 why = f"{len(self.entries)} commands wait for their ticks, as many as it holds"
                 raise OperatorTableError(f"the operator table is full: {why}; permitted: once one of them is given")
             entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
-            self._fill(entry, request)
+            ticket = self._words[System.REQUESTED] + 1
+            claim = ByteLock(self._segment, _CLAIMS + ticket)
+            if has_client:
+                claim.take()
+            self._fill(entry, request, ticket, has_client)
         finally:
             lock.close()
-        return entry
+        return entry, claim
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
         """Take a request back that still waits; False when it was given."""
@@ -103,17 +135,28 @@ class OperatorTable:
         if words[RequestWord.TICKET] != ticket or words[RequestWord.STAGE] != RequestStage.WAITING:
             return False
         words[RequestWord.STAGE] = RequestStage.FREE
+        # The clock first says that it gives it, then looks whether it is still wanted.
         return words[RequestWord.GIVEN_TICK] < 0
+
+    def is_waiting(self, entry: RequestEntry) -> bool:
+        """Say whether a request waits, and nobody who wanted it has ended."""
+        words = entry.words
+        if words[RequestWord.STAGE] != RequestStage.WAITING:
+            return False
+        return not words[RequestWord.HAS_CLIENT] or ByteLock.is_taken(
+            self._segment, _CLAIMS + words[RequestWord.TICKET]
+        )
 
     def waiting(self) -> list[RequestEntry]:
         """Return the requests that wait, in the order in which they were added."""
-        found = [entry for entry in self.entries if entry.words[RequestWord.STAGE] == RequestStage.WAITING]
+        found = [entry for entry in self.entries if self.is_waiting(entry)]
         return sorted(found, key=lambda entry: entry.words[RequestWord.TICKET])
 
-    def _fill(self, entry: RequestEntry, request: Request) -> None:
+    def _fill(self, entry: RequestEntry, request: Request, ticket: int, has_client: bool) -> None:
         words = entry.words
         words[RequestWord.STAGE] = RequestStage.FREE
-        words[RequestWord.TICKET] = self._words[System.REQUESTED] + 1
+        words[RequestWord.TICKET] = ticket
+        words[RequestWord.HAS_CLIENT] = has_client
         words[RequestWord.MAILBOX] = request.mailbox
         words[RequestWord.TICK] = request.tick
         words[RequestWord.SERIAL], words[RequestWord.GIVEN_TICK] = 0, -1

@@ -25,7 +25,7 @@ _sem_open.argtypes, _sem_open.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.
 _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 
 
-class Semaphore(posix_ipc.Semaphore):
+class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no types
     """An open semaphore whose waits no step of the wall clock makes longer or shorter.
 
     `wait()` waits until what `bind` has set, and returns 0 when it has obtained the semaphore: it is the C library's

@@ -11,7 +11,7 @@ from time import monotonic_ns
 
 from backplane.alarms import Alarm, AlarmWriter
 from backplane.clock import SystemClock
-from backplane.process import GONE, STOPPED, is_alive, state_of
+from backplane.process import GONE, STOPPED, WAITING, is_alive, state_of
 from backplane.segment import Segment
 from backplane.semaphores import wake_semaphore
 from backplane.words import Block, Head, System
@@ -21,7 +21,7 @@ _TICK = int(System.TICK)
 CLOCK_TICKS = 2
 """Ticks behind a release that does not come after which the clock is looked at."""
 CLOCK_SILENT_S = 0.5
-"""Time without a tick after which the clock is called stopped though its process could run."""
+"""Time without a tick after which the clock is called stopped when its process waits: for no tick, by then."""
 CHECK_S = 0.25
 """A wait that takes longer looks whether the launcher still lives."""
 SPINS = 100_000
@@ -48,6 +48,7 @@ class NextCycle:
         self._poll = poll
         self._clock_alarms = None if self._clock.is_lockstep else clock_alarms
         self._clock_is_silent = False
+        self._waited_at = -1
         # A restarted planner takes nothing that was released before its time.
         self._slack = 0
         self._last = self._block[Block.RELEASED]
@@ -106,8 +107,13 @@ class NextCycle:
             return
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
-        stopped = state_of(clock) in STOPPED + GONE
-        if not self._clock_is_silent and (stopped or silent_s > CLOCK_SILENT_S):
+        state = state_of(clock)
+        # One that could run is only late. Seen twice: after a pause of the whole machine it is about to be woken.
+        waits = silent_s > CLOCK_SILENT_S and state in WAITING
+        is_proof = state in STOPPED + GONE or (waits and self._waited_at == newest)
+        self._waited_at = newest if waits else -1
+        # What the clock has done meanwhile, or the end of the run, makes the look void.
+        if is_proof and not self._clock_is_silent and self._words[_TICK] == newest and not self._clock.is_stopped:
             self._clock_is_silent = True
             alarms.ring(now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest)
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from backplane.address_map import CLOCK
 from backplane.alarms import Alarm, AlarmWriter
 from backplane.episodes import Episodes
 from backplane.mailbox import Reading, Verdict
+from backplane.message import Message
 from backplane.message_watch import MessageWatch
 from backplane.protocols import open_reader
 from backplane.segment import Segment
 from backplane.silence_watch import SilenceWatch, Witness
+from backplane.slots import Slots
 from backplane.words import Block
 
 _LOST = int(Block.LOST)
@@ -48,19 +52,36 @@ class WatchedReader:
 
 
 class SporadicReader:
-    """Reads an operator's mailbox: silence there proves nothing, but what comes must be whole, and the clock's."""
+    """Reads an operator's mailbox: silence there proves nothing, but what comes must be whole, and the clock's.
+
+    A command may leave standing what an earlier one said, so none is left out: the newest comes with those before it
+    that have not been read; at first with all that are there, for a board that comes back must know them.
+    """
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
         self.reader = open_reader(segment, name)
+        self._slots = Slots(segment, self.reader.spec)
         self._episodes = Episodes(segment, name, alarms)
         self._bad_reads = self._corrupt = self._forged = 0
 
     def read(self, tick: int) -> Reading:
-        """Return the newest message visible at `tick`, with its verdict."""
+        """Return the newest message visible at `tick`, with its verdict, and those that came before it."""
+        before = self.reader.serial
         reading = self.reader.read(tick)
         if self.reader.bad_reads != self._bad_reads:
             self._tell(tick)
+        if self.reader.serial > before + 1:
+            return reading._replace(earlier=tuple(self._between(before, self.reader.serial)))
         return reading
+
+    def _between(self, before: int, newest: int) -> Iterator[Message]:
+        """Yield a copy of each good message between two serials, as far as the slots reach back."""
+        slots = self._slots
+        for serial in range(max(before + 1, newest - slots.mask), newest):
+            if slots.fetch(serial) and slots.is_lawful(0):
+                message = Message(slots.dtype)
+                message.copy_from(slots.message)
+                yield message
 
     def _tell(self, tick: int) -> None:
         reader, self._bad_reads = self.reader, self.reader.bad_reads

@@ -36,9 +36,10 @@ class ClockGuard:
             left_out = words[System.CLOCK_SKIPPED] - self._left_out
             self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=left_out, since=tick - left_out)
         self._left_out = words[System.CLOCK_SKIPPED]
+        late_ns = words[_TICK_NS] - self._clock.time_of(tick)
+        # Only now: the time is of this tick as long as the clock has not come to the next.
         if self._clock.is_lockstep or words[_TICK] != tick:
             return
-        late_ns = words[_TICK_NS] - self._clock.time_of(tick)
         if late_ns > self._late_ns:
             if tick >= self._quiet_from:
                 self._alarms.ring(tick, Alarm.CLOCK_LATE, value=late_ns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ class Orders:
     """The operator's commands to one level. `standing` is what it is to do: HOLD, SETPOINT or GOTO; NONE: its own work.
 
     `serial` is the newest command's, and `basis` that of the newest which was not refused. A refused command leaves
-    standing what stood.
+    standing what stood, also on a board that comes back: it takes up every command again, in their order.
     """
 
     def __init__(self, commands: Commands) -> None:
@@ -34,9 +34,20 @@ class Orders:
         self._before = 0, What.NONE
         self._is_told = False
 
-    def take(self, operator: Reading) -> bool:
-        """Look into the mailbox; True in the cycle that takes up a command."""
-        return operator.is_new and self._take_up(operator.value)
+    def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
+        """Look into the mailbox; True in the cycle that takes up a command.
+
+        `judge` is called with each one taken up: where a level has objections of its own, it refuses the command there.
+        """
+        if not operator.is_new:
+            return False
+        taken = False
+        for message in (*operator.earlier, operator.value):
+            if self._take_up(message):
+                taken = True
+                if judge is not None:
+                    judge(message)
+        return taken
 
     def _take_up(self, message: Message) -> bool:
         # Once only: a clock that died while it gave it gives it again.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
 
@@ -40,18 +41,28 @@ within_cycles = 4
 _NUMBERS = count()
 
 
+_NO_TURN = pytest.StashKey[str]()
+
+
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Take turns with tests that need the machine to themselves.
+
+    Out here, and not in a fixture: the time-out of a test begins within, so it does not count the wait.
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(turn(alone=item.get_closest_marker("alone") is not None))
+        except TimeoutError as error:
+            item.stash[_NO_TURN] = str(error)
+        yield
+
+
 @pytest.fixture(autouse=True)
-def _turn(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Take turns with tests that need the machine to themselves."""
-    with turn(alone=request.node.get_closest_marker("alone") is not None):
-        yield
-
-
-@pytest.fixture(scope="module")
-def machine_alone() -> Iterator[None]:
-    """Have the machine for a module: for fixtures that its tests share."""
-    with turn(alone=True):
-        yield
+def _turn(request: pytest.FixtureRequest) -> None:
+    """Fail a test that has waited in vain: an error of the hook would end the whole session."""
+    if _NO_TURN in request.node.stash:
+        pytest.fail(request.node.stash[_NO_TURN])
 
 
 @pytest.fixture

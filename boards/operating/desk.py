@@ -37,9 +37,12 @@ class OperatorDesk:
             self._waiting = self._table.waiting()
         for entry in [entry for entry in self._waiting if entry[RequestWord.TICK] <= tick]:
             self._waiting.remove(entry)
-            # It may have been withdrawn since.
-            if entry.stage == RequestStage.WAITING:
+            # First the word, then the look: whoever withdraws it does the same the other way round.
+            entry.words[RequestWord.GIVEN_TICK] = tick
+            if self._table.is_waiting(entry):
                 self._give(entry, tick)
+            else:
+                entry.words[RequestWord.GIVEN_TICK] = -1
 
     def _give(self, entry: RequestEntry, tick: int) -> None:
         words, writer = entry.words, self._writers[entry[RequestWord.MAILBOX]]
@@ -50,7 +53,6 @@ class OperatorDesk:
         message = writer.message
         message.raw[:] = entry.message[: len(message.raw)]
         message.id = words[RequestWord.SERIAL]
-        words[RequestWord.GIVEN_TICK] = tick
         writer.write(tick, self._clock.now())
         words[RequestWord.STAGE] = RequestStage.GIVEN
         self._alarms.ring(tick, Alarm.COMMANDED, entry.index, words[RequestWord.SERIAL])

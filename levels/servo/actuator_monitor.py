@@ -75,7 +75,7 @@ class ActuatorMonitor:
         left = self._left_over(velocity, terms)
         if not self._exact:
             # What encoders may make of a gain in velocity that there is not.
-            self._noise = self._least + np.abs(terms.inertia) @ (2.0 * self._speed_off / self._period_s)
+            self._noise = self._least + mat_vec(np.abs(terms.inertia), 2.0 * self._speed_off / self._period_s)
         if not np.count_nonzero(np.abs(left) > self._noise):
             self._cycles = 0
             return None

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backplane.mailbox import Reading
+from backplane.message import Message
 from levels.operator import Commands, What
 from levels.orders import Orders, joints_of
 from levels.servo.curves import Motion
@@ -34,13 +35,8 @@ class Standing:
 
     def take(self, operator: Reading) -> None:
         """Take up what is new."""
-        if not self.orders.take(operator):
+        if not self.orders.take(operator, self._judge):
             return
-        if self.orders.standing is What.SETPOINT:
-            try:
-                self._goal = joints_of(operator.value, self._joints, self._ranges)
-            except ValueError as error:
-                self.orders.refuse(str(error))
         if self.orders.standing is What.NONE and self._way:
             self.orders.under_way()
         self.stands = self.orders.standing is not What.NONE or bool(self._way)
@@ -53,6 +49,14 @@ class Standing:
         if self.orders.standing is What.NONE:
             return "goes back to where the operator took over, then follows the level above"
         return f"operator's {self.orders.standing.name.lower()}, until resume"
+
+    def _judge(self, command: Message) -> None:
+        """Take the goal of a set point, or refuse it."""
+        if self.orders.standing is What.SETPOINT:
+            try:
+                self._goal = joints_of(command, self._joints, self._ranges)
+            except ValueError as error:
+                self.orders.refuse(str(error))
 
     def wanted(self, reference: Reference, tick: int) -> Motion:
         """Return the motion wanted at `tick`, while the level follows the operator."""

@@ -58,8 +58,7 @@ class TaskExecutor(Executor):
         """Take up what is done below, and what an operator says; hand down what comes next."""
         if not self._started:
             self._go_on(read)
-        if self._orders.take(read.operator) and self._orders.standing is What.GOTO:
-            self._take_goto(read)
+        self._orders.take(read.operator, lambda command: self._judge(command, read.last_status.value.order))
         plan, below = read.plan.value, read.status.value
         if not self._error:
             self._follow(plan, below)
@@ -83,10 +82,10 @@ class TaskExecutor(Executor):
             self._window = ShownWindow(last.first, read.last_command.value.id, before)
             self._detour = Detour(self.context.robot, last.detour)
 
-    def _take_goto(self, read: Ports) -> None:
-        """Take up a goto, or the one that was under way when this board died."""
-        is_new = read.last_status.value.order != self._orders.serial
-        self._detour.begin(read.operator.value, self._orders, is_new)
+    def _judge(self, command: Message, answered: int) -> None:
+        """Take up a goto, or one that this board had answered when it died, or refuse it."""
+        if self._orders.standing is What.GOTO:
+            self._detour.begin(command, self._orders, command.id > answered)
 
     def _follow(self, plan: Message, below: Message) -> None:
         if plan.error:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from contextlib import ExitStack
+
 import pytest
 
 from backplane.address_map import OPERATOR_ENTRIES
@@ -68,6 +72,30 @@ def test_nobody_takes_back_what_another_has_put_into_the_same_entry(segment: Seg
     assert again.index == entry.index
     assert not table.withdraw(entry, ticket)
     assert again.stage == RequestStage.WAITING
+
+
+def test_a_claimed_request_waits_as_long_as_its_block(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    with table.claim(Request(0, b"", 9)) as entry:
+        assert OperatorTable(segment).waiting()[0].index == entry.index
+    assert table.waiting() == []
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_a_dead_client_makes_room(segment: Segment) -> None:
+    table = OperatorTable(segment)
+
+    def die() -> None:
+        with ExitStack() as claims:
+            for _ in range(OPERATOR_ENTRIES):
+                claims.enter_context(table.claim(Request(0, b"", 9)))
+            assert len(table.waiting()) == OPERATOR_ENTRIES
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    assert exit_status(fork(die)) == -signal.SIGKILL
+    assert table.waiting() == []
+    entries = {table.add(Request(0, b"", 9)).index for _ in range(OPERATOR_ENTRIES)}
+    assert len(entries) == len(table.waiting()) == OPERATOR_ENTRIES
 
 
 def test_a_full_table_makes_room_with_the_command_given_longest_ago(segment: Segment) -> None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import signal
 import threading
+import time
+from collections.abc import Callable
 
 import pytest
 
+from backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from backplane.process import state_of
 from backplane.segment import Segment
 from backplane.semaphores import wake_semaphore
 from backplane.wake import NextCycle
 from backplane.words import Block, Head, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S
+from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
 
 POLL = pytest.mark.parametrize("poll", [False, True], ids=["signal", "poll"])
 EVERY = 4
@@ -110,6 +115,33 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment, poll: bool) -> None:
 def test_the_launchers_end_ends_a_wait(bus: Segment, poll: bool) -> None:
     bus.words[Head.LAUNCHER_START] += 1
     assert NextCycle(bus, "level", poll).wait() is None
+
+
+def busy() -> None:
+    while True:
+        pass
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize(("clock", "rung"), [(busy, []), (signal.pause, [Alarm.CLOCK_STOPPED])])
+def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
+    bus: Segment, monkeypatch: pytest.MonkeyPatch, clock: Callable[[], None], rung: list[Alarm]
+) -> None:
+    monkeypatch.setattr("backplane.wake.CLOCK_SILENT_S", 0.05)
+    looks: list[int] = []
+    monkeypatch.setattr("backplane.wake.state_of", lambda pid: looks.append(pid) or state_of(pid))
+    bus.words[System.PERIOD_NS], bus.words[System.EPOCH_NS] = 2_500_000, time.monotonic_ns()
+    cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))
+    release(bus, 0)
+    cycle.wait()
+    with forked(clock) as pid:
+        bus.words[System.CLOCK_PID] = pid
+        with in_thread(cycle.wait):
+            # The looks of a tenth of a second and more.
+            wait_until(lambda: len(looks) > 60)
+            bus.words[System.STATE] = Run.STOPPED
+            wake_semaphore(bus.rack, "level").release()
+    assert [Alarm(code) for code in alarm_ring(bus, "level").drain().rows["code"]] == rung
 
 
 def test_posts_that_a_polling_task_does_not_need_do_not_add_up(bus: Segment) -> None:

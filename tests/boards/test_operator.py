@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from backplane.mailbox import Reading
-from backplane.operator_table import RequestEntry, RequestStage, RequestWord
+from backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
 from backplane.protocols import open_observer
 from backplane.ring import mailbox_ring
 from backplane.words import Run, System
@@ -17,12 +18,13 @@ from boards.config.schema import RackConfig
 from boards.errors import ConfigError
 from boards.events import Event
 from boards.faults.config import FaultConfig
+from boards.operating.text import message_of
 from boards.outcome import Outcome
 from boards.rack import Rack
-from levels.operator import Answer, What
+from levels.operator import Answer, Goal, What
 from tests.boards.conftest import MakeConfig
 from tests.boards.told_racks import TOLD, commands
-from tests.processes import wait_until
+from tests.processes import FORKS, forked, kill, wait_until
 
 HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
 UPPER, LOWER = 8, 1
@@ -114,6 +116,32 @@ def test_a_board_that_comes_back_goes_on_with_what_it_was_told(told: Callable[..
     assert (last["order"], last["standing"]) == (1, What.HOLD)
 
 
+@pytest.mark.parametrize("board", ["upper", "lower"])
+def test_what_stood_before_a_refusal_stands_on_a_board_that_comes_back(
+    told: Callable[..., RackConfig], board: str
+) -> None:
+    # The lower level never takes a goto: its config would refuse it, an intruder in the table may say it all the same.
+    config = told(commands(f"level='{board}', what='hold', tick=50"))
+    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
+    with Rack(config) as rack:
+        hold = OperatorTable(rack.segment).entries[0]
+        message = message_of(hold, rack.segment.layout)
+        message.what, message.goal = What.GOTO, Goal.HOME
+        OperatorTable(rack.segment).add(Request(hold[RequestWord.MAILBOX], bytes(message.raw), 60))
+        assert rack.run(1.0).worked
+        last = mailbox_ring(rack.segment, f"{board}.status").drain().rows["message"][-1]
+    assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
+    assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, What.HOLD, 1)
+
+
+def test_a_command_overtaken_by_one_that_is_refused_stands(told: Callable[..., RackConfig]) -> None:
+    # Both come within one cycle of the level.
+    setting = commands("level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52")
+    _, _, boxes = run(told(setting))
+    last = boxes["upper.status"]["message"][-1]
+    assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, What.HOLD)
+
+
 def test_a_clock_that_comes_back_goes_on_with_the_serials(told: Callable[..., RackConfig]) -> None:
     config = told(HELD)
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)})
@@ -136,6 +164,25 @@ def test_a_program_commands_its_rack_while_it_runs(told: Callable[..., RackConfi
         assert second[RequestWord.GIVEN_TICK] >= later
         rack.stop("tried")
         watch(rack, lambda: rack.segment.words[System.STATE] == Run.STOPPED)
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_command_is_given_only_while_its_client_lives(told: Callable[..., RackConfig], is_killed: bool) -> None:
+    with Rack(told(commands("level='upper', what='hold', tick=50"))) as rack:
+        table = OperatorTable(rack.segment)
+        wanted = Request(table.entries[0][RequestWord.MAILBOX], bytes(table.entries[0].message), 100)
+
+        def wait() -> None:
+            with OperatorTable(rack.segment).claim(wanted):
+                time.sleep(60)
+
+        with forked(wait) as pid:
+            wait_until(lambda: len(table.waiting()) == 2)
+            if is_killed:
+                kill(pid)
+            assert rack.run(1.0).worked
+        assert mailbox_ring(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
 
 
 def test_what_a_program_says_must_fit_the_rack(told: Callable[..., RackConfig]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from backplane.message import Field, State, command, status
+from backplane.message import Field, Message, State, command, status
 from levels.level import Executor, Input, Ports
 from levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, What
 from levels.orders import Orders
@@ -21,14 +21,17 @@ class Upper(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take up what is said, and hand it down."""
         orders = self.orders
-        if orders.take(read.operator) and orders.standing is What.GOTO:
-            orders.refuse("the way home is closed")
+        orders.take(read.operator, self._judge)
         write.command.hold = orders.standing is What.HOLD
         write.command.operator = orders.rests_on(0)
         if read.status.value.operator >= orders.basis:
             orders.done()
         orders.report(write.status)
         write.status.state = State.EXECUTING
+
+    def _judge(self, command: Message) -> None:
+        if self.orders.standing is What.GOTO:
+            self.orders.refuse("the way home is closed")
 
     def self_test(self) -> None:
         """Begin without orders."""

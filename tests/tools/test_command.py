@@ -144,12 +144,13 @@ def test_a_rack_that_is_not_there_is_one_line() -> None:
     assert done.stderr.startswith("rack 'no-such-rack' is not there")
 
 
-def test_an_interrupted_wait_leaves_no_command_behind(running: str) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(running: str, end: signal.Signals) -> None:
     table = OperatorTable(Segment.attach(running))
     command = [sys.executable, "-m", "tools.cli", "command", running, "upper", "hold", "--tick", str(10**9)]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     wait_until(table.waiting)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(end)
     process.communicate(timeout=BOUND_S)
     assert process.returncode != 0
     assert table.waiting() == []

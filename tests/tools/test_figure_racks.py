@@ -27,7 +27,7 @@ ENOUGH = 5
 
 
 @pytest.fixture(scope="module")
-def runs(machine_alone: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     # An executor that is overloaded waits for itself: there is nothing to tell others by.
     folders = {name: tmp_path_factory.mktemp("runs") for name in FIGURES}
     found = {name: undisturbed(name, folders[name]) for name in FIGURES[:3]}

@@ -60,13 +60,10 @@ class LiveDesk:
             raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
         if Patience(segment, "").is_in_vain:
             raise Failure(f"rack '{segment.rack}': its run is over")
-        entry = self._table.add(wanted)
-        ticket, text = entry[RequestWord.TICKET], describe(message_of(entry, segment.layout))
-        try:
+        # However the wait ends, nothing is left that would be given when nobody asks for it any more.
+        with self._table.claim(wanted) as entry:
+            ticket, text = entry[RequestWord.TICKET], describe(message_of(entry, segment.layout))
             told = self._await_giving(entry, ticket, command.level, text)
-        finally:
-            # However the wait ends, nothing is left that would be given when nobody asks for it any more.
-            self._table.withdraw(entry, ticket)
         return self._await_answer(told, wait, timeout_s)
 
     def _await_giving(self, entry: RequestEntry, ticket: int, level: str, text: str) -> Told:
