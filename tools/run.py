@@ -12,7 +12,7 @@ from tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
 
 Lockstep = Annotated[bool, typer.Option("--lockstep", help="a tick begins when every task due has finished: exact")]
 Seconds = Annotated[
-    float | None, typer.Option(metavar="S", min=0.0, help="simulated time to run for; default: until the task ends")
+    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="simulated time to run for; default: until it ends")
 ]
 Speed = Annotated[
     float | None, typer.Option(metavar="X", help="run this many times faster than real time, or slower: 0.5")
