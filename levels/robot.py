@@ -11,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 # pydantic keeps one bound of a kind: fields that are narrower say so with `le` and `ge`.
 Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
+LAST_TICK = 10**15
+"""Ticks are 64-bit words: this many of the shortest are 300 years."""
 
 
 class Table(BaseModel):

@@ -11,7 +11,7 @@ class MotionConfig(Table):
     """A move of an obstacle, done by the simulated cell at a fixed time: a mocap body goes to a place."""
 
     body: str = Field(description="obstacle that moves")
-    at: float = Field(ge=0, description="simulated time when it starts, s")
+    at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it starts, s")
     to: tuple[Finite, Finite, Finite] = Field(description="where its origin goes, m")
     speed: Positive = Field(0.25, description="speed along the straight line, m/s")
 

@@ -14,7 +14,7 @@ Lockstep = Annotated[
     bool, typer.Option("--lockstep", help="begin a tick when every task due has finished: exact and repeatable")
 ]
 Seconds = Annotated[
-    float | None, typer.Option(metavar="S", min=0.0, help="simulated time to run for; default: until the task ends")
+    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="simulated time to run for; default: until it ends")
 ]
 Speed = Annotated[
     float | None, typer.Option(metavar="X", help="run this many times as fast as real time, as in 2 or 0.5")

@@ -11,7 +11,9 @@ from tools.answer import Failure, Json, RackName, print_json
 
 def stop(
     rack: RackName,
-    wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="seconds to wait for the rack's end")] = 10.0,
+    wait: Annotated[
+        float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the rack's end")
+    ] = 10.0,
     as_json: Json = False,
 ) -> None:
     """End a run and wait until it is gone.

@@ -143,12 +143,11 @@ class Wiring:
 
     def _check_params(self) -> None:
         """Check the parameters of a board against what its executor's and planner's classes declare."""
-        kinds = {(ports.board, ports.kind.params): None for ports in self._tasks}
-        for board, kind in kinds:
+        kinds = [(ports.board, ports.kind.params) for ports in self._tasks if ports.kind.params is not None]
+        for board, kind in dict.fromkeys(kinds):
             params = self.config.board[board].params
             try:
-                if kind is not None:
-                    kind.model_validate(params)
+                kind.model_validate(params)
             except ValidationError as error:
                 self.mistakes += mistakes_of(error, kind, params, f"board.{board}.params")
 

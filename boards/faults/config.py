@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from levels.robot import Finite, Table
+from levels.robot import LAST_TICK, Finite, Table
 
 DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s)\s*")
 
@@ -39,15 +39,17 @@ class FaultConfig(Table):
 
     kind: str = Field(description="what goes wrong; 'rack inject --help' lists the kinds")
     board: str = Field(description="task concerned: a board, as in servo, its planner, as in servo.planner, or clock")
-    tick: int | None = Field(None, ge=0, description="first tick; at most one of tick, at and when; none: at the start")
-    at: float | None = Field(None, ge=0, allow_inf_nan=False, description="instead of tick: simulated time, s")
+    tick: int | None = Field(
+        None, ge=0, le=LAST_TICK, description="first tick; at most one of tick, at and when; none: at the start"
+    )
+    at: float | None = Field(None, ge=0, le=1e9, allow_inf_nan=False, description="instead of tick: simulated time, s")
     when: str | None = Field(
         None, description='instead of tick: once a field has a value, as in "elemental_move.status.verb == grasp"'
     )
     lasts: Seconds | None = Field(
         None, alias="for", description='simulated time that it lasts, as in "0.5s", "20ms" or 0.5; or give cycles'
     )
-    cycles: int | None = Field(None, ge=1, le=10**9, description="instead of for: cycles of the task that it lasts")
+    cycles: int | None = Field(None, ge=1, le=10**6, description="instead of for: cycles of the task that it lasts")
     phase: float = Field(
         0.0, ge=0, lt=1, description="when in its first tick it strikes, in ticks of real time; not in lockstep"
     )

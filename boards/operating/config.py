@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from levels.operator import Goal, What
-from levels.robot import Finite, Table
+from levels.robot import LAST_TICK, Finite, Table
 
 Vector = tuple[Finite, Finite, Finite]
 Said = Literal["hold", "resume", "setpoint", "goto"]
@@ -18,7 +18,9 @@ class CommandConfig(Table):
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
     what: Said = Field(description="hold: come to rest; resume: go on; setpoint, goto: move to a goal, and stay there")
-    tick: int | None = Field(None, ge=0, description="tick at which it is given; at most one of tick and at")
+    tick: int | None = Field(
+        None, ge=0, le=LAST_TICK, description="tick at which it is given; at most one of tick and at"
+    )
     at: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
         None, description="instead of tick: simulated time, s"
     )

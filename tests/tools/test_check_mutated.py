@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -24,7 +25,7 @@ from boards.config.text import to_toml
 from tools.answer import LONGEST_LINE
 from tools.cli import main
 
-EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "150"))
+EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "300"))
 BOUND_S = 20
 """Processor time of one check, at most: the machine's load does not count."""
 
@@ -104,7 +105,30 @@ def spoilt(draw: st.DrawFn) -> str:
             holder[key] = copy.deepcopy(draw(st.sampled_from(VALUES)))
         if not tables:
             break
-    return to_toml(tables)
+    text = to_toml(tables)
+    return draw(torn(text)) if draw(st.integers(0, 5)) == 0 else text
+
+
+@st.composite
+def torn(draw: st.DrawFn, text: str) -> str:
+    """Draw text that was edited without care: a line twice, a line less, the end lost, a stray piece."""
+    lines = text.splitlines()
+    line = draw(st.integers(0, len(lines) - 1))
+    piece = draw(
+        st.sampled_from(("=", "[", "]]", '"', "1990-03-01", "0x", "\x7f", "\ufeff", "#", "\t", "nan", "1e400"))
+    )
+    column = draw(st.integers(0, len(lines[line])))
+    return draw(
+        st.sampled_from(
+            (
+                [*lines[: line + 1], *lines[line:]],
+                [*lines[:line], *lines[line + 1 :]],
+                lines[:line],
+                [*lines[:line], lines[line][:column] + piece + lines[line][column:], *lines[line + 1 :]],
+                [*lines[:line], lines[line].partition("=")[0] + "= " + piece, *lines[line + 1 :]],
+            )
+        ).map("\n".join)
+    )
 
 
 @contextmanager
@@ -146,18 +170,57 @@ def judge(status: int, document: dict[str, Any]) -> None:
         assert status == (0 if document["timing"]["holds"] else 1)
 
 
-@settings(
-    max_examples=EXAMPLES,
-    derandomize="RACK_CHECK_EXAMPLES" not in os.environ,
-    database=None,
-    deadline=None,
-    phases=(Phase.generate,),
-    suppress_health_check=list(HealthCheck),
-)
-@given(text=spoilt())
+@pytest.mark.timeout(600)  # a machine that is shared: the bound is processor time
 def test_a_spoilt_config_is_answered_in_time_with_what_is_wrong(
-    text: str, tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path_factory.getbasetemp() / "spoilt.toml"
-    path.write_text(text)
-    judge(*check(capsys, str(path)))
+    path, seen = tmp_path / "spoilt.toml", set()
+
+    @settings(
+        max_examples=EXAMPLES,
+        derandomize="RACK_CHECK_EXAMPLES" not in os.environ,
+        database=None,
+        deadline=None,
+        phases=(Phase.generate,),
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(text=spoilt())
+    def examine(text: str) -> None:
+        path.write_text(text)
+        status, document = check(capsys, str(path))
+        judge(status, document)
+        seen.add(status)
+
+    examine()
+    assert seen == {0, 1, 2}
+
+
+ATTACKS = {
+    "circle": ("nasrem", 'board.servo.below="primitive"', "board.primitive.below"),
+    "no clock": ("nasrem", "clock.period_ms=1e-6", "clock.period_ms"),
+    "no cycle": ("fig2", "board.level.every=1000000000000", "board.level.every"),
+    "much too fast": ("fig2", "clock.speed=1e300", "clock.speed"),
+    "much too slow": ("fig2", "clock.speed=1e-300", "clock.speed"),
+    "truth": ("fig2", "clock.period_ms=true", "clock.period_ms"),
+    "text": ("fig2", 'board.level.params.process_ms="lock"', "board.level.params.process_ms"),
+    "unknown": ("fig2", "board.level.params.proces_ms=1", "board.level.params.proces_ms"),
+    "deep": ("fig2", f"task.x={'[' * 1000}{']' * 1000}", "--set"),
+    "deep keys": ("fig2", f"task{'.a' * 1000}=1", "--set"),
+    "digits": ("fig2", f"seed={'9' * 4000}", "--set"),
+}
+
+
+@pytest.mark.parametrize(("rack", "setting", "place"), ATTACKS.values(), ids=ATTACKS)
+def test_what_made_rack_check_hang_or_fall_is_a_mistake_on_one_line(
+    capsys: pytest.CaptureFixture[str], rack: str, setting: str, place: str
+) -> None:
+    status, document = check(capsys, rack, "--set", setting)
+    judge(status, document)
+    assert [line.startswith(f"{place} ") for line in document["error"]] == [True]
+
+
+def test_the_longest_cycles_and_plans_there_are_are_judged_in_time(capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ("clock.period_ms=0.01", "timing.clock_ms=0.009999", "board.level.every=1000000")
+    slow = ("board.level.core=0", "board.level.within_cycles=10000", "board.level.budget.process_ms=0.5")
+    status, document = check(capsys, "fig2", *(word for setting in (*settings, *slow) for word in ("--set", setting)))
+    assert (status, document["timing"]["holds"]) == (1, False)

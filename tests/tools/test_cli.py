@@ -42,6 +42,13 @@ def test_a_name_that_no_file_can_have_is_refused_in_one_line(arguments: tuple[st
     assert "aaaaaaaa" in done.stderr
 
 
+@pytest.mark.parametrize("seconds", ["inf", "nan", "1e300", "-1"])
+def test_no_run_lasts_for_ever_or_less_than_nothing(seconds: str) -> None:
+    done = rack("run", "fig2", "--lockstep", "--no-record", "--seconds", seconds)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "Invalid value for '--seconds'" in done.stderr
+
+
 def test_bytes_that_are_no_text_are_refused() -> None:
     command = [sys.executable, "-m", "tools.cli", "check", b"\xff"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)

@@ -161,3 +161,11 @@ def test_a_rack_without_budgets_has_no_schedule(tmp_path: Path) -> None:
 def test_a_run_cannot_be_asked_for_what_it_does_not_have(run: Path) -> None:
     assert "outside the run, which lasts from 0 to 160 ms" in rack(run, "--from-ms", 500).stderr
     assert "is a run, and its config is what it was" in rack(run, "--set", "clock.speed=2").stderr
+
+
+def test_a_schedule_without_end_is_refused_in_one_line() -> None:
+    settings = ("clock.period_ms=0.01", "timing.clock_ms=0.001", "board.level.every=1000000")
+    done = rack("fig2", *(word for setting in settings for word in ("--set", setting)))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("no schedule: 10 slices of the slowest task, 20000 ms each, hold ")
+    assert len(done.stderr.splitlines()) == 1

@@ -77,7 +77,7 @@ def switch(as_json: Json = False) -> None:
 @bench.command()
 def partition(
     config: Config = "nasrem",
-    seconds: Annotated[float, typer.Option(min=1.0, help="simulated time of one run, s")] = 15.0,
+    seconds: Annotated[float, typer.Option(min=1.0, max=1e9, help="simulated time of one run, s")] = 15.0,
     rounds: Annotated[int, typer.Option(min=1, help="runs of each partition, interleaved")] = 2,
     as_json: Json = False,
 ) -> None:

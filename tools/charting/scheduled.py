@@ -18,6 +18,8 @@ from tools.charting.patterns import Detail, patterns
 
 SLICES = 10
 """Slices of the slowest task over which patterns are counted, at least."""
+MOST_CYCLES = 1_000_000
+"""Cycles of all tasks that are worked out, at most: a minute of work."""
 
 
 class Schedule:
@@ -51,6 +53,9 @@ class Schedule:
         longest = max(task.period_ns for task in self.tasks)
         counted_ns = SLICES * longest
         until = max(end_ns - skipped, counted_ns + longest)
+        if (jobs := sum(until // task.period_ns for task in self.tasks)) > MOST_CYCLES:
+            why = f"{SLICES} slices of the slowest task, {longest * 1e-6:g} ms each, hold {jobs} cycles of all"
+            raise Failure(f"no schedule: {why}; at most {MOST_CYCLES} are worked out", 2)
         chart = simulate(self.tasks, until, self.switch_ns, self._variants)
         lanes = lanes_of(self.tasks)
         detail = Detail(gap_ns=2 * self.switch_ns)

@@ -63,12 +63,14 @@ def longest_cycles(config: RackConfig) -> dict[str, float]:
     with the board. A board outside of all has its own.
     """
     found = {name: float(config.every(name)) for name in config.board}
-    ways, goal_ms = chains(config), config.timing.response_ms
-    for chain in ways if goal_ms is None else ():
-        together = {name for other in ways if other[0] == chain[0] for name in other}
-        found |= dict.fromkeys(chain, float(max(config.every(name) for name in together)))
-    for chain in sorted(ways, key=len) if goal_ms is not None else ():
-        found |= dict.fromkeys(chain, goal_ms / config.clock.period_ms / len(chain))
+    ways, goal_ms = sorted(chains(config), key=len), config.timing.response_ms
+    for chain in ways:
+        if goal_ms is None:
+            together = {name for other in ways if other[0] == chain[0] for name in other}
+            longest = float(max(config.every(name) for name in together))
+        else:
+            longest = goal_ms / config.clock.period_ms / len(chain)
+        found |= dict.fromkeys(chain, longest)
     return found
 
 
