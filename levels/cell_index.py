@@ -13,7 +13,7 @@ from levels.mjcf import compile_spec, load_spec
 from levels.motors import listed
 from levels.robot import RobotConfig
 from levels.scene import SceneConfig
-from levels.touches import below, geoms_of
+from levels.touches import below
 
 NOUNS = {
     mujoco.mjtObj.mjOBJ_SITE: "site",
