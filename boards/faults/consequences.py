@@ -52,7 +52,7 @@ CONSEQUENCES: Mapping[str, Consequence] = {
     "clock-stop": Consequence(reactions=("restart",), ends_process=True),
     "drop": Consequence(own=(Alarm.MUTE,)),
     # The first messages on time overtake the last ones held back.
-    "delay": Consequence(own=(Alarm.MUTE, Alarm.DISORDER)),
+    "delay": Consequence(own=(Alarm.DISORDER,)),
     "reorder": Consequence(own=(Alarm.MUTE, Alarm.HELD_BACK)),
     "corrupt": _DAMAGE,
     "babble": Consequence(own=(Alarm.DISORDER, Alarm.GAP)),

@@ -111,7 +111,8 @@ KINDS: tuple[Kind, ...] = (
         "delay",
         "writer",
         "messages are held back",
-        (Alarm.HELD_BACK,),
+        # Until the first comes there is none.
+        (Alarm.HELD_BACK, Alarm.MUTE),
         "the delay + 1 read",
         (Parameter("by", "cycles", "writer's cycles for which they are held", 2, 1, 50, is_whole=True),),
         takes_mailbox=True,

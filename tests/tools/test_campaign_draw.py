@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import tomllib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import pytest
@@ -15,16 +14,17 @@ import pytest
 from boards.config import load, wire
 from boards.config.schema import RackConfig
 from boards.faults.config import FaultConfig
+from boards.faults.consequences import recovery_ticks
 from boards.faults.kinds import KINDS, NUMBERS
 from boards.faults.request import cycle_ticks, injections
 from tools.answer import Failure
-from tools.campaign.draw import MOST, Course, Deck, fault_plans, kill_plans, size_plans
+from tools.campaign.draw import MOST, Course, fault_plans, kill_plans, needs_real_time, size_plans
 from tools.campaign.plan import EXTERNAL, Kill, Plan
 from tools.campaign.shape import SIZED, swept_sizes
 from tools.campaign.targets import Targets, kinds_for
 
 BOTH = (True, False)
-MODES = [BOTH[place % 2] for place in range(60)]
+COUNT = 10
 TICKS, SECOND = 11_000, 400.0
 
 
@@ -43,40 +43,70 @@ def kinds(course: Course) -> list[str]:
     return kinds_for(None, course.targets, lockstep=True, realtime=True)
 
 
+def drawn(course: Course, kinds: Sequence[str], seed: str, lockstep: bool) -> list[Plan]:
+    fitting = [kind for kind in kinds if not (lockstep and needs_real_time(kind))]
+    return fault_plans(course, dict.fromkeys(fitting, COUNT), seed, lockstep, first=1)
+
+
 def test_the_same_seed_draws_the_same_plans(course: Course, kinds: list[str]) -> None:
-    plans = list(fault_plans(course, kinds, 7, MODES))
-    assert plans == list(fault_plans(course, kinds, 7, MODES))
-    assert plans != list(fault_plans(course, kinds, 8, MODES))
-    # A longer campaign begins as the shorter one does.
-    assert plans[:10] == list(fault_plans(course, kinds, 7, MODES[:10]))
+    plans = drawn(course, kinds, "7", True)
+    assert plans == drawn(course, kinds, "7", True)
+    assert plans != drawn(course, kinds, "8", True)
+    assert [plan.number for plan in plans] == list(range(1, len(plans) + 1))
 
 
 def test_every_plan_fits_its_rack(course: Course, kinds: list[str], config: RackConfig) -> None:
-    for plan in [*fault_plans(course, kinds, 3, MODES), *size_plans(course, kinds, 10, 3, 61)]:
+    for plan in [*drawn(course, kinds, "3", True), *drawn(course, kinds, "3", False)]:
         found = injections(plan.config(config, "other"), course.targets.layout)
         assert len(found) == len(plan.faults)
+    assert size_plans(course, kinds, 10, 3, 61)[0].number == 61
 
 
-def test_every_kind_that_the_rack_can_have_is_drawn(course: Course, kinds: list[str]) -> None:
-    drawn = Counter(table["kind"] for plan in fault_plans(course, kinds, 1, MODES) for table in plan.faults)
-    assert set(drawn) | {EXTERNAL} == set(kinds)
+@pytest.mark.parametrize("lockstep", BOTH)
+def test_every_kind_is_drawn_as_often_as_asked_for(course: Course, kinds: list[str], lockstep: bool) -> None:
+    plans = drawn(course, kinds, "1", lockstep)
+    found = Counter(table["kind"] for plan in plans for table in plan.faults)
+    found[EXTERNAL] += sum(len(plan.kills) for plan in plans)
+    wanted = [kind for kind in kinds if not (lockstep and needs_real_time(kind))]
+    assert +found == Counter(dict.fromkeys(wanted, COUNT))
     # Nothing of the default rack has protocol lock.
     assert set(NUMBERS) - set(kinds) == {"lock-held"}
 
 
-def test_what_needs_real_time_is_not_drawn_in_lockstep(course: Course, kinds: list[str]) -> None:
-    drawn = {t["kind"] for p in fault_plans(course, kinds, 1, MODES) if p.lockstep for t in p.faults}
-    assert not [kind for kind in drawn if KINDS[NUMBERS[kind]].realtime]
+def test_what_needs_real_time_is_no_matter_of_lockstep() -> None:
+    assert needs_real_time("hog")
+    # How soon a death is seen is a matter of time.
+    assert needs_real_time(EXTERNAL)
+    assert not needs_real_time("kill")
 
 
-def test_faults_of_a_trial_follow_each_other_with_time_to_recover(course: Course, kinds: list[str]) -> None:
-    for plan in fault_plans(course, kinds, 2, MODES):
+@pytest.mark.parametrize("lockstep", BOTH)
+def test_faults_of_a_trial_follow_each_other_with_time_to_recover(
+    course: Course, kinds: list[str], lockstep: bool
+) -> None:
+    plans = drawn(course, kinds, "2", lockstep)
+    for plan in plans:
         assert 1 <= len(plan.faults) + len(plan.kills) <= MOST
-        ends = [(t.get("tick", 0), t.get("tick", 0) + _lasts(t)) for t in plan.faults]
-        ends += [(kill.tick, kill.tick) for kill in plan.kills]
+        ends = [
+            (t.get("tick", 0), t.get("tick", 0) + _lasts(t) + _undone(t["kind"], t["board"], course))
+            for t in plan.faults
+        ]
+        ends += [(kill.tick, kill.tick + _undone("kill", kill.board, course)) for kill in plan.kills]
         ends.sort()
-        assert all(later[0] - earlier[1] > SECOND for earlier, later in pairwise(ends))
+        assert all(later[0] > earlier[1] for earlier, later in pairwise(ends))
         assert ends[-1][0] <= TICKS
+    # Trials are as full as they can be: a campaign is long enough as it is.
+    assert max(len(plan.faults) + len(plan.kills) for plan in plans) > 8
+
+
+def _undone(kind: str, board: str, course: Course) -> int:
+    return recovery_ticks(kind, board, course.targets.layout, course.restart_s)
+
+
+def test_a_mailbox_is_struck_again_only_where_its_readers_would_tell_of_it_again(course: Course) -> None:
+    for plan in drawn(course, ["drop", "corrupt"], "5", True):
+        struck = Counter(table["mailbox"] for table in plan.faults)
+        assert not [box for box, count in struck.items() if box.startswith(("task.", "elemental")) and count > 1]
 
 
 def _lasts(table: Mapping[str, Any]) -> int:
@@ -85,13 +115,13 @@ def _lasts(table: Mapping[str, Any]) -> int:
 
 
 def test_a_board_that_fails_its_start_has_a_trial_of_its_own(course: Course, kinds: list[str]) -> None:
-    plans = [p for p in fault_plans(course, kinds, 2, MODES) if any(t["kind"] == "self-test" for t in p.faults)]
+    plans = [p for p in drawn(course, kinds, "2", True) if any(t["kind"] == "self-test" for t in p.faults)]
     assert plans
     assert all(len(plan.faults) == 1 and not plan.kills for plan in plans)
 
 
 def test_faults_strike_at_phases_of_the_tick_in_real_time_alone(course: Course, kinds: list[str]) -> None:
-    plans = list(fault_plans(course, kinds, 2, MODES))
+    plans = [*drawn(course, kinds, "2", True), *drawn(course, kinds, "2", False)]
     phased = [table for plan in plans if not plan.lockstep for table in plan.faults if "phase" in table]
     assert len({table["phase"] for table in phased}) > 5
     assert all(KINDS[NUMBERS[table["kind"]]].takes_phase for table in phased)
@@ -109,17 +139,11 @@ def test_only_mailboxes_that_somebody_reads_are_struck(small: Path) -> None:
 
 def test_a_muted_mailbox_stays_mute_for_longer_than_its_bound(course: Course) -> None:
     layout = course.targets.layout
-    for plan in fault_plans(course, ["mute"], 4, MODES):
+    for plan in drawn(course, ["mute"], "4", True):
         for table in plan.faults:
             readers = layout.mailbox(table["mailbox"]).readers
             bound = 2 * cycle_ticks(layout, table["board"]) + min(cycle_ticks(layout, r) for r in readers)
-            assert table["for"] * SECOND >= 2 * bound - 1
-
-
-def test_a_deck_deals_each_kind_as_often_as_any_other() -> None:
-    deck = Deck(["kill", "hang", "mute"], Random(1))
-    dealt = Counter(kind for _ in range(9) for kind in deck.deal(4))
-    assert set(dealt.values()) == {12}
+            assert table["for"] * SECOND >= bound
 
 
 def test_kills_from_outside_are_as_many_as_asked_for_and_apart(course: Course) -> None:

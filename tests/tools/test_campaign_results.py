@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +12,7 @@ from boards.outcome import Cause, Outcome
 from tests.tools.campaign_events import LAYOUT, event, found, strike
 from tools.campaign.ending import Arm, Strike
 from tools.campaign.plan import Plan
-from tools.campaign.results import Faultless, Judged, Results, misses_of
+from tools.campaign.results import Faultless, Judged, Results, keep, kept, misses_of
 from tools.campaign.trial import Trial
 
 FAULT = strike("mute", "lower", 100, 150)
@@ -55,6 +56,18 @@ def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_noth
             trial(found(140, "mute", "upper", "lower.status")),
             "mute of lower.status, struck at tick 100: mute by upper after 40 ticks; bound 10",
         ),
+        (
+            trial(SEEN, event(110, "reaction", "restart", "lower")),
+            "mute of lower.status, struck at tick 100: restart never undone; bound 150",
+        ),
+        (
+            trial(found(100, "command_invalid", "lower"), strikes=(strike("command-nan", "lower", 100, 110),)),
+            "command-nan of lower, struck at tick 100: no brakes closed follows",
+        ),
+        (
+            replace(trial(SEEN), outcome=outcome("task refused", "level 'lower': blocked")),
+            "the task is not done, and no fault had to end it: task refused; level 'lower': blocked",
+        ),
         (replace(trial(SEEN), arm=Arm(violations=3)), "limits violated at 3 substeps"),
         (replace(trial(SEEN), left=("process 7 (x:servo)",)), "left behind: process 7 (x:servo)"),
         (trial(SEEN, found(9000, "gap", "upper", "lower.status")), "upper: gap: no fault explains it (tick 9000)"),
@@ -95,18 +108,28 @@ def test_a_rack_that_does_not_launch_without_a_reason_falls_short() -> None:
 
 def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
     calm = [
-        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())),
-        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())),
+        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())).finding(),
+        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())).finding(),
     ]
-    document = Faultless(2, 1800.0, tuple(calm)).document()
-    assert (document["trips"], document["trips_per_hour"]) == (1, 2.0)
-    assert document["misses"] == misses_of([judged.trial for judged in calm]) == {"late": 2}
+    document = Faultless("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm)).document()
+    # One in half an hour: below 4.74 in that time, with 95 %.
+    assert (document["trips"], document["trips_per_hour"]) == (1, {"an_hour": 2.0, "below": 9.488})
+    assert document["misses"] == misses_of(calm) == {"late": 2}
     assert [event["code"] for event in document["tripped"]] == ["stale"]
+    assert [run.stray_misses for run in calm] == [2, 0]
 
 
 def test_what_any_run_breaks_counts_whatever_the_run_is_for() -> None:
-    nominal = Judged.of(trial(strikes=()))
-    swept = Judged.of(replace(trial(SEEN), arm=Arm(violations=2)))
-    results = Results(nominal, trials=[Judged.of(trial(SEEN))], sizes=[swept])
-    assert sum(judged.trial.arm.violations for judged in results.runs) == 2
+    nominal = Judged.of(trial(strikes=())).finding()
+    swept = Judged.of(replace(trial(SEEN), arm=Arm(violations=2))).finding()
+    results = Results(nominal, trials=[Judged.of(trial(SEEN)).finding()], sizes=[swept])
+    assert sum(run.violations for run in results.runs) == 2
     assert len(results.faults) == 1
+
+
+def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+    judged, path = Judged.of(trial(SEEN, found(9000, "gap", "upper", "lower.status"))), tmp_path / "trials" / "1.json"
+    assert kept(path) is None
+    keep(judged, path)
+    assert kept(path) == judged.finding()
+    assert [file.name for file in path.parent.iterdir()] == ["1.json"]

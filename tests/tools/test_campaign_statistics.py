@@ -8,7 +8,7 @@ from typing import Any
 from tests.tools.campaign_events import TICK_NS
 from tools.campaign.judge import Judgement
 from tools.campaign.plan import EXTERNAL
-from tools.campaign.statistics import by_kind, curve, part_of_bound, spread, totals
+from tools.campaign.statistics import by_kind, curve, part_of_bound, rate, spread, totals, wilson
 
 FOUND = Judgement(
     kind="mute",
@@ -83,3 +83,27 @@ def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
 def test_nothing_has_no_median() -> None:
     assert spread([]) is None
     assert by_kind([judgement(delay=None)], TICK_NS)["mute"]["ticks"] is None
+
+
+def test_bounds_of_a_share_are_wilsons() -> None:
+    # As in any table of them.
+    assert wilson(100, 100) == (0.963007, 1.0)
+    assert wilson(5, 10) == (0.236593, 0.763407)
+    assert wilson(0, 10) == (0.0, 0.277533)
+    assert wilson(0, 0) is None
+
+
+def test_a_rate_stays_below_what_so_few_events_leave_possible() -> None:
+    # Three in as much time as there was, with 95 %, is what none seen permits.
+    assert rate(0, 3600.0) == {"an_hour": 0.0, "below": 2.996}
+    assert rate(2, 7200.0) == {"an_hour": 1.0, "below": 3.148}
+    assert rate(0, 0.0) is None
+
+
+def test_every_share_of_a_kind_has_its_bounds() -> None:
+    faults = [judgement(), judgement(delay=12), judgement(is_recovered=False)]
+    assert by_kind(faults, TICK_NS)["mute"]["wilson"] == {
+        "detected": wilson(3, 3),
+        "within_bound": wilson(2, 3),
+        "recovered": wilson(2, 3),
+    }

@@ -97,8 +97,9 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
 
 class _Judge:
     def __init__(self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> None:
-        self._strikes = sorted(strikes, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
         self._events, self._run, self._layout = events, run, run.layout
+        shown = [_shown(strike, events) for strike in strikes]
+        self._strikes = sorted(shown, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
         self._bound = _bound_in(run.layout)
         self._left_out = LeftOut(events)
         self._last = max((event.tick for event in events), default=0)
@@ -121,6 +122,9 @@ class _Judge:
     def _window(self, strike: Strike) -> tuple[int, int]:
         """Return the first and the last tick in which an event may come of a fault."""
         first = strike.tick if strike.tick >= 0 else strike.began
+        if _takes_mailbox(strike) and self._layout.task(strike.board).role == "planner":
+            # Its writer may be the one to find what is wrong with a plan, when it makes the next.
+            return first - 1, self._last
         over = max(self._ends(strike), first + (self._bound(strike, None) or 0))
         undone = recovery_ticks(table_kind(strike.kind), strike.board, self._layout, self._run.restart_s)
         return first - 1, over + undone + last_read(strike.mailboxes, self._layout) + self._settle
@@ -156,9 +160,8 @@ class _Judge:
 
     def _horizon(self, place: int, last: int) -> int:
         """Return the tick up to which reactions are of this fault: the next one strikes then, or it is long over."""
-        # One that was too slight to count may have been reacted to all the same.
-        begins = [s.tick if s.tick >= 0 else s.began for s in self._strikes]
-        return min([*(tick for tick in begins[place + 1 :] if tick > begins[place]), last + 1])
+        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick]
+        return min([*later, last + 1])
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
         after = aftermath(strike, self._events, horizon)
@@ -207,13 +210,23 @@ class _Judge:
         if event.kind not in ("detection", "died", "miss"):
             return False
         around = [s for s, (first, last) in zip(self._strikes, windows, strict=True) if first <= event.tick <= last]
-        return not any(_explains(strike, event) for strike in around if strike.began >= 0)
+        return not any(_explains(strike, event) for strike in around if strike.tick >= 0)
+
+
+def _shown(strike: Strike, events: Sequence[Event]) -> Strike:
+    """Return a fault of the arm as having struck, at the latest, when it was found.
+
+    One counts as acting from a certain difference to the truth on; who finds a smaller one is right as well.
+    """
+    if strike.began < 0 or KINDS[NUMBERS[table_kind(strike.kind)]].where != "arm":
+        return strike
+    begun = replace(strike, tick=strike.began)
+    last = strike.tick if strike.tick >= 0 else strike.ends
+    found = min((e.tick for e in events if fits(e, begun) and (last < 0 or e.tick <= last)), default=strike.tick)
+    return strike if found == strike.tick else replace(strike, tick=found, count=max(1, strike.count))
 
 
 def _explains(strike: Strike, event: Event) -> bool:
-    if strike.tick < 0:
-        # It was too slight to count as an injection, and may have been found all the same.
-        return fits(event, replace(strike, tick=strike.began))
     # Whoever takes one task's cycles may take those of any task on its core.
     return takes_cycles(strike) if event.kind == "miss" else explains(strike, event)
 

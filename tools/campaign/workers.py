@@ -74,7 +74,8 @@ class Workers:
                     line.send((busy[line], set(self._cores) if alone else {self._cores[place]}))
             if not busy:
                 return
-            for line in wait(list(busy), LOOK_S):
+            ready: list[Any] = wait(list(busy), LOOK_S)
+            for line in ready:
                 yield self._done(line, busy.pop(line))
             if self._interrupt.is_set:
                 waiting.clear()
