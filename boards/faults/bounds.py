@@ -94,7 +94,8 @@ BOUNDS: Mapping[str, Callable[[_Case], int]] = {
     "sensor-stuck": _cycles(20),
     "sensor-dropout": _cycles(2),
     "actuator-off": _cycles(5),
-    "actuator-saturated": _cycles(5),
+    # What it gives is like a load that pulls, until it is told more and gives no more.
+    "actuator-saturated": _cycles(20),
     # At the gate, in the same cycle: they never reach the arm.
     "command-nan": _cycles(0),
     "command-limit": _cycles(0),
@@ -137,6 +138,6 @@ def _first_read(mailboxes: tuple[MailboxSpec, ...], layout: Layout) -> int:
 
 
 def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
-    """Return the cycle of the slowest reader of these mailboxes: so long after a fault one may still find traces."""
-    readers = (reader for name in mailboxes for reader in layout.mailbox(name).readers)
-    return max((cycle_ticks(layout, reader) for reader in readers), default=0)
+    """Return the ticks from the last message of these mailboxes to its slowest reader: until then traces are found."""
+    boxes = [layout.mailbox(name) for name in mailboxes]
+    return max((box.delay + cycle_ticks(layout, reader) for box in boxes for reader in box.readers), default=0)

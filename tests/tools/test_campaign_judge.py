@@ -207,11 +207,19 @@ def test_a_fault_explains_what_its_kind_leads_to_and_nothing_else(other: Event) 
 
 
 def test_a_fault_explains_nothing_after_its_window() -> None:
-    # Its bound, a cycle and two seconds and a quarter for a restart, a read by the slowest, and a quarter of a second.
-    late = found(100 + 2 + 1 + 900 + 8 + 100 + 1, "stale", "upper", "lower.status")
+    # Its bound, a cycle and two seconds and a quarter for a restart, the last message's way, a quarter of a second.
+    late = found(100 + 2 + 1 + 900 + (1 + 8) + 100 + 1, "stale", "upper", "lower.status")
     in_time = replace(late, tick=late.tick - 1)
     assert verdict([strike("kill", "lower", 100)], late).unexplained == (late,)
     assert verdict([strike("kill", "lower", 100)], in_time).unexplained == ()
+
+
+def test_what_a_planner_finds_has_the_tick_of_its_release_which_may_be_before_the_fault() -> None:
+    in_slice, before = found(97, "masquerade", "lower.planner", "lower.status"), found(90, "masquerade", "upper", "")
+    early = replace(in_slice, tick=94)
+    forged = strike("masquerade", "lower", 100)
+    assert verdict([forged], in_slice).unexplained == ()
+    assert verdict([forged], early, before).unexplained == (early, before)
 
 
 def test_a_sensor_at_fault_may_show_at_any_joint_but_is_found_only_at_its_own() -> None:
