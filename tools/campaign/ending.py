@@ -74,7 +74,10 @@ def levels_of(segment: Segment) -> str:
     """Return the state that each level was left in, with its reason, as one readable text."""
     told = []
     for box in segment.layout.mailboxes:
-        if not {"state", "reason"} <= {field.name for field in box.fields}:
+        # An arm's state, of the simulation, is no level's.
+        units = {field.name: field.unit for field in box.fields}
+        # An arm's state, that of its simulation, is no level's.
+        if units.get("state") != State.__name__ or "reason" not in units:
             continue
         if (status := open_observer(segment, box.name).peek()).is_there:
             state, reason = State(status.value.state).name.lower(), status.value.reason

@@ -22,7 +22,8 @@ def faults(recording: Recording, layout: Layout) -> Report:
     events = [Event(**event) for event in recording.events if "tick" in event]
     ended = next((event for event in recording.events if event["kind"] == "outcome"), {})
     strikes = [_strike(entry) for entry in ended.get("faults", [])]
-    verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0)))
+    is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
+    verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep))
     restarts = Counter(event.board for event in events if event.code == "restart")
     return {
         # Those that never struck come last.
@@ -42,6 +43,7 @@ def _row(found: Judgement, layout: Layout) -> Report:
     return {
         **asdict(found),
         "reactions": list(found.reactions),
+        "lacking": list(found.lacking),
         "delay_cycles": None if found.delay is None else round(found.delay / cycle, 3),
         "bound_cycles": None if found.bound is None else round(found.bound / cycle, 3),
         "recovery_ms": None if found.recovery is None else round(found.recovery * tick_ms, 6),
