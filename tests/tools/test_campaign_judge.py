@@ -214,7 +214,7 @@ def test_a_fault_explains_nothing_after_its_window() -> None:
     assert verdict([strike("kill", "lower", 100)], in_time).unexplained == ()
 
 
-def test_what_a_planner_finds_has_the_tick_of_its_release_which_may_be_before_the_fault() -> None:
+def test_what_a_task_finds_has_the_tick_of_its_release_which_may_be_before_the_fault() -> None:
     in_slice, before = found(97, "masquerade", "lower.planner", "lower.status"), found(90, "masquerade", "upper", "")
     early = replace(in_slice, tick=94)
     forged = strike("masquerade", "lower", 100)

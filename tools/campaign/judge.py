@@ -101,8 +101,7 @@ class _Judge:
         shown = [_shown(strike, events) for strike in strikes]
         self._strikes = sorted(shown, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
         self._bound = _bound_in(run.layout)
-        planners = [task.name for task in run.layout.tasks if task.role == "planner"]
-        self._slices = {name: cycle_ticks(run.layout, name) for name in planners}
+        self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
         self._left_out = LeftOut(events)
         self._last = max((event.tick for event in events), default=0)
         self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
@@ -211,8 +210,8 @@ class _Judge:
         """Say whether no fault explains a detection, a death or a miss."""
         if event.kind not in ("detection", "died", "miss"):
             return False
-        # A planner's event has the tick of its release, and may come of anything in its slice.
-        until = event.tick + self._slices.get(event.board, 0)
+        # What a task tells of has the tick of its release, and may come of anything until the end of its cycle.
+        until = event.tick + self._cycles.get(event.board, 1) - 1
         windowed = zip(self._strikes, windows, strict=True)
         around = [strike for strike, (first, last) in windowed if first <= until and event.tick <= last]
         return not any(_explains(strike, event) for strike in around if strike.tick >= 0)
