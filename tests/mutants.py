@@ -56,7 +56,7 @@ MUTANTS = (
         "corrupt",
         (
             (SLOTS, "self._words[_CRC] == crc32(self._crc_part)", "True"),
-            first("backplane/message_watch.py", "def _is_damaged(self, serial: int) -> bool:", "return False"),
+            ("backplane/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
         ),
     ),
     Mutant(
@@ -87,7 +87,7 @@ MUTANTS = (
     Mutant(
         "violation counter",
         "violation counter",
-        (first("levels/arm/limit_monitor.py", "def _count(self, time_s: float) -> None:", "return"),),
+        (("levels/arm/limit_monitor.py", "self.count += int(steps.sum())", "self.count += 0"),),
     ),
 )
 KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation counter"))

@@ -138,7 +138,8 @@ class Campaign:
         for plan in plans:
             injections(plan.config(self._config, "campaign"), self.layout)
         self._number = max([self._number, *(plan.number for plan in plans)])
-        self._progress.total(self._guess_s(plans))
+        if plans:
+            self._progress.total(self._guess_s(plans))
         for lockstep in (True, False):
             jobs = [self._job(plan) for plan in plans if plan.lockstep is lockstep]
             jobs = [job for job in jobs if self._kept(job) is None]
