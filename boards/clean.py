@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
+
 from backplane import semaphores
 from backplane.byte_lock import ByteLock
 from backplane.errors import SegmentError
@@ -45,6 +48,17 @@ def _remove(segment: Segment) -> bool:
         return True
     finally:
         removal.close()
+
+
+def remove_own(rack: str | None = None) -> None:
+    """Remove the racks that this very process has launched, or one of them; whatever state they are in."""
+    for name in racks() if rack is None else [rack]:
+        with suppress(SegmentError):
+            segment = Segment.open(name)
+            if segment.launcher_is_alive and segment.launcher == os.getpid():
+                semaphores.unlink_all(name)
+                unlink(name)
+            segment.close()
 
 
 def clean() -> tuple[list[str], list[str]]:

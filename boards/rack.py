@@ -21,10 +21,10 @@ from backplane.errors import EmergencyStopError
 from backplane.fault_table import FaultTable
 from backplane.lines import UtilityLines
 from backplane.operator_table import OperatorTable, RequestEntry
-from backplane.segment import Segment, unlink
+from backplane.segment import Segment
 from backplane.words import Block, Run, System, TaskState
 from boards.alarm_watch import AlarmWatch, Heard
-from boards.clean import remove_dead
+from boards.clean import remove_dead, remove_own
 from boards.config import load
 from boards.config.schema import RackConfig
 from boards.crate_line import CrateLine
@@ -45,6 +45,8 @@ LAUNCH_S = 60.0
 UP = (TaskState.READY, TaskState.RUNNING)
 LEAVE_S = 2.0
 """Bound of the boards' own end."""
+STOP_S = 0.8
+"""Bound of an orderly stop: a clock that has not ended the run by then is not waited for."""
 
 
 class Rack:
@@ -64,6 +66,8 @@ class Rack:
         self._is_armed = False
         self._is_beyond_help = False
         self._cause: Cause | None = None
+        self._why_stopped = ""
+        self._stop_by: float | None = None
 
     @property
     def events(self) -> list[Event]:
@@ -172,7 +176,8 @@ class Rack:
         """Watch the boards for that long, or until something happens; False when the run is over."""
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
-            self._listen(deadline - time.monotonic())
+            self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
+            self._tell_stop()
             for line in self._line.printed():
                 self._journal.tell("printed", "", line)
             for heard in self._alarms.drain():
@@ -183,17 +188,24 @@ class Rack:
             self._recovery.advance()
             if not self._is_armed:
                 self._reset_latch()
-            if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help:
+            is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
+            if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help or is_late:
                 self._end()
             if time.monotonic() >= deadline:
                 break
         return self.outcome is None
 
     def stop(self, why: str) -> None:
-        """Have the run end at the next tick."""
+        """Have the run end at the next tick. May be called at any moment, by a signal's handler as well."""
+        self._why_stopped = self._why_stopped or why
         self._cause = self._cause or "stopped"
-        self._journal.tell("stop", "", why)
         self.segment.words[System.STOP_REQUEST] = 1
+        os.eventfd_write(self._line.attention, 1)
+
+    def _tell_stop(self) -> None:
+        if self._why_stopped and self._stop_by is None:
+            self._stop_by = time.monotonic() + STOP_S
+            self._journal.tell("stop", "", self._why_stopped)
 
     def command(self, level: str, what: str, tick: int | None = None, **goal: object) -> RequestEntry:
         """Hand an operator's command to a level, to be given at `tick`, or at once; return its entry in the table.
@@ -293,9 +305,9 @@ class Rack:
             # A crate that has no boards yet may still be importing for them.
             crate.close(LEAVE_S if self._pids else 0)
         finally:
+            # By its name: what interrupted the launch may have come before the segment was known here.
+            remove_own(self.config.name)
             if hasattr(self, "segment"):
-                semaphores.unlink(self.segment.layout)
-                unlink(self.segment.rack)
                 self.segment.close()
 
     def _has_lost(self) -> bool:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
+from tools.interrupt import INTERRUPT
 
 Lockstep = Annotated[bool, typer.Option("--lockstep", help="a tick begins when every task due has finished: exact")]
 Seconds = Annotated[
@@ -36,7 +37,8 @@ def run(
 ) -> None:
     """Run a rack until its task ends, and report on it.
 
-    The exit status is 0 when the task was done and no fault is latched.
+    The exit status is 0 when the task was done and no fault is latched; Ctrl-C ends the run in order, with a report
+    and 130.
     """
     from boards.config import load
     from tools.display import display_for
@@ -50,15 +52,18 @@ def run(
     overrides += [f"clock.speed={speed}"] if speed is not None else []
     found = load(config, overrides, faults)
     folder = None if no_record else folder_of(out, found.name)
-    with display_for(silent=as_json) as display:
-        result = run_rack(found, seconds, folder, display, view)
-    if folder is None:
-        report, text = result.document(), result.text()
-    else:
-        from tools.reporting.report import write_report
+    # From the start of the run to the end of its report; the launch in between ends at once.
+    with INTERRUPT.orderly():
+        with display_for(silent=as_json) as display:
+            result = run_rack(found, seconds, folder, display, view)
+        if folder is None:
+            report, text = result.document(), result.text()
+        else:
+            from tools.reporting.report import write_report
 
-        report, text = write_report(folder)
-    print_json(report) if as_json else print(text)
+            INTERRUPT.unfinished = f"no time for the report: 'rack report {folder}' makes it"
+            report, text = write_report(folder)
+        print_json(report) if as_json else print(text)
     if not result.worked:
         # Last, and by itself: whoever looks only at the end, or only at stderr, sees why.
         print(result.failure(), file=sys.stderr)

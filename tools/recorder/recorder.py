@@ -36,6 +36,7 @@ class Recorder:
         self._mailboxes = {mailbox.name: mailbox_ring(segment, mailbox.name) for mailbox in layout.mailboxes}
         self._cycles = CyclesFile(folder / "cycles.parquet")
         self._signals = SignalsFile(folder / "signals.parquet", layout)
+        self._is_stopped = False
         self._lost = dict.fromkeys([*self._traces, *self._mailboxes], 0)
         self._is_follower = not is_alive(self._words[System.FOLLOWER_PID])
         if self._is_follower:
@@ -74,9 +75,14 @@ class Recorder:
         watched = [] if until is None else [until]
         while not select.select(watched, [], [], period_s)[0]:
             self.drain()
-            if until is None and (self._words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive):
+            over = self._words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
+            if self._is_stopped or (until is None and over):
                 break
         self.drain()
+
+    def stop(self) -> None:
+        """Have `follow` return soon."""
+        self._is_stopped = True
 
     def close(self) -> None:
         """Finish both files; the rack goes on without a follower."""
