@@ -134,7 +134,7 @@ class Segment:
             )
         if self.words[Head.SIZE] != len(self.bytes):
             raise SegmentError(f"rack '{self.rack}': {len(self.bytes)} bytes; its head says {self.words[Head.SIZE]}")
-        self.layout = _layout(json.loads(self._text(Head.LAYOUT_AT)))
+        self.layout = layout_of(json.loads(self._text(Head.LAYOUT_AT)))
         self.config = self._text(Head.CONFIG_AT)
         self.map = AddressMap(self.layout)
 
@@ -214,7 +214,8 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
     return FieldSpec(**{**entry, "shape": shape, "fields": fields})
 
 
-def _layout(entry: dict[str, Any]) -> Layout:
+def layout_of(entry: dict[str, Any]) -> Layout:
+    """Return the layout that `dataclasses.asdict` has made plain data of."""
     boxes = [
         MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": tuple(_field(f) for f in m["fields"])})
         for m in entry["mailboxes"]

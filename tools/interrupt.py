@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BOUND_S = 1.7
@@ -30,16 +30,18 @@ class Interrupted(BaseException):
     """Raised where a command waits, so that it withdraws what it has asked for."""
 
 
-class Interrupt:
-    """The signals of this process. `number` is that of the first one received, 0 before it.
+class _Way(NamedTuple):
+    stop: Callable[[], object]
+    unfinished: str = ""
+    bound_s: float = BOUND_S
 
-    `unfinished` tells the user what to do about what could not be finished in time.
-    """
+
+class Interrupt:
+    """The signals of this process. `number` is that of the first one received, 0 before it."""
 
     def __init__(self) -> None:
         self.number = 0
-        self.unfinished = ""
-        self._ways: list[Callable[[], object]] = [self.end]
+        self._ways: list[_Way] = [_Way(self.end)]
 
     @property
     def name(self) -> str:
@@ -55,15 +57,20 @@ class Interrupt:
         signal.signal(signal.SIGALRM, lambda number, frame: self.end())
 
     @contextmanager
-    def orderly(self, stop: Callable[[], object] = lambda: None) -> Iterator[None]:
-        """While this lasts the first signal calls `stop`, in its handler; the command then comes to its own end."""
-        self._ways.append(stop)
+    def orderly(
+        self, stop: Callable[[], object] = lambda: None, unfinished: str = "", bound_s: float = BOUND_S
+    ) -> Iterator[None]:
+        """While this lasts the first signal calls `stop`, in its handler; the command then comes to its own end.
+
+        It has `bound_s` for that; `unfinished` tells the user what to do when that did not suffice.
+        """
+        self._ways.append(_Way(stop, unfinished, bound_s))
         try:
             if self.number:
                 stop()
             yield
         finally:
-            self._ways.remove(stop)
+            self._ways.pop()
 
     def at_once(self) -> AbstractContextManager[None]:
         """While this lasts a signal ends the process in its handler, also inside `orderly`."""
@@ -79,7 +86,7 @@ class Interrupt:
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):
                     stream.flush()
-            self.unfinished = ""
+            self._ways = [_Way(self.end)]
             self.end()
 
     def end(self) -> NoReturn:
@@ -93,8 +100,8 @@ class Interrupt:
         with suppress(OSError):
             if sys.stdout is not None and os.isatty(1):
                 os.write(1, SHOW_CURSOR)
-            if self.unfinished:
-                os.write(2, f"{self.unfinished}\n".encode())
+            if unfinished := self._ways[-1].unfinished:
+                os.write(2, f"{unfinished}\n".encode())
         os._exit(128 + self.number)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
@@ -103,8 +110,8 @@ class Interrupt:
         if self.number:
             self.end()
         self.number = number
-        signal.setitimer(signal.ITIMER_REAL, BOUND_S)
-        self._ways[-1]()
+        signal.setitimer(signal.ITIMER_REAL, self._ways[-1].bound_s)
+        self._ways[-1].stop()
 
 
 INTERRUPT = Interrupt()

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
 from tools.interrupt import INTERRUPT
+
+if TYPE_CHECKING:
+    from tools.running import RunResult
 
 Lockstep = Annotated[bool, typer.Option("--lockstep", help="a tick begins when every task due has finished: exact")]
 Seconds = Annotated[
@@ -43,7 +46,7 @@ def run(
     from boards.config import load
     from tools.display import display_for
     from tools.folders import folder_of
-    from tools.running import run_rack
+    from tools.running import NO_TIME, run_rack
 
     if view and no_record:
         raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
@@ -53,18 +56,23 @@ def run(
     found = load(config, overrides, faults)
     folder = None if no_record else folder_of(out, found.name)
     # From the start of the run to the end of its report; the launch in between ends at once.
-    with INTERRUPT.orderly():
+    with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:
             result = run_rack(found, seconds, folder, display, view)
-        if folder is None:
-            report, text = result.document(), result.text()
-        else:
-            from tools.reporting.report import write_report
-
-            INTERRUPT.unfinished = f"no time for the report: 'rack report {folder}' makes it"
-            report, text = write_report(folder)
+        report, text = (result.document(), result.text()) if folder is None else _report(folder, result)
         print_json(report) if as_json else print(text)
     if not result.worked:
         # Last, and by itself: whoever looks only at the end, or only at stderr, sees why.
         print(result.failure(), file=sys.stderr)
     sys.exit(0 if result.worked else 1)
+
+
+def _report(folder: Path, result: RunResult) -> tuple[dict[str, Any], str]:
+    """Make the report; a recording that cannot be read spoils no run."""
+    from tools.reporting.report import write_report
+
+    try:
+        return write_report(folder)
+    except Failure as failure:
+        print(f"no report: {failure}", file=sys.stderr)
+        return result.document(), result.text()

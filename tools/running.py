@@ -30,6 +30,10 @@ COUNTED = (
 )
 
 
+NO_TIME = "no time for the report: 'rack report {}' makes it"
+LATE = "the recorder has not begun yet: the run begins without it"
+
+
 @dataclass(frozen=True)
 class RunResult:
     """A run that has ended: its outcome, what every task's control block counted, and what was injected into it.
@@ -75,8 +79,8 @@ def run_rack(
 
     With `view` the recorder serves a viewer, whose window opens and may close at any time.
 
-    Raises what `Rack` raises, and `Failure` when the recorder cannot attach; a rack that did not get as far as
-    that leaves no folder.
+    Raises what `Rack` raises; a rack that could not be launched leaves no folder. What becomes of the recorder changes
+    nothing in how the run ends.
     """
     log = EventLog(display)
     sources: list[Callable[[], list[str]]] = []
@@ -85,14 +89,15 @@ def run_rack(
         with INTERRUPT.at_once():
             recorder = stack.enter_context(_recorder(folder))
             rack = stack.enter_context(Rack(config, log.add))
-        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received")):
+        unfinished = NO_TIME.format(folder) if folder else ""
+        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())
                 log.open(folder / "events.jsonl")
                 port = free_port() if view else None
-                if not recorder.attach(config.name, folder, port):
-                    raise Failure(recorder.finish())
+                if not recorder.attach(config.name, folder, port, rack.segment.words):
+                    log.add(Event(time.time_ns(), -1, "recorder", "", LATE))
                 sources = [recorder.told, *([] if port is None else [_window(port)])]
             started = time.monotonic()
             outcome = _watch(rack, seconds, display, lambda: _hear(sources, rack.segment, log))

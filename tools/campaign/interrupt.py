@@ -6,6 +6,9 @@ from contextlib import ExitStack
 
 from tools.interrupt import INTERRUPT
 
+BOUND_S = 30.0
+"""A report of hours of trials is worth more than 2 s; a second signal ends the campaign at once."""
+
 
 class Interrupt:
     """While its context lasts, the first signal asks for an end in order."""
@@ -19,7 +22,7 @@ class Interrupt:
         return INTERRUPT.number != 0
 
     def __enter__(self) -> Interrupt:
-        self._stack.enter_context(INTERRUPT.orderly())
+        self._stack.enter_context(INTERRUPT.orderly(bound_s=BOUND_S))
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -17,19 +17,21 @@ HOST = "127.0.0.1"
 
 
 class Window:
-    """A viewer that shows a recording's file, or what a recorder serves.
+    """A viewer that shows a recording's files, or what a recorder serves.
 
     Raises `Failure` when none is installed, or when there is no screen and `headless` does not ask for none.
     """
 
-    def __init__(self, source: str, headless: bool = False) -> None:
+    def __init__(self, *sources: str, headless: bool = False) -> None:
         if not (headless or has_screen()):
-            raise Failure(f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; where there is one: rerun {source}")
+            raise Failure(
+                f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; where there is one: rerun {' '.join(sources)}"
+            )
         # A file, no pipe: nobody reads what the viewer says while it is open.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window
         self._process = subprocess.Popen(
             # Without an address of its own the viewer would listen to every machine around.
-            [executable(), "--bind", HOST, source, *(["--headless"] if headless else [])],
+            [executable(), "--bind", HOST, *sources, *(["--headless"] if headless else [])],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._said,
