@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import mmap
 import os
+import stat
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -115,6 +116,8 @@ class Segment:
 
         Raises `SegmentError` when there is none, or it is another user's or no segment.
         """
+        if (kind := stranger(rack)) is not None:
+            raise SegmentError(f"rack '{rack}': {shm_path(rack)} is a {kind}, not a segment")
         try:
             shm = posix_ipc.SharedMemory(_shm_name(rack))
         except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
@@ -181,6 +184,16 @@ class Segment:
 def racks() -> list[str]:
     """Return the names of the racks that have a segment, whether they run or not."""
     return sorted(path.name.removeprefix(PREFIX) for path in SHM_FOLDER.glob(f"{PREFIX}*"))
+
+
+def stranger(rack: str) -> str | None:
+    """Return what stands under a rack's name that no rack has made, as in "directory"; None for a file, or nothing."""
+    try:
+        mode = shm_path(rack).lstat().st_mode
+    except FileNotFoundError:
+        return None
+    kinds = {stat.S_IFDIR: "directory", stat.S_IFLNK: "symbolic link"}
+    return None if stat.S_ISREG(mode) else kinds.get(stat.S_IFMT(mode), "special file")
 
 
 def unlink(rack: str) -> None:

@@ -8,20 +8,22 @@ from contextlib import suppress
 from backplane import semaphores
 from backplane.byte_lock import ByteLock
 from backplane.errors import SegmentError
-from backplane.segment import Segment, racks, unlink
+from backplane.segment import Segment, racks, stranger, unlink
 from backplane.words import Head
 
 
 def remove_dead(rack: str) -> bool:
     """Remove a rack's segment when nobody runs it; return whether there was one to remove.
 
-    Raises `SegmentError` when its launcher lives, or it is another user's.
+    Raises `SegmentError` when its launcher lives, or it is another user's, or no file at all.
     """
     if rack not in racks():
         return False
     try:
         segment = Segment.open(rack)
     except SegmentError:
+        if stranger(rack) is not None:
+            raise
         # Too small for a head: nobody can be running it.
         unlink(rack)
         return True
@@ -61,13 +63,13 @@ def remove_own(rack: str | None = None) -> None:
             segment.close()
 
 
-def clean() -> tuple[list[str], list[str]]:
-    """Remove every rack that nobody runs; return the names removed and the names in use."""
-    removed, in_use = [], []
+def clean() -> tuple[list[str], list[str], list[str]]:
+    """Remove every rack that nobody runs; return the names removed, those in use, and a line for what is no rack."""
+    removed, in_use, strange = [], [], []
     for rack in racks():
         try:
             if remove_dead(rack):
                 removed.append(rack)
-        except SegmentError:
-            in_use.append(rack)
-    return removed, in_use
+        except SegmentError as error:
+            strange.append(str(error)) if stranger(rack) is not None else in_use.append(rack)
+    return removed, in_use, strange

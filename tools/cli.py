@@ -81,6 +81,10 @@ def _run() -> None:
         commands()(prog_name="rack")
     except Failure as failure:
         fail(str(failure), failure.status)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        fail(f"{error.filename}: {error.strerror}", 1)
     except Exception as error:
         status_of_error = _status(error)
         if status_of_error is None:

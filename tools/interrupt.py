@@ -21,7 +21,7 @@ from typing import NamedTuple, NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BOUND_S = 1.7
 """From the first signal to the end of whatever is still being finished."""
-GONE_S = 0.2
+GONE_S = 0.25
 """Bound of the wait for killed children."""
 SHOW_CURSOR = b"\x1b[?25h\n"
 

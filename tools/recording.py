@@ -16,6 +16,8 @@ import pyarrow.parquet as pq
 
 from backplane.layout import Layout, MailboxSpec, TaskSpec
 from backplane.trace import RECORD
+from boards.config import RackConfig, loads
+from boards.errors import ConfigError
 from boards.events import Event
 from tools.answer import Failure
 from tools.recorder.files import mend
@@ -40,6 +42,15 @@ class Recording:
                 _say(f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and signals.parquet")
         self._cycles = self._open("cycles.parquet", ("task", "tick"))
         self._signals = self._open("signals.parquet", ("mailbox", *HEAD))
+
+    @cached_property
+    def rack_config(self) -> RackConfig:
+        """The resolved config. Raises `Failure`, with every mistake, when it is none."""
+        try:
+            return loads(self.config)
+        except ConfigError as error:
+            mistakes = "; ".join(str(error).splitlines())
+            raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
 
     def _open(self, name: str, columns: Sequence[str]) -> pq.ParquetFile:
         path = self._there(name)

@@ -55,6 +55,9 @@ def run(
     overrides += [f"clock.speed={speed}"] if speed is not None else []
     found = load(config, overrides, faults)
     folder = None if no_record else folder_of(out, found.name)
+    if folder is not None:
+        # Now, and not when somebody waits for the end.
+        import tools.reporting.report  # noqa: F401
     # From the start of the run to the end of its report; the launch in between ends at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:

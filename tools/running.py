@@ -89,8 +89,6 @@ def run_rack(
         with INTERRUPT.at_once():
             recorder = stack.enter_context(_recorder(folder))
             rack = stack.enter_context(Rack(config, log.add))
-        unfinished = NO_TIME.format(folder) if folder else ""
-        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())
@@ -99,6 +97,8 @@ def run_rack(
                 if not recorder.attach(config.name, folder, port, rack.segment.words):
                     log.add(Event(time.time_ns(), -1, "recorder", "", LATE))
                 sources = [recorder.told, *([] if port is None else [_window(port)])]
+        unfinished = NO_TIME.format(folder) if folder else ""
+        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             started = time.monotonic()
             outcome = _watch(rack, seconds, display, lambda: _hear(sources, rack.segment, log))
             wall_s, segment = time.monotonic() - started, rack.segment

@@ -9,7 +9,7 @@ from typing import Any
 
 from backplane.layout import Layout, TaskSpec
 from backplane.message import State
-from boards.config import RackConfig, loads
+from boards.config import RackConfig
 from tools.recording import Recording
 from tools.reporting.difference import first_difference
 from tools.reporting.faults import faults
@@ -40,7 +40,7 @@ def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str
 
 def report_of(recording: Recording) -> Report:
     """Return the report of a recorded run as plain data."""
-    config, layout = loads(recording.config), recording.layout
+    config, layout = recording.rack_config, recording.layout
     ended = next((event for event in recording.events if event["kind"] == "outcome"), {})
     outcome = ended.get("outcome", {})
     counted = ended.get("tasks", {})
