@@ -91,18 +91,20 @@ class Interrupt:
 
     def end(self) -> NoReturn:
         """Kill this process's children, remove its racks, and end, in this very moment."""
-        signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
-        _kill_family()
-        # Looked up, not imported: in a handler a module may be half imported. Without it there are no racks.
-        remove_own = getattr(sys.modules.get("boards.clean"), "remove_own", None)
-        if remove_own is not None:
-            remove_own()
-        with suppress(OSError):
-            if sys.stdout is not None and os.isatty(1):
-                os.write(1, SHOW_CURSOR)
-            if unfinished := self._ways[-1].unfinished:
-                os.write(2, f"{unfinished}\n".encode())
-        os._exit(128 + self.number)
+        try:
+            signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
+            for step in (_kill_family, _remove_racks, self._take_leave):
+                # One that fails must not keep the others from their work, nor the process from its end.
+                with suppress(Exception):
+                    step()
+        finally:
+            os._exit(128 + self.number)
+
+    def _take_leave(self) -> None:
+        if os.isatty(1):
+            os.write(1, SHOW_CURSOR)
+        if unfinished := self._ways[-1].unfinished:
+            os.write(2, f"{unfinished}\n".encode())
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGHUP:
@@ -147,9 +149,23 @@ def _kill_family() -> None:
 
 
 def _descendants(pid: int, session: int) -> Iterator[int]:
-    for children in Path(f"/proc/{pid}/task").glob("*/children"):
-        with suppress(FileNotFoundError, ProcessLookupError):
-            for child in map(int, children.read_text().split()):
+    for thread in _listed(Path(f"/proc/{pid}/task")):
+        with suppress(OSError):
+            for child in map(int, Path(f"/proc/{pid}/task/{thread}/children").read_text().split()):
                 if os.getsid(child) == session:
                     yield from _descendants(child, session)
                     yield child
+
+
+def _listed(folder: Path) -> list[str]:
+    # Of a process that ends meanwhile nothing is left.
+    with suppress(OSError):
+        return os.listdir(folder)
+    return []
+
+
+def _remove_racks() -> None:
+    # Looked up, not imported: in a handler a module may be half imported. Without it there are no racks.
+    remove_own = getattr(sys.modules.get("boards.clean"), "remove_own", None)
+    if remove_own is not None:
+        remove_own()
