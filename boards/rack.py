@@ -29,12 +29,13 @@ from boards.config import load
 from boards.config.schema import RackConfig
 from boards.crate_line import CrateLine
 from boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
-from boards.errors import LaunchError
+from boards.errors import ConfigError, LaunchError, Mistake
 from boards.events import Event
 from boards.faults.kinds import KINDS
 from boards.heartbeat import Heartbeat
 from boards.journal import Journal
 from boards.launch import Launch, modules
+from boards.neighbours import conflicts, holders, placed
 from boards.operating.request import asked, request, requests
 from boards.outcome import Cause, Outcome
 from boards.recovery import Recovery
@@ -43,6 +44,7 @@ from boards.supervision import Supervision
 LAUNCH_S = 60.0
 """Bound of the launch: a stranger's model with many meshes compiles for a while in every board."""
 UP = (TaskState.READY, TaskState.RUNNING)
+TO_SHARE = "stop that rack, choose other cores, or give --share"
 LEAVE_S = 2.0
 """Bound of the boards' own end."""
 STOP_S = 0.8
@@ -52,11 +54,13 @@ STOP_S = 0.8
 class Rack:
     """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
 
-    `on_event` is called with every `Event`, in the process of the caller.
+    `on_event` is called with every `Event`, in the process of the caller. Without `share` a launch is refused where
+    another rack's real-time boards hold a core that this one asks for; a program that launches several places them.
     """
 
-    def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None) -> None:
+    def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None, share: bool = True) -> None:
         self.config = config
+        self._share = share
         self.segment: Segment
         self.outcome: Outcome | None = None
         self._journal = Journal(on_event)
@@ -89,8 +93,8 @@ class Rack:
     def launch(self) -> None:
         """Power on every board but the clock, and wait until all have passed their self-tests.
 
-        Raises `ConfigError`, `SegmentError` when the name is in use, `LaunchError` when a board fails; nothing is
-        left then.
+        Raises `ConfigError` for a config, or cores, that cannot be, `SegmentError` when the name is in use, and
+        `LaunchError` when a board fails; nothing is left then.
         """
         try:
             self._power_on()
@@ -99,6 +103,11 @@ class Rack:
             raise
 
     def _power_on(self) -> None:
+        held = holders(self.config.name)
+        self.config, moved = placed(self.config, held)
+        shared = conflicts(self.config, held)
+        if shared and not self._share:
+            raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
         self._crate = crate = CrateLine()
         # The crate imports while the config is being wired: on two cores that is half a second saved.
         crate.send(Preload(modules(self.config), tuple(sys.path)))
@@ -115,8 +124,9 @@ class Rack:
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
         self._await_ready()
+        plan.check_realtime(self.segment)
         self._inject()
-        for note in plan.notes(self.segment):
+        for note in (*moved, *shared, *plan.notes(self.segment)):
             self._journal.tell("ready", "", note)
 
     def _set_words(self) -> None:

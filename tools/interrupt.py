@@ -149,19 +149,16 @@ def _kill_family() -> None:
 
 
 def _descendants(pid: int, session: int) -> Iterator[int]:
-    for thread in _listed(Path(f"/proc/{pid}/task")):
-        with suppress(OSError):
-            for child in map(int, Path(f"/proc/{pid}/task/{thread}/children").read_text().split()):
-                if os.getsid(child) == session:
-                    yield from _descendants(child, session)
-                    yield child
-
-
-def _listed(folder: Path) -> list[str]:
-    # Of a process that ends meanwhile nothing is left.
+    # Of a process that ends meanwhile nothing is left to read.
+    children: list[int] = []
     with suppress(OSError):
-        return os.listdir(folder)
-    return []
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            children += map(int, (thread / "children").read_text().split())
+    for child in children:
+        with suppress(OSError):
+            if os.getsid(child) == session:
+                yield from _descendants(child, session)
+                yield child
 
 
 def _remove_racks() -> None:

@@ -22,6 +22,7 @@ from boards.events import Event
 from tools.answer import Failure
 from tools.recorder.files import mend
 from tools.recorder.signals import HEAD
+from tools.recorder.steal import Stolen
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """What damaged files, and files of something else, make of their reading."""
@@ -107,6 +108,13 @@ class Recording:
         with _naming(self.folder):
             texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
             return {name: count for text in texts for name, count in json.loads(text).items()}
+
+    @cached_property
+    def stolen(self) -> list[Stolen]:
+        """When the hypervisor had a core, earliest first; nothing where the recorder did not look, or was killed."""
+        with _naming(self.folder / "cycles.parquet"):
+            found = json.loads(self._cycles.metadata.metadata.get(b"stolen", b"[]"))
+            return [Stolen(*map(int, entry)) for entry in found]
 
     @property
     def columns(self) -> list[str]:

@@ -23,6 +23,9 @@ Speed = Annotated[
 ]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
+Share = Annotated[
+    bool, typer.Option("--share", help="run on cores that another rack's real-time boards hold, too: both will be late")
+]
 NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
 
 
@@ -36,6 +39,7 @@ def run(
     out: Out = None,
     no_record: NoRecord = False,
     view: View = False,
+    share: Share = False,
     as_json: Json = False,
 ) -> None:
     """Run a rack until its task ends, and report on it.
@@ -61,7 +65,7 @@ def run(
     # From the start of the run to the end of its report; the launch in between ends at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:
-            result = run_rack(found, seconds, folder, display, view)
+            result = run_rack(found, seconds, folder, display, view, share)
         report, text = (result.document(), result.text()) if folder is None else _report(folder, result)
         print_json(report) if as_json else print(text)
     if not result.worked:

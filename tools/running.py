@@ -73,11 +73,16 @@ class RunResult:
 
 
 def run_rack(
-    config: RackConfig, seconds: float | None, folder: Path | None, display: Display, view: bool = False
+    config: RackConfig,
+    seconds: float | None,
+    folder: Path | None,
+    display: Display,
+    view: bool = False,
+    share: bool = True,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`, if there is one.
 
-    With `view` the recorder serves a viewer, whose window opens and may close at any time.
+    `share` is as in `Rack`. With `view` the recorder serves a viewer, whose window opens and may close at any time.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. What becomes of the recorder changes
     nothing in how the run ends.
@@ -88,7 +93,7 @@ def run_rack(
         # Nothing is worth keeping before the run has begun.
         with INTERRUPT.at_once():
             recorder = stack.enter_context(_recorder(folder))
-            rack = stack.enter_context(Rack(config, log.add))
+            rack = stack.enter_context(Rack(config, log.add, share))
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())

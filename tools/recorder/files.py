@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from backplane.layout import Layout
 from tools.recorder.cycles import CyclesFile
 from tools.recorder.signals import SignalsFile
 from tools.recorder.spool import NAME, Frame, read
+from tools.recorder.steal import Stolen
 
 CYCLES, SIGNALS = "cycles.parquet", "signals.parquet"
 MENDED = "-mended"
@@ -36,10 +38,10 @@ class RunFiles:
         self.lost[name] += lost
         self.taken[name] += lost + len(rows)
 
-    def close(self) -> None:
-        """Finish both."""
+    def close(self, stolen: Sequence[Stolen] = ()) -> None:
+        """Finish both; the trace keeps the time that was stolen from its cores."""
         tasks = set(self.tasks)
-        self._cycles.close({name: count for name, count in self.lost.items() if name in tasks})
+        self._cycles.close({name: count for name, count in self.lost.items() if name in tasks}, stolen)
         self._signals.close({name: count for name, count in self.lost.items() if name not in tasks})
 
 

@@ -16,6 +16,7 @@ from backplane.words import Run, System
 from tools.recorder.files import RunFiles
 from tools.recorder.side_sink import Sink
 from tools.recorder.spool import Frame, Spool
+from tools.recorder.steal import StealMeter
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
@@ -41,6 +42,8 @@ class Recorder:
         self._rings = traces | mailboxes
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)
+        # In lockstep nothing is late.
+        self._steal = None if self._words[System.LOCKSTEP] else StealMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         self._is_follower = follower == os.getpid() or not is_alive(follower)
@@ -64,6 +67,8 @@ class Recorder:
             elif self._beside is not None:
                 self._beside.add_signals(name, rows)
         self._spool.flush()
+        if self._steal is not None:
+            self._steal.look()
         if self._beside is not None:
             self._beside.advance(tick, self._files.lost)
         self._follow_from(tick)
@@ -94,7 +99,7 @@ class Recorder:
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
         self._spool.flush(now=True)
-        self._files.close()
+        self._files.close([] if self._steal is None else self._steal.stolen)
         self._spool.remove()
         if self._beside is not None:
             self._beside.close(self._words[System.TICK] + 1, self._files.lost)

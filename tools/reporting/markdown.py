@@ -32,6 +32,8 @@ def _lines(report: Report) -> Iterator[str]:
         f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
     )
     yield from (f"- fault: {fault}" for fault in outcome["faults"])
+    yield from (f"- {note}" for note in report["notes"])
+    yield from _steal(report["steal"])
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
     yield from (f"- {count} rows of {name} were lost" for name, count in report["rows_lost"].items())
@@ -45,6 +47,15 @@ def _lines(report: Report) -> Iterator[str]:
     yield from _faults(report)
     yield from _misses(report["misses"])
     yield from _response(report["system_response"])
+
+
+def _steal(steal: Report) -> Iterator[str]:
+    """Say which misses are not the rack's own."""
+    if steal["ms"]:
+        cores = ", ".join(f"core {core} {ms} ms" for core, ms in steal["ms"].items())
+        yield (
+            f"- {steal['missed_during']} of {steal['missed']} misses while the hypervisor had the core; stolen: {cores}"
+        )
 
 
 def _against(against: Report | None) -> Iterator[str]:

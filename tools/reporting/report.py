@@ -17,6 +17,7 @@ from tools.reporting.markdown import markdown
 from tools.reporting.misses import misses
 from tools.reporting.motion import motion
 from tools.reporting.response import system_response
+from tools.reporting.steal import steal
 from tools.reporting.timing import plan_age_ms, task_times
 from tools.snapshot import TASK_STATUS
 
@@ -59,6 +60,8 @@ def report_of(recording: Recording) -> Report:
         "missed": sum(task.get("missed", 0) for task in counted.values()),
         "skipped": sum(task.get("skipped", 0) for task in counted.values()),
         "misses": misses(recording, layout),
+        "steal": steal(recording, layout),
+        "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
         **faults(recording, layout),
         "tasks": {task.name: _task(recording, config, layout, task, counted) for task in layout.tasks},
         "system_response": system_response(recording, config, layout),
