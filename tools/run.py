@@ -80,6 +80,6 @@ def _report(folder: Path, result: RunResult) -> tuple[dict[str, Any], str]:
 
     try:
         return write_report(folder)
-    except Failure as failure:
-        print(f"no report: {failure}", file=sys.stderr)
+    except (Failure, OSError) as error:
+        print(f"no report: {error}", file=sys.stderr)
         return result.document(), result.text()

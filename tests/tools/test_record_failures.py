@@ -14,6 +14,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from boards.config import RackConfig, load
+from boards.events import Event
 from boards.rack import Rack
 from tests.processes import children_of
 from tools.answer import Failure
@@ -99,6 +100,25 @@ def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path
     lines = [event["text"] for event in recording.events if event["kind"] == "recorder"]
     assert len(lines) == 1
     assert lines[0].startswith("run.rrd ends here: ")
+
+
+class Telling(SilentDisplay):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def tell(self, event: Event) -> None:
+        """Keep the text."""
+        self.told.append(event.text)
+
+
+def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: Path) -> None:
+    folder, display = tmp_path / "run", Telling()
+    folder.mkdir()
+    (folder / "events.jsonl").symlink_to("/dev/full")
+    assert run_rack(config, 0.5, folder, display).worked
+    assert display.told.count("events.jsonl ends here: No space left on device") == 1
 
 
 class AtTick(SilentDisplay):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from backplane.layout import Layout
@@ -54,7 +54,7 @@ def mend(folder: Path) -> bool:
         return False
     made: list[RunFiles] = []
 
-    def begin(layout: Layout) -> object:
+    def begin(layout: Layout) -> Callable[[Frame], None]:
         made.append(RunFiles(folder, layout, MENDED))
         return made[0].add
 
