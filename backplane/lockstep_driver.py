@@ -7,12 +7,17 @@ from collections.abc import Callable
 
 from backplane.alarms import AlarmWriter
 from backplane.clock_driver import ClockDriver, Ended
-from backplane.process import is_alive
+from backplane.process import GONE, STOPPED, state_of
 from backplane.released_task import ReleasedTask
 from backplane.segment import Segment
 from backplane.semaphores import clock_semaphore
 from backplane.wake import CHECK_S
 from backplane.words import Run, System
+
+IDLE_S = 5.0
+"""Bound of the wait for a recorder that is stopped, or dead and not restarted."""
+SLOW_S = 30.0
+"""Bound of the wait for one that runs and takes nothing over: it may be a new one that still imports its libraries."""
 
 
 class LockstepDriver(ClockDriver):
@@ -84,8 +89,12 @@ class LockstepDriver(ClockDriver):
     def _wait_for_follower(self, tick: int) -> bool:
         """Wait for a recorder before its rings run over: in lockstep time stands still meanwhile."""
         words = self.words
+        seen, since = words[System.FOLLOWER_TICK], time.monotonic()
         while (pid := words[System.FOLLOWER_PID]) and tick - words[System.FOLLOWER_TICK] > self._history_ticks:
-            if not is_alive(pid):
+            if words[System.FOLLOWER_TICK] != seen:
+                seen, since = words[System.FOLLOWER_TICK], time.monotonic()
+            bound_s = IDLE_S if state_of(pid) in (*STOPPED, *GONE) else SLOW_S
+            if time.monotonic() - since > bound_s:
                 words[System.FOLLOWER_PID] = 0
             if words[System.STOP_REQUEST] or not self.launcher_is_alive:
                 return False

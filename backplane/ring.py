@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from backplane.address_map import MAILBOX_HEAD_SIZE, oldest_kept, slot_stride
+from backplane.layout import MailboxSpec
 from backplane.segment import Segment
 from backplane.slots import message_dtype
 from backplane.words import Box, Slot
@@ -33,6 +34,10 @@ class Ring:
         """Records written and not yet taken."""
         return self._head[0] - self._taken
 
+    def resume(self, taken: int) -> None:
+        """Go on behind the first `taken` records: another reader had them."""
+        self._taken = taken
+
     def drain(self) -> Drained:
         """Take every record written since the last call."""
         head = self._head[0]
@@ -48,16 +53,19 @@ class Ring:
 def mailbox_ring(segment: Segment, name: str) -> Ring:
     """Return the messages of a mailbox as a ring: `words.Slot` fields in lower case, then `message`."""
     spec = segment.layout.mailbox(name)
-    stride = slot_stride(spec)
-    body = message_dtype(spec.fields, spec.size)
-    dtype = np.dtype(
-        {
-            "names": [word.name.lower() for word in Slot] + ["message"],
-            "formats": ["i8"] * len(Slot) + [body],
-            "offsets": [8 * word for word in Slot] + [8 * len(Slot)],
-            "itemsize": stride,
-        }
-    )
+    stride, dtype = slot_stride(spec), row_dtype(spec)
     address = segment.map.mailboxes[name]
     head = segment.words[address // 8 + Box.HEAD : address // 8 + Box.HEAD + 1]
     return Ring(segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * stride), dtype, head)
+
+
+def row_dtype(spec: MailboxSpec) -> np.dtype:
+    """Return the type of one row of a mailbox's ring, padding and all."""
+    return np.dtype(
+        {
+            "names": [word.name.lower() for word in Slot] + ["message"],
+            "formats": ["i8"] * len(Slot) + [message_dtype(spec.fields, spec.size)],
+            "offsets": [8 * word for word in Slot] + [8 * len(Slot)],
+            "itemsize": slot_stride(spec),
+        }
+    )

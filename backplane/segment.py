@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import mmap
 import os
+import stat
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -115,6 +116,8 @@ class Segment:
 
         Raises `SegmentError` when there is none, or it is another user's or no segment.
         """
+        if (kind := stranger(rack)) is not None:
+            raise SegmentError(f"rack '{rack}': {shm_path(rack)} is a {kind}, not a segment")
         try:
             shm = posix_ipc.SharedMemory(_shm_name(rack))
         except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
@@ -134,7 +137,7 @@ class Segment:
             )
         if self.words[Head.SIZE] != len(self.bytes):
             raise SegmentError(f"rack '{self.rack}': {len(self.bytes)} bytes; its head says {self.words[Head.SIZE]}")
-        self.layout = _layout(json.loads(self._text(Head.LAYOUT_AT)))
+        self.layout = layout_of(json.loads(self._text(Head.LAYOUT_AT)))
         self.config = self._text(Head.CONFIG_AT)
         self.map = AddressMap(self.layout)
 
@@ -183,6 +186,16 @@ def racks() -> list[str]:
     return sorted(path.name.removeprefix(PREFIX) for path in SHM_FOLDER.glob(f"{PREFIX}*"))
 
 
+def stranger(rack: str) -> str | None:
+    """Return what stands under a rack's name that no rack has made, as in "directory"; None for a file, or nothing."""
+    try:
+        mode = shm_path(rack).lstat().st_mode
+    except FileNotFoundError:
+        return None
+    kinds = {stat.S_IFDIR: "directory", stat.S_IFLNK: "symbolic link"}
+    return None if stat.S_ISREG(mode) else kinds.get(stat.S_IFMT(mode), "special file")
+
+
 def unlink(rack: str) -> None:
     """Remove a rack's segment by name; no error when it is gone already.
 
@@ -214,7 +227,8 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
     return FieldSpec(**{**entry, "shape": shape, "fields": fields})
 
 
-def _layout(entry: dict[str, Any]) -> Layout:
+def layout_of(entry: dict[str, Any]) -> Layout:
+    """Return the layout that `dataclasses.asdict` has made plain data of."""
     boxes = [
         MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": tuple(_field(f) for f in m["fields"])})
         for m in entry["mailboxes"]

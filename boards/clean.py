@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
+
 from backplane import semaphores
 from backplane.byte_lock import ByteLock
 from backplane.errors import SegmentError
-from backplane.segment import Segment, racks, unlink
+from backplane.segment import Segment, racks, stranger, unlink
 from backplane.words import Head
 
 
 def remove_dead(rack: str) -> bool:
     """Remove a rack's segment when nobody runs it; return whether there was one to remove.
 
-    Raises `SegmentError` when its launcher lives, or it is another user's.
+    Raises `SegmentError` when its launcher lives, or it is another user's, or no file at all.
     """
     if rack not in racks():
         return False
     try:
         segment = Segment.open(rack)
     except SegmentError:
+        if stranger(rack) is not None:
+            raise
         # Too small for a head: nobody can be running it.
         unlink(rack)
         return True
@@ -47,13 +52,24 @@ def _remove(segment: Segment) -> bool:
         removal.close()
 
 
-def clean() -> tuple[list[str], list[str]]:
-    """Remove every rack that nobody runs; return the names removed and the names in use."""
-    removed, in_use = [], []
+def remove_own(rack: str | None = None) -> None:
+    """Remove the racks that this very process has launched, or one of them; whatever state they are in."""
+    for name in racks() if rack is None else [rack]:
+        with suppress(SegmentError):
+            segment = Segment.open(name)
+            if segment.launcher_is_alive and segment.launcher == os.getpid():
+                semaphores.unlink_all(name)
+                unlink(name)
+            segment.close()
+
+
+def clean() -> tuple[list[str], list[str], list[str]]:
+    """Remove every rack that nobody runs; return the names removed, those in use, and a line for what is no rack."""
+    removed, in_use, strange = [], [], []
     for rack in racks():
         try:
             if remove_dead(rack):
                 removed.append(rack)
-        except SegmentError:
-            in_use.append(rack)
-    return removed, in_use
+        except SegmentError as error:
+            strange.append(str(error)) if stranger(rack) is not None else in_use.append(rack)
+    return removed, in_use, strange

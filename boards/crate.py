@@ -154,8 +154,8 @@ class Crate:
 def main() -> None:
     """Serve as the crate of the Rack at the other end of the inherited socket."""
     # Ctrl-C, and what ends a group, reach every process of it; how the run ends is the Rack's decision.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     line, attention = (int(fd) for fd in sys.argv[1:])
     Crate(Channel(socket.socket(fileno=line)), attention).run()
 

@@ -16,6 +16,7 @@ from boards.config.cores import obtained_core
 from boards.config.ports import TaskPorts, all_ports
 from boards.config.schema import RackConfig
 from boards.config.timing import is_critical
+from boards.errors import LaunchError
 from boards.faults.kinds import KINDS
 from boards.faults.request import injections
 from boards.outcome import Cause
@@ -26,6 +27,13 @@ LINGER_S = 0.5
 """Simulated time that a run goes on behind the task's end: the arm is seen at rest."""
 HISTORY_S = 1.0
 """Simulated time by which lockstep may be ahead of a recorder: half of what the rings hold."""
+
+
+PERMIT = (
+    "To permit it: a line '@GROUP - rtprio 99' in /etc/security/limits.conf for a group of yours, and a new login "
+    "(ulimit -r shows it); or CAP_SYS_NICE"
+)
+"""What to do where a user may not have a real-time priority."""
 
 
 @dataclass(frozen=True)
@@ -105,11 +113,17 @@ class Launch:
 
     def notes(self, segment: Segment) -> list[str]:
         """Return what the launch must say: cores shared out, real-time priority refused."""
+        refused = self._refused(segment)
+        return shared_out(self.config) + ([f"{refused}; misses are likely. {PERMIT}"] if refused else [])
+
+    def check_realtime(self, segment: Segment) -> None:
+        """Raise `LaunchError` when a task was refused its real-time priority and the config does not go on without."""
+        if self.config.clock.on_no_realtime == "refuse" and (refused := self._refused(segment)):
+            raise LaunchError(f'{refused}, and clock.on_no_realtime is "refuse". {PERMIT}')
+
+    def _refused(self, segment: Segment) -> str:
         refused = [t.name for t in self.layout.tasks if t.priority and not segment.block(t.name)[Block.PRIORITY]]
-        notes = shared_out(self.config)
-        if refused:
-            notes.append(f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}; misses are likely")
-        return notes
+        return f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
 
 
 def modules(config: RackConfig) -> tuple[str, ...]:

@@ -21,20 +21,21 @@ from backplane.errors import EmergencyStopError
 from backplane.fault_table import FaultTable
 from backplane.lines import UtilityLines
 from backplane.operator_table import OperatorTable, RequestEntry
-from backplane.segment import Segment, unlink
+from backplane.segment import Segment
 from backplane.words import Block, Run, System, TaskState
 from boards.alarm_watch import AlarmWatch, Heard
-from boards.clean import remove_dead
+from boards.clean import remove_dead, remove_own
 from boards.config import load
 from boards.config.schema import RackConfig
 from boards.crate_line import CrateLine
 from boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
-from boards.errors import LaunchError
+from boards.errors import ConfigError, LaunchError, Mistake
 from boards.events import Event
 from boards.faults.kinds import KINDS
 from boards.heartbeat import Heartbeat
 from boards.journal import Journal
 from boards.launch import Launch, modules
+from boards.neighbours import conflicts, holders, placed
 from boards.operating.request import asked, request, requests
 from boards.outcome import Cause, Outcome
 from boards.recovery import Recovery
@@ -43,18 +44,23 @@ from boards.supervision import Supervision
 LAUNCH_S = 60.0
 """Bound of the launch: a stranger's model with many meshes compiles for a while in every board."""
 UP = (TaskState.READY, TaskState.RUNNING)
+TO_SHARE = "stop that rack, choose other cores, or give --share"
 LEAVE_S = 2.0
 """Bound of the boards' own end."""
+STOP_S = 0.8
+"""Bound of an orderly stop: a clock that has not ended the run by then is not waited for."""
 
 
 class Rack:
     """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
 
-    `on_event` is called with every `Event`, in the process of the caller.
+    `on_event` is called with every `Event`, in the process of the caller. Without `share` a launch is refused where
+    another rack's real-time boards hold a core that this one asks for; a program that launches several places them.
     """
 
-    def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None) -> None:
+    def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None, share: bool = True) -> None:
         self.config = config
+        self._share = share
         self.segment: Segment
         self.outcome: Outcome | None = None
         self._journal = Journal(on_event)
@@ -64,6 +70,8 @@ class Rack:
         self._is_armed = False
         self._is_beyond_help = False
         self._cause: Cause | None = None
+        self._why_stopped = ""
+        self._stop_by: float | None = None
 
     @property
     def events(self) -> list[Event]:
@@ -85,8 +93,8 @@ class Rack:
     def launch(self) -> None:
         """Power on every board but the clock, and wait until all have passed their self-tests.
 
-        Raises `ConfigError`, `SegmentError` when the name is in use, `LaunchError` when a board fails; nothing is
-        left then.
+        Raises `ConfigError` for a config, or cores, that cannot be, `SegmentError` when the name is in use, and
+        `LaunchError` when a board fails; nothing is left then.
         """
         try:
             self._power_on()
@@ -95,6 +103,11 @@ class Rack:
             raise
 
     def _power_on(self) -> None:
+        held = holders(self.config.name)
+        self.config, moved = placed(self.config, held)
+        shared = conflicts(self.config, held)
+        if shared and not self._share:
+            raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
         self._crate = crate = CrateLine()
         # The crate imports while the config is being wired: on two cores that is half a second saved.
         crate.send(Preload(modules(self.config), tuple(sys.path)))
@@ -111,8 +124,9 @@ class Rack:
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
         self._await_ready()
+        plan.check_realtime(self.segment)
         self._inject()
-        for note in plan.notes(self.segment):
+        for note in (*moved, *shared, *plan.notes(self.segment)):
             self._journal.tell("ready", "", note)
 
     def _set_words(self) -> None:
@@ -172,7 +186,8 @@ class Rack:
         """Watch the boards for that long, or until something happens; False when the run is over."""
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
-            self._listen(deadline - time.monotonic())
+            self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
+            self._tell_stop()
             for line in self._line.printed():
                 self._journal.tell("printed", "", line)
             for heard in self._alarms.drain():
@@ -183,17 +198,24 @@ class Rack:
             self._recovery.advance()
             if not self._is_armed:
                 self._reset_latch()
-            if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help:
+            is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
+            if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help or is_late:
                 self._end()
             if time.monotonic() >= deadline:
                 break
         return self.outcome is None
 
     def stop(self, why: str) -> None:
-        """Have the run end at the next tick."""
+        """Have the run end at the next tick. May be called at any moment, by a signal's handler as well."""
+        self._why_stopped = self._why_stopped or why
         self._cause = self._cause or "stopped"
-        self._journal.tell("stop", "", why)
         self.segment.words[System.STOP_REQUEST] = 1
+        os.eventfd_write(self._line.attention, 1)
+
+    def _tell_stop(self) -> None:
+        if self._why_stopped and self._stop_by is None:
+            self._stop_by = time.monotonic() + STOP_S
+            self._journal.tell("stop", "", self._why_stopped)
 
     def command(self, level: str, what: str, tick: int | None = None, **goal: object) -> RequestEntry:
         """Hand an operator's command to a level, to be given at `tick`, or at once; return its entry in the table.
@@ -293,9 +315,9 @@ class Rack:
             # A crate that has no boards yet may still be importing for them.
             crate.close(LEAVE_S if self._pids else 0)
         finally:
+            # By its name: what interrupted the launch may have come before the segment was known here.
+            remove_own(self.config.name)
             if hasattr(self, "segment"):
-                semaphores.unlink(self.segment.layout)
-                unlink(self.segment.rack)
                 self.segment.close()
 
     def _has_lost(self) -> bool:

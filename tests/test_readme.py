@@ -38,7 +38,7 @@ def example(tmp_path: Path) -> Path:
 
 def rack(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     # A rack of the same name may be at work on this machine.
-    own = ["--set", f"name={OWN_NAME}"] if words[0] == "run" else []
+    own = ["--set", f"name={OWN_NAME}", "--share"] if words[0] == "run" else []
     return python(folder, "-m", "tools.cli", *words, *own)
 
 

@@ -4,68 +4,90 @@ from __future__ import annotations
 
 import errno
 import sys
+from typing import TYPE_CHECKING
 
-import typer
+from tools.interrupt import INTERRUPT, Interrupted
 
-from boards.errors import shown
-from tools.analyze import analyze
-from tools.answer import Failure, fail
-from tools.bench.command import bench
-from tools.campaign.command import campaign
-from tools.check import check
-from tools.clean import clean
-from tools.command import EXAMPLES as COMMANDING
-from tools.command import command
-from tools.estop import estop
-from tools.gantt import gantt
-from tools.inject import EXAMPLES as INJECTING
-from tools.inject import inject
-from tools.injecting.kinds import KindsCommand
-from tools.list import list_racks
-from tools.record import record
-from tools.replay import replay
-from tools.report import report
-from tools.run import run
-from tools.status import status
-from tools.stop import stop
+if TYPE_CHECKING:
+    import typer
 
 LONGEST_ARGUMENT = 4096
 """Characters, as in the longest path; what a config holds beyond that belongs into a file."""
 USAGE = (errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ELOOP, errno.EACCES)
 """What the system says of a path that a user should not have given."""
 
-app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
-    epilog="Exit status: 0 it worked, 1 it did not, 2 usage or config error.",
-)
-app.command()(run)
-app.command()(check)
-app.command("list")(list_racks)
-app.command()(status)
-app.command()(stop)
-app.command()(clean)
-app.command(epilog=COMMANDING)(command)
-app.command(cls=KindsCommand, epilog=INJECTING)(inject)
-app.command()(estop)
-app.command()(record)
-app.command()(replay)
-app.command()(report)
-app.command()(analyze)
-app.command()(gantt)
-app.add_typer(bench, name="bench")
-app.command()(campaign)
+
+def commands() -> typer.Typer:
+    """Return the command line."""
+    import typer
+
+    from tools.analyze import analyze
+    from tools.bench.command import bench
+    from tools.campaign.command import campaign
+    from tools.check import check
+    from tools.clean import clean
+    from tools.command import EXAMPLES as COMMANDING
+    from tools.command import command
+    from tools.estop import estop
+    from tools.gantt import gantt
+    from tools.inject import EXAMPLES as INJECTING
+    from tools.inject import inject
+    from tools.injecting.kinds import KindsCommand
+    from tools.list import list_racks
+    from tools.record import record
+    from tools.replay import replay
+    from tools.report import report
+    from tools.run import run
+    from tools.status import status
+    from tools.stop import stop
+
+    app = typer.Typer(
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
+        epilog="Exit status: 0 it worked, 1 it did not, 2 usage or config error.",
+    )
+    app.command()(run)
+    app.command()(check)
+    app.command("list")(list_racks)
+    app.command()(status)
+    app.command()(stop)
+    app.command()(clean)
+    app.command(epilog=COMMANDING)(command)
+    app.command(cls=KindsCommand, epilog=INJECTING)(inject)
+    app.command()(estop)
+    app.command()(record)
+    app.command()(replay)
+    app.command()(report)
+    app.command()(analyze)
+    app.command()(gantt)
+    app.add_typer(bench, name="bench")
+    app.command()(campaign)
+    return app
 
 
 def main() -> None:
     """Run the command line; what is refused shows as one line a mistake."""
     if sys.platform != "linux":
         sys.exit(f"rack runs on Linux alone, not on {sys.platform}: it needs /dev/shm, pidfds and SCHED_FIFO")
+    # First of all: to import what commands need takes longer than many a command.
+    INTERRUPT.catch()
+    try:
+        _run()
+    except Interrupted:
+        return
+    finally:
+        INTERRUPT.settle()
+
+
+def _run() -> None:
+    from boards.errors import shown
+    from tools.answer import Failure, fail
+
     try:
         _look_over(sys.argv[1:])
-        app(prog_name="rack")
+        commands()(prog_name="rack")
     except Failure as failure:
         fail(str(failure), failure.status)
     except OSError as error:
@@ -81,6 +103,9 @@ def main() -> None:
 
 def _look_over(arguments: list[str]) -> None:
     """Refuse what no command can use, before any sees it. Raises `Failure`."""
+    from boards.errors import shown
+    from tools.answer import Failure
+
     for at, argument in enumerate(arguments, 1):
         if len(argument) > LONGEST_ARGUMENT:
             raise Failure(

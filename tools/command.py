@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from tools.answer import Failure, Json, print_json
+from tools.interrupt import INTERRUPT
 
 Rack = Annotated[str, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it")]
 Level = Annotated[
@@ -77,7 +78,9 @@ def command(
         raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
     if timeout is not None and not wait:
         raise Failure("--timeout is the bound of --wait; give both, or neither", 2)
-    told = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
+    # Raised, not ended at once: a command that nobody waits for any more is withdrawn.
+    with INTERRUPT.raising():
+        told = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
     print_json(told.document()) if as_json else print(told.line)
     if not told.worked:
         raise typer.Exit(1)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from tools.answer import Json, RackName, print_json
+from tools.interrupt import INTERRUPT
 
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
@@ -19,8 +20,6 @@ def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = 
 
     Trace, signals and run.rrd, until its run is over or Ctrl-C.
     """
-    from contextlib import suppress
-
     from backplane.segment import Segment
     from tools.folders import folder_of
     from tools.recorder.recorder import Recorder
@@ -36,7 +35,7 @@ def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = 
     port = free_port() if view else None
     beside = SideSink(lambda: ViewSink(segment, folder, port), told.append)
     # Ctrl-C ends the recording, not the run; the files are finished on the way out.
-    with Recorder(segment, folder, beside) as recorder, suppress(KeyboardInterrupt):
+    with INTERRUPT.orderly(), Recorder(segment, folder, beside) as recorder, INTERRUPT.orderly(recorder.stop):
         if port is not None:
             Window(url(port))
         recorder.follow()

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,33 +16,77 @@ import pyarrow.parquet as pq
 
 from backplane.layout import Layout, MailboxSpec, TaskSpec
 from backplane.trace import RECORD
+from boards.config import RackConfig, loads
+from boards.errors import ConfigError
+from boards.events import Event
 from tools.answer import Failure
+from tools.recorder.files import mend
+from tools.recorder.signals import HEAD
+from tools.recorder.steal import Stolen
+
+UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
+"""What damaged files, and files of something else, make of their reading."""
 
 
 class Recording:
-    """A run's folder. Raises `Failure` when it holds no recording."""
+    """A run's folder. Raises `Failure`, with the file and what is wrong with it, when it cannot be read.
+
+    What a recorder that was killed has left is made readable first; what is left out is said on stderr.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        for name in ("config.toml", "cycles.parquet", "signals.parquet"):
-            if not (folder / name).is_file():
-                raise Failure(f"{folder}: no run, it has no {name}", 2)
-        try:
-            self._cycles = pq.ParquetFile(folder / "cycles.parquet")
-            self._signals = pq.ParquetFile(folder / "signals.parquet")
-        except pa.ArrowInvalid as error:
-            raise Failure(f"{folder}: its recorder was killed before it could finish: {error}") from error
+        self.config = self._text("config.toml")
+        """The resolved config, as TOML text."""
+        with _naming(folder):
+            if mend(folder):
+                _say(f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and signals.parquet")
+        self._cycles = self._open("cycles.parquet", ("task", "tick"))
+        self._signals = self._open("signals.parquet", ("mailbox", *HEAD))
 
     @cached_property
-    def config(self) -> str:
-        """The resolved config, as TOML text."""
-        return (self.folder / "config.toml").read_text()
+    def rack_config(self) -> RackConfig:
+        """The resolved config. Raises `Failure`, with every mistake, when it is none."""
+        try:
+            return loads(self.config)
+        except ConfigError as error:
+            mistakes = "; ".join(str(error).splitlines())
+            raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
+
+    def _open(self, name: str, columns: Sequence[str]) -> pq.ParquetFile:
+        path = self._there(name)
+        with _naming(path):
+            file = pq.ParquetFile(path)
+        if absent := [column for column in columns if column not in file.schema_arrow.names]:
+            raise Failure(f"{path}: not a recording of a rack, it has no column '{absent[0]}'", 2)
+        return file
+
+    def _text(self, name: str) -> str:
+        path = self._there(name)
+        try:
+            return path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise Failure(f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2) from None
+        except OSError as error:
+            raise Failure(f"{path}: {error.strerror}", 2) from None
+
+    def _there(self, name: str) -> Path:
+        if not (self.folder / name).is_file():
+            raise Failure(f"{self.folder}: no run, it has no {name}", 2)
+        return self.folder / name
 
     @cached_property
     def events(self) -> list[dict[str, Any]]:
-        """The events of the run, oldest first."""
+        """The events of the run, oldest first. Raises `Failure` when they are something else."""
         path = self.folder / "events.jsonl"
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+        if not path.is_file():
+            return []
+        *lines, last = self._text(path.name).split("\n")
+        found = [_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1)]
+        if last:
+            # A run that was killed leaves that.
+            _say(f"{path}: line {len(lines) + 1} is cut off, and left out")
+        return found
 
     @cached_property
     def ended(self) -> dict[str, Any]:
@@ -49,16 +96,25 @@ class Recording:
     @cached_property
     def layout(self) -> Layout:
         """The rack's layout; the fields of its messages are `signal`'s to know."""
-        text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
-        boxes = (MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": ()}) for m in text["mailboxes"])
-        tasks = tuple(TaskSpec(**task) for task in text["tasks"])
-        return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes))
+        with _naming(self.folder / "signals.parquet"):
+            text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
+            boxes = [MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": ()}) for m in text["mailboxes"]]
+            tasks = tuple(TaskSpec(**task) for task in text["tasks"])
+            return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes))
 
     @cached_property
     def lost(self) -> dict[str, int]:
         """Rows that were overwritten before the recorder came, by task and by mailbox."""
-        texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
-        return {name: count for text in texts for name, count in json.loads(text).items()}
+        with _naming(self.folder):
+            texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
+            return {name: count for text in texts for name, count in json.loads(text).items()}
+
+    @cached_property
+    def stolen(self) -> list[Stolen]:
+        """When the hypervisor had a core, earliest first; nothing where the recorder did not look, or was killed."""
+        with _naming(self.folder / "cycles.parquet"):
+            found = json.loads(self._cycles.metadata.metadata.get(b"stolen", b"[]"))
+            return [Stolen(*map(int, entry)) for entry in found]
 
     @property
     def columns(self) -> list[str]:
@@ -68,13 +124,13 @@ class Recording:
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
         """The trace by task: structured rows, oldest first, with the fields of `backplane.trace.RECORD`."""
-        table = self._cycles.read()
-        names = table.column_names[1:]
-        tasks = table["task"].to_numpy()
-        # 0 where an earlier rack has not traced a column.
-        rows = np.zeros(len(tasks), dtype=RECORD)
-        for name in names:
-            rows[name] = table[name].to_numpy()
+        with _naming(self.folder / "cycles.parquet"):
+            table = self._cycles.read()
+            tasks = table["task"].to_numpy()
+            # 0 where an earlier rack has not traced a column.
+            rows = np.zeros(len(tasks), dtype=RECORD)
+            for name in table.column_names[1:]:
+                rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
 
     @property
@@ -91,7 +147,8 @@ class Recording:
         name = field if field in schema.names else f"{mailbox}.{field}"
         column = schema.field(name)
         groups = [group for group in range(self._signals.num_row_groups) if self._mailbox_of(group) == mailbox]
-        read = [self._signals.read_row_group(group, columns=[name]).column(0).combine_chunks() for group in groups]
+        with _naming(self.folder / "signals.parquet"):
+            read = [self._signals.read_row_group(group, columns=[name]).column(0).combine_chunks() for group in groups]
         shape = tuple(json.loads(column.metadata[b"shape"])) if column.metadata else ()
         values = [(block.flatten() if shape else block).to_numpy(zero_copy_only=False) for block in read]
         if not values:
@@ -111,3 +168,30 @@ class Recording:
     def _mailbox_of(self, group: int) -> str:
         # Rows of one mailbox alone stand in a row group: its smallest name is its only one.
         return str(self._signals.metadata.row_group(group).column(0).statistics.min)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Make a `Failure` that names the file of whatever goes wrong while it is read."""
+    try:
+        yield
+    except UNREADABLE as error:
+        raise Failure(f"{path}: not readable as a recording: {' '.join(str(error).split()) or error!r}", 2) from None
+
+
+def _event(line: str, place: str) -> dict[str, Any]:
+    """Return an event from its line. Raises `Failure`."""
+    try:
+        event = json.loads(line)
+        if event["kind"] == "outcome":
+            {**event["outcome"], **event["tasks"]}
+        else:
+            Event(**event)
+            int(event["tick"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise Failure(f"{place}: not an event of a run: {error or error!r}", 2) from None
+    return dict(event)
+
+
+def _say(note: str) -> None:
+    print(note, file=sys.stderr)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from backplane.segment import Segment
@@ -22,6 +20,7 @@ from tools.campaign.ending import Strike, strikes
 from tools.display import Display
 from tools.event_log import EventLog
 from tools.holds import Standstill
+from tools.interrupt import INTERRUPT
 from tools.recorder.process import RecorderProcess
 from tools.snapshot import Viewer
 from tools.viewer.window import Window, free_port, url
@@ -30,6 +29,10 @@ COUNTED = (
     *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),
     *("READS", "READ_BYTES", "WRITES", "WRITE_BYTES", "CORRUPT", "BUS_ERRORS"),
 )
+
+
+NO_TIME = "no time for the report: 'rack report {}' makes it"
+LATE = "the recorder has not begun yet: the run begins without it"
 
 
 @dataclass(frozen=True)
@@ -71,30 +74,41 @@ class RunResult:
 
 
 def run_rack(
-    config: RackConfig, seconds: float | None, folder: Path | None, display: Display, view: bool = False
+    config: RackConfig,
+    seconds: float | None,
+    folder: Path | None,
+    display: Display,
+    view: bool = False,
+    share: bool = True,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`, if there is one.
 
-    With `view` the recorder serves a viewer, whose window opens and may close at any time.
+    `share` is as in `Rack`. With `view` the recorder serves a viewer, whose window opens and may close at any time.
 
-    Raises what `Rack` raises, and `Failure` when the recorder cannot attach; a rack that did not get as far as
-    that leaves no folder.
+    Raises what `Rack` raises; a rack that could not be launched leaves no folder. What becomes of the recorder changes
+    nothing in how the run ends.
     """
     log = EventLog(display)
     sources: list[Callable[[], list[str]]] = []
-    with closing(log), _recorder(folder) as recorder:
-        with Rack(config, log.add) as rack:
+    with closing(log), ExitStack() as stack:
+        # Nothing is worth keeping before the run has begun.
+        with INTERRUPT.at_once():
+            recorder = stack.enter_context(_recorder(folder))
+            rack = stack.enter_context(Rack(config, log.add, share))
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())
                 log.open(folder / "events.jsonl")
                 port = free_port() if view else None
-                if not recorder.attach(config.name, folder, port):
-                    raise Failure(recorder.finish())
+                if not recorder.attach(config.name, folder, port, rack.segment.words):
+                    log.add(Event(time.time_ns(), -1, "recorder", "", LATE))
                 sources = [recorder.told, *([] if port is None else [_window(port)])]
+        unfinished = NO_TIME.format(folder) if folder else ""
+        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             started = time.monotonic()
             outcome = _watch(rack, seconds, display, _ears(sources, rack.segment, log))
             wall_s, segment = time.monotonic() - started, rack.segment
+        rack.close()
         recording = recorder.finish() if recorder is not None else "none"
         _hear(sources, segment, log)
         skipped = segment.words[System.CLOCK_SKIPPED]
@@ -113,33 +127,15 @@ def run_rack(
 
 
 def _watch(rack: Rack, seconds: float | None, display: Display, hear: Callable[[], None]) -> Outcome:
-    with _stopped_by_signals(rack):
-        rack.start(seconds)
-        viewer = Viewer(rack.segment)
-        while rack.watch(display.period_s):
-            display.show(viewer.look())
-            hear()
+    rack.start(seconds)
+    viewer = Viewer(rack.segment)
+    while rack.watch(display.period_s):
         display.show(viewer.look())
+        hear()
+    display.show(viewer.look())
     if rack.outcome is None:
         raise Failure("the run ended without an outcome")
     return rack.outcome
-
-
-@contextmanager
-def _stopped_by_signals(rack: Rack) -> Iterator[None]:
-    """Turn the first SIGINT or SIGTERM into an orderly end; the second one ends the command at once."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        for ended in kept:
-            signal.signal(ended, signal.default_int_handler)
-        rack.stop(f"{signal.Signals(number).name} received")
-
-    kept = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in kept.items():
-            signal.signal(number, handler)
 
 
 def _window(port: int) -> Callable[[], list[str]]:

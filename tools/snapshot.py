@@ -123,7 +123,14 @@ class Viewer:
         lines = self._lines
         held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
         single = {"ACFAIL": lines.acfail, "SYSRESET": lines.sysreset, "EMERGENCY STOP": lines.emergency_stop}
-        return held + [name for name, asserted in single.items() if asserted]
+        return held + [name for name, asserted in single.items() if asserted] + self._without_priority()
+
+    def _without_priority(self) -> list[str]:
+        """Return the standing warning of a rack whose tasks were refused their real-time priority."""
+        blocks = {task.name: self._segment.block(task.name) for task in self._segment.layout.tasks if task.priority}
+        refused = [name for name, block in blocks.items() if block[Block.PID] and not block[Block.PRIORITY]]
+        is_up = self._segment.words[System.STATE] != Run.STARTING
+        return [f"NO REAL-TIME PRIORITY: {', '.join(refused)}"] if refused and is_up else []
 
     def _row(self, task: TaskSpec) -> TaskRow:
         block = self._segment.block(task.name)

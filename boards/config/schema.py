@@ -25,6 +25,7 @@ LAST_SLOT = 21
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
 Wake = Literal["signal", "poll"]
+OnNoRealtime = Literal["refuse", "warn"]
 OnLoss = Literal["hold", "stop", "brake"]
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
@@ -56,6 +57,9 @@ class ClockConfig(Table):
     wake: Wake = Field("signal", description="how boards wait for their cycle: a semaphore each, or busy-waiting")
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
+    on_no_realtime: OnNoRealtime = Field(
+        "warn", description="where a SCHED_FIFO priority is not obtained: go on with a warning, or refuse the launch"
+    )
 
 
 class TimingConfig(Table):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 
@@ -15,7 +16,7 @@ from backplane.wake import NextCycle
 from backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, exit_status, fork, in_thread
+from tests.processes import BOUND_S, FORKS, forked, in_thread
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 HISTORY = 8
@@ -125,12 +126,18 @@ def test_lockstep_waits_for_its_recorder(make_bus: MakeBus) -> None:
     assert max(ahead) <= HISTORY + 1
 
 
-def test_a_dead_recorder_is_not_waited_for(make_bus: MakeBus) -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, None], ids=["dead", "stopped", "idle"])
+def test_a_recorder_that_takes_nothing_over_is_not_waited_for_long(
+    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch, number: signal.Signals | None
+) -> None:
+    monkeypatch.setattr("backplane.lockstep_driver.IDLE_S", 0.05 if number else 60.0)
+    monkeypatch.setattr("backplane.lockstep_driver.SLOW_S", 60.0 if number else 0.05)
     segment = make_bus(task("fast"))
-    gone = fork(lambda: None)
-    assert exit_status(gone) == 0
-    segment.words[System.FOLLOWER_PID] = gone
-    _, ticks = lockstep(segment, 3 * HISTORY, False)
+    with forked(signal.pause) as follower:
+        if number is not None:
+            os.kill(follower, number)
+        segment.words[System.FOLLOWER_PID] = follower
+        _, ticks = lockstep(segment, 3 * HISTORY, False)
     assert len(ticks) == 3 * HISTORY + 1
     assert segment.words[System.FOLLOWER_PID] == 0
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +16,7 @@ from backplane.errors import SegmentError
 from backplane.layout import Layout
 from backplane.segment import SHM_FOLDER, VERSION, Segment, racks, shm_path, unlink
 from backplane.words import Head, System
-from boards.clean import clean, remove_dead
+from boards.clean import clean, remove_dead, remove_own
 from tests.backplane.bus import layout, mailbox
 from tests.processes import FORKS, descriptors, exit_status, fork, kill, wait_until
 
@@ -106,7 +108,7 @@ def test_clean_tells_what_it_removed_and_what_is_in_use(spec: Layout, rack_name:
     leave_dead(spec)
     live = Segment.create(layout(f"{rack_name}-live"), "")
     try:
-        removed, in_use = clean()
+        removed, in_use, _ = clean()
         assert spec.rack in removed
         assert live.rack in in_use
         assert live.rack not in removed
@@ -176,3 +178,34 @@ def test_of_several_launches_one_takes_a_dead_racks_name_and_keeps_it(spec: Layo
             kill(pid)
         unlink(start.rack)
         start.close()
+
+
+@pytest.mark.parametrize("kind", ["directory", "symbolic link"])
+def test_what_has_a_racks_name_and_is_none_is_named_and_left_alone(rack_name: str, tmp_path: Path, kind: str) -> None:
+    place, target = shm_path(rack_name), tmp_path / "target"
+    target.write_bytes(bytes(8192))
+    place.mkdir() if kind == "directory" else place.symlink_to(target)
+    why = f"rack '{rack_name}': {place} is a {kind}, not a segment"
+    try:
+        assert why in clean()[2]
+        with pytest.raises(SegmentError, match=re.escape(why)):
+            remove_dead(rack_name)
+        with pytest.raises(SegmentError, match=re.escape(why)):
+            Segment.attach(rack_name)
+        assert place.is_dir() if kind == "directory" else place.is_symlink()
+        assert target.read_bytes() == bytes(8192)
+    finally:
+        place.rmdir() if kind == "directory" else place.unlink()
+
+
+def test_only_the_own_racks_of_a_process_are_removed_by_it(spec: Layout, rack_name: str) -> None:
+    own = Segment.create(spec, "")
+    semaphores.create(spec)
+    other = layout(f"{rack_name}-other")
+    assert exit_status(fork(lambda: Segment.create(other, "").close())) == 0
+    try:
+        remove_own()
+        assert left(spec.rack) == [shm_path(other.rack).name]
+    finally:
+        unlink(other.rack)
+        own.close()

@@ -112,7 +112,7 @@ def test_ctrl_c_ends_a_campaign_with_a_report_of_what_was_done(small: Path, tmp_
     finally:
         process.kill()
         process.communicate()
-    assert process.returncode == 1
+    assert process.returncode == 128 + signal.SIGINT
     assert "Interrupted: this is what was done until then." in printed
     report = json.loads((out / "campaign.json").read_text())
     assert (report["interrupted"], report["summary"]["left_behind"]) == (True, 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from boards.config import RackConfig, loads
+from boards.config import RackConfig
 from boards.config.timing import budgets
 from tools.analysis.breaches import Breach, breaches
 from tools.analysis.comparison import Pair, compare
@@ -44,7 +44,7 @@ class Analysis:
         cls, recording: Recording, percentile: float = WORST, told: Callable[[float], None] = lambda part: None
     ) -> Analysis:
         """Analyze a recorded run; `told` hears which part is done. Raises `Failure` when its trace is empty or old."""
-        config, layout = loads(recording.config), recording.layout
+        config, layout = recording.rack_config, recording.layout
         found = cycles_of(recording)
         if not found:
             raise Failure(f"{recording.folder}: no cycle was traced; there is nothing to analyze", 2)

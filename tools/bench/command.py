@@ -9,10 +9,17 @@ from typing import Annotated, Literal
 import typer
 
 from tools.answer import Json, print_json
+from tools.interrupt import INTERRUPT
 
-bench = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Measure what things cost on this machine.")
+bench = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 Config = Annotated[str, typer.Option("--config", metavar="CONFIG", help="rack by name, or a path to a .toml file")]
+
+
+@bench.callback()
+def interruptible(context: typer.Context) -> None:
+    """Measure what things cost on this machine."""
+    context.with_resource(INTERRUPT.raising())  # temporary folders go, too
 
 
 @bench.command()

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import signal
-from types import FrameType
+from contextlib import ExitStack
+
+from tools.interrupt import INTERRUPT
+
+BOUND_S = 30.0
+"""A report of hours of trials is worth more than 2 s; a second signal ends the campaign at once."""
 
 
 class Interrupt:
-    """The first SIGINT or SIGTERM asks for an end in order; the second one ends the command at once."""
+    """While its context lasts, the first signal asks for an end in order."""
 
     def __init__(self) -> None:
-        self.is_set = False
-        self._kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._stack = ExitStack()
+
+    @property
+    def is_set(self) -> bool:
+        """Whether there was a signal."""
+        return INTERRUPT.number != 0
 
     def __enter__(self) -> Interrupt:
-        for number in self._kept:
-            signal.signal(number, self._ask)
+        self._stack.enter_context(INTERRUPT.orderly(bound_s=BOUND_S))
         return self
 
     def __exit__(self, *error: object) -> None:
-        for number, handler in self._kept.items():
-            signal.signal(number, handler)
-
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        self.is_set = True
-        for asked in self._kept:
-            signal.signal(asked, signal.default_int_handler)
+        self._stack.close()

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from backplane.trace import FIELDS, SKIPPED_SHIFT, Flag
-from boards.config import RackConfig, loads, timed_tasks
+from boards.config import RackConfig, timed_tasks
 from levels.timing.budget import Budget
 from levels.timing.chart import Chart, Job, Span
 from levels.timing.tasks import TimedTask, Unit
@@ -45,7 +45,7 @@ class Run:
         missing = [name for name in FIELDS if name not in recording.columns]
         if missing:
             raise Failure(f"{recording.folder}: recorded by an earlier rack, its trace has no {', '.join(missing)}", 2)
-        self.config: RackConfig = loads(recording.config)
+        self.config: RackConfig = recording.rack_config
         layout = recording.layout
         known = timed_tasks(self.config, layout, dict.fromkeys(self.config.board, Budget()))
         # Cores as the run obtained them; of the clock there is no trace.

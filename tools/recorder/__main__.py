@@ -11,10 +11,11 @@ import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from backplane.segment import Segment
-from tools.recorder.recorder import Recorder
-from tools.recorder.side_sink import SideSink, Sink
+if TYPE_CHECKING:
+    from backplane.segment import Segment
+    from tools.recorder.side_sink import Sink
 
 NICENESS = 10
 """On a core that it shares, the recorder comes behind boards without real-time priority too."""
@@ -23,9 +24,13 @@ NICENESS = 10
 def main() -> None:
     """Attach to the rack that one line of JSON names, say so on stdout, record until stdin ends."""
     # Ctrl-C and the like reach the whole foreground group; the launcher decides when the recording is complete.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
+    from backplane.segment import Segment
+    from tools.recorder.recorder import Recorder
+    from tools.recorder.side_sink import SideSink
+
     with suppress(ImportError):
         import tools.viewer.sink  # noqa: F401  takes a second: spent while the rack is being launched
     line = sys.stdin.readline()

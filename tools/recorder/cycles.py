@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from backplane.trace import FIELDS
+from tools.recorder.steal import Stolen
 
 BLOCK_ROWS = 1 << 16
 SCHEMA = pa.schema([pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS)])
@@ -43,8 +44,8 @@ class CyclesFile:
         self._writer.write_batch(pa.record_batch(arrays, schema=SCHEMA), row_group_size=len(rows))
         self._waiting, self._rows = [], 0
 
-    def close(self, lost: Mapping[str, int]) -> None:
-        """Write what waits, and by task the rows that were lost; finish the file."""
+    def close(self, lost: Mapping[str, int], stolen: Sequence[Stolen] = ()) -> None:
+        """Write what waits, by task the rows that were lost, and what was stolen from the cores; finish the file."""
         self._flush()
-        self._writer.add_key_value_metadata({"lost": json.dumps(lost)})
+        self._writer.add_key_value_metadata({"lost": json.dumps(lost), "stolen": json.dumps(stolen)})
         self._writer.close()

@@ -13,9 +13,10 @@ from backplane.ring import mailbox_ring
 from backplane.segment import Segment
 from backplane.trace import trace_ring
 from backplane.words import Run, System
-from tools.recorder.cycles import CyclesFile
+from tools.recorder.files import RunFiles
 from tools.recorder.side_sink import Sink
-from tools.recorder.signals import SignalsFile
+from tools.recorder.spool import Frame, Spool
+from tools.recorder.steal import StealMeter
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
@@ -32,15 +33,21 @@ class Recorder:
         layout = segment.layout
         self._beside = beside
         self._segment, self._words = segment, segment.words
-        self._traces = {task.name: trace_ring(segment, task.name) for task in layout.tasks}
-        self._mailboxes = {mailbox.name: mailbox_ring(segment, mailbox.name) for mailbox in layout.mailboxes}
-        self._cycles = CyclesFile(folder / "cycles.parquet")
-        self._signals = SignalsFile(folder / "signals.parquet", layout)
-        self._lost = dict.fromkeys([*self._traces, *self._mailboxes], 0)
-        self._is_follower = not is_alive(self._words[System.FOLLOWER_PID])
-        if self._is_follower:
-            self._words[System.FOLLOWER_TICK] = self._words[System.TICK]
-            self._words[System.FOLLOWER_PID] = os.getpid()
+        # The spool first: it is refused where another recorder is at work, whose files stay as they are.
+        self._spool = Spool(folder, layout)
+        self._files = RunFiles(folder, layout)
+        self._spool.resume(self._files.add)
+        traces = {task.name: trace_ring(segment, task.name) for task in layout.tasks}
+        mailboxes = {mailbox.name: mailbox_ring(segment, mailbox.name) for mailbox in layout.mailboxes}
+        self._rings = traces | mailboxes
+        for name, taken in self._files.taken.items():
+            self._rings[name].resume(taken)
+        # In lockstep nothing is late.
+        self._steal = None if self._words[System.LOCKSTEP] else StealMeter()
+        self._is_stopped = False
+        follower = self._words[System.FOLLOWER_PID]
+        self._is_follower = follower == os.getpid() or not is_alive(follower)
+        self._follow_from(self._words[System.TICK])
 
     def __enter__(self) -> Self:
         return self
@@ -51,22 +58,26 @@ class Recorder:
     def drain(self) -> None:
         """Take over everything written since the last call."""
         tick = self._words[System.TICK]
-        for task, ring in self._traces.items():
+        for name, ring in self._rings.items():
             rows, lost = ring.drain()
-            self._cycles.add(task, rows)
-            self._lost[task] += lost
-            if self._beside is not None:
-                self._beside.add_cycles(task, rows)
-        for mailbox, ring in self._mailboxes.items():
-            rows, lost = ring.drain()
-            self._signals.add(mailbox, rows)
-            self._lost[mailbox] += lost
-            if self._beside is not None:
-                self._beside.add_signals(mailbox, rows)
+            self._spool.add(name, rows, lost)
+            self._files.add(Frame(name, rows, lost))
+            if self._beside is not None and name in self._files.tasks:
+                self._beside.add_cycles(name, rows)
+            elif self._beside is not None:
+                self._beside.add_signals(name, rows)
+        self._spool.flush()
+        if self._steal is not None:
+            self._steal.look()
         if self._beside is not None:
-            self._beside.advance(tick, self._lost)
+            self._beside.advance(tick, self._files.lost)
+        self._follow_from(tick)
+
+    def _follow_from(self, tick: int) -> None:
+        """In lockstep, tell the clock how far the recording is; it may have let a follower go that was held up."""
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = tick
+            self._words[System.FOLLOWER_PID] = os.getpid()
 
     def follow(self, until: int | None = None) -> None:
         """Record until the run is over; with a descriptor `until`, until that can be read or its other end is gone."""
@@ -74,15 +85,21 @@ class Recorder:
         watched = [] if until is None else [until]
         while not select.select(watched, [], [], period_s)[0]:
             self.drain()
-            if until is None and (self._words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive):
+            over = self._words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
+            if self._is_stopped or (until is None and over):
                 break
         self.drain()
+
+    def stop(self) -> None:
+        """Have `follow` return soon."""
+        self._is_stopped = True
 
     def close(self) -> None:
         """Finish both files; the rack goes on without a follower."""
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
-        self._cycles.close({task: self._lost[task] for task in self._traces})
-        self._signals.close({mailbox: self._lost[mailbox] for mailbox in self._mailboxes})
+        self._spool.flush(now=True)
+        self._files.close([] if self._steal is None else self._steal.stolen)
+        self._spool.remove()
         if self._beside is not None:
-            self._beside.close(self._words[System.TICK] + 1, self._lost)
+            self._beside.close(self._words[System.TICK] + 1, self._files.lost)

@@ -74,6 +74,8 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
         f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
     )
     yield from (f"- fault: {fault}" for fault in outcome["faults"])
+    yield from (f"- {note}" for note in report["notes"])
+    yield from _steal(report["steal"])
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
     if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
@@ -122,6 +124,15 @@ def _holds(report: Report) -> Iterator[str | Grid]:
 
 def _first(rows: Sequence[Any], which: str) -> str:
     return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
+
+
+def _steal(steal: Report) -> Iterator[str]:
+    """Say which misses are not the rack's own."""
+    if steal["ms"]:
+        cores = ", ".join(f"core {core} {ms} ms" for core, ms in steal["ms"].items())
+        yield (
+            f"- {steal['missed_during']} of {steal['missed']} misses while the hypervisor had the core; stolen: {cores}"
+        )
 
 
 def _against(against: Report | None) -> Iterator[str]:

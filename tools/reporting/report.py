@@ -10,7 +10,7 @@ from typing import Any
 
 from backplane.layout import Layout, TaskSpec
 from backplane.message import State
-from boards.config import RackConfig, loads, wire
+from boards.config import RackConfig, wire
 from tools.recording import Recording
 from tools.reporting.difference import first_difference
 from tools.reporting.faults import faults
@@ -19,6 +19,7 @@ from tools.reporting.markdown import markdown
 from tools.reporting.misses import counted, misses
 from tools.reporting.motion import motion
 from tools.reporting.response import system_response
+from tools.reporting.steal import steal
 from tools.reporting.timing import plan_age_ms, task_times
 from tools.snapshot import TASK_STATUS
 
@@ -42,7 +43,7 @@ def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str
 
 def report_of(recording: Recording) -> Report:
     """Return the report of a recorded run as plain data."""
-    config, layout = loads(recording.config), recording.layout
+    config, layout = recording.rack_config, recording.layout
     ended, found = recording.ended, misses(recording, layout)
     report = _head(config, ended, _last_tick(recording) + 1)
     if not ended:
@@ -53,6 +54,8 @@ def report_of(recording: Recording) -> Report:
         **report,
         "folder": str(recording.folder),
         "misses": found,
+        "steal": steal(recording, layout),
+        "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
         "holds": holds(recording, layout),
         **faults(recording, layout),
         "tasks": {task.name: _task(recording, config, layout, task, counters) for task in layout.tasks},
@@ -66,7 +69,10 @@ def report_of(recording: Recording) -> Report:
 
 def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that nobody recorded: the same keys; null is what only a recording knows."""
-    unknown = ("misses", "holds", "faults", "unexplained", "restarts", "system_response", "task", "motion", "rows_lost")
+    unknown = (
+        *("misses", "steal", "notes", "holds", "faults", "unexplained", "restarts"),
+        *("system_response", "task", "motion", "rows_lost"),
+    )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
     head = _head(config, ended, 0)

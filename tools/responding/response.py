@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from boards.config import loads
 from levels.operator import Answer, What
 from tools.recording import Recording
 from tools.responding.course import Course, acting, courses
@@ -138,7 +137,7 @@ class Response:
 
 def response_of(recording: Recording) -> Response | None:
     """Return the response of a run; None where no operator commanded a level of the hierarchy."""
-    config, layout = loads(recording.config), recording.layout
+    config, layout = recording.rack_config, recording.layout
     found = courses(config, layout)
     given = [level for level in found if f"{level}.operator" in recording.mailboxes]
     if not given:

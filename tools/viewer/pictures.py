@@ -3,25 +3,43 @@
 from __future__ import annotations
 
 import argparse
+import shutil
+import socket
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from rerun.experimental import ViewerClient
 
+from tools.answer import Failure
 from tools.viewer.timelines import SIM_TIME
-from tools.viewer.window import executable, free_port
+from tools.viewer.window import HOST, Window, free_port, url
 
 PATIENCE_S = 30.0
+LOOK_S = 0.05
+DYING_S = 2.0
+"""A viewer without a driver listens first, and then ends."""
 PAUSE_S = 0.4
 """Two pictures this far apart that are the same: the viewer has drawn all it has."""
 NO_COMPLAINT = ("INFO", "DEBUG", "TRACE")
 SOFTWARE = "Software rasterizer"
 """What the viewer remarks where there is no graphics card; it draws all the same."""
+
+
+PACKAGES = (
+    *("mesa-vulkan-drivers", "libvulkan1", "libgl1-mesa-dri", "libegl1", "libxkbcommon0", "libxkbcommon-x11-0"),
+    *("libx11-xcb1", "libxcursor1", "libxi6", "libxrandr2"),
+)
+"""Debian's packages that draw where there is no graphics card; .ci/run installs them."""
+
+
+class NoViewerError(Failure):
+    """No picture can be drawn on this machine; the message says why, and what to install."""
 
 
 class Look(NamedTuple):
@@ -62,13 +80,46 @@ class Screen:
 
 @contextmanager
 def opened(recording: Path) -> Iterator[Screen]:
-    """Open a recording in a headless viewer. Raises `RuntimeError` where the machine lacks the graphics libraries."""
-    spawned = ViewerClient.spawn(
-        headless=True, port=free_port(), hide_welcome_screen=True, executable_path=executable()
-    )
-    with spawned as client:
-        client.open(str(recording.resolve()))
+    """Open a recording in a headless viewer. Raises `NoViewerError` where the machine lacks the graphics libraries."""
+    port = free_port()
+    # Started here: the viewer that `ViewerClient.spawn` starts listens to every machine around.
+    window = Window(headless=True, port=port)
+    try:
+        client = _connected(window, port)
+        try:
+            client.open(str(recording.resolve()))
+        except (ConnectionError, RuntimeError) as error:
+            raise NoViewerError(_why(window, error)) from None
         yield Screen(client)
+    finally:
+        window.close()
+
+
+def _connected(window: Window, port: int) -> ViewerClient:
+    deadline = time.monotonic() + PATIENCE_S
+    while window.is_open and time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex((HOST, port)) == 0:
+                return ViewerClient.connect(url(port))
+        time.sleep(LOOK_S)
+    raise NoViewerError(_why(window, f"it does not listen after {PATIENCE_S:g} s"))
+
+
+def _why(window: Window, otherwise: object) -> str:
+    """Return why there is no picture, and what helps on a machine without a graphics card."""
+    with suppress(TimeoutError):
+        window.await_end(DYING_S)
+    return f"{otherwise if window.is_open else window.wait()}; {packages_text()}"
+
+
+def packages_text() -> str:
+    """Return which of the packages that draw without a graphics card are missing."""
+    if shutil.which("dpkg-query") is None:
+        return f"a machine without a graphics card needs what Debian calls {' '.join(PACKAGES)}"
+    asked = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
+    found = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
+    missing = [name for name in PACKAGES if f"{name} install ok installed" not in found]
+    return f"missing packages: apt-get install {' '.join(missing)}" if missing else "no package for it is missing"
 
 
 def main() -> int:
@@ -79,8 +130,12 @@ def main() -> int:
     parser.add_argument("--at", type=float, required=True, metavar="S", help="simulated time to look at, s")
     parser.add_argument("--view", metavar="NAME", help="one view alone, as its title says")
     given = parser.parse_args()
-    with opened(given.recording) as screen:
-        look = screen.look(given.at, given.view)
+    try:
+        with opened(given.recording) as screen:
+            look = screen.look(given.at, given.view)
+    except Failure as failure:
+        print(failure, file=sys.stderr)
+        return failure.status
     given.out.write_bytes(look.picture)
     for complaint in look.complaints:
         print(complaint, file=sys.stderr)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
 
 from backplane.address_map import CLOCK
 from backplane.segment import Segment
-from backplane.words import System
+from backplane.words import Head, System
 from boards.config import loads
 from tools.timing.prediction import hierarchy
 from tools.viewer.ages import Age
@@ -32,6 +33,12 @@ BLOCK_S = 1.0
 """Simulated time in one block: a call costs the same for 4 rows and for 400."""
 
 
+def next_file(folder: Path) -> Path:
+    """Return the file to write: a recorder that was started again leaves run.rrd alone and writes run-2.rrd."""
+    names = chain([FILE], (f"run-{part}.rrd" for part in count(2)))
+    return next(folder / name for name in names if not (folder / name).is_file())
+
+
 class ViewSink:
     """Writes run.rrd of one rack into `folder`; with a port, serves it to a viewer of this machine as well."""
 
@@ -45,7 +52,8 @@ class ViewSink:
             cell = build_cell(config.robot, config.scene, config.clock_ns)
         self._times = Timelines(layout.clock_ns)
         view = blueprint(layout, config, cell, live=port is not None)
-        self._stream = stream = Stream(folder.name, folder / FILE, self._times, view, port)
+        run = f"{folder.name}-{words[Head.CREATED_NS]}"
+        self._stream = stream = Stream(folder.name, run, next_file(folder), self._times, view, port)
         write_document(stream, segment.config, config, layout)
         if cell is not None:
             write_geometry(stream, cell.model, cell.start())

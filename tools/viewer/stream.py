@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,14 +21,16 @@ SERVER_MEMORY = "200MB"
 class Stream:
     """One recording being written. Its entities are named by parts, which may hold any character.
 
-    Raises `RuntimeError` from `flush` once the file cannot be written.
+    Files of one `run` show as one recording. Raises `RuntimeError` from `flush` once the file cannot be written.
     """
 
-    def __init__(self, name: str, file: Path, times: Timelines, blueprint: rrb.Blueprint, port: int | None) -> None:
+    def __init__(
+        self, name: str, run: str, file: Path, times: Timelines, blueprint: rrb.Blueprint, port: int | None
+    ) -> None:
         self.times = times
         # Else a mistake is a warning on stderr and a hole in the recording.
         rr.set_strict_mode(True)
-        self._recording = rr.RecordingStream(APPLICATION, recording_id=f"{name}-{time.time_ns()}")
+        self._recording = rr.RecordingStream(APPLICATION, recording_id=run)
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
         sinks: list[rr.FileSink | rr.GrpcServerSink] = [rr.FileSink(str(file))]

@@ -14,22 +14,29 @@ from pathlib import Path
 from tools.answer import Failure
 
 HOST = "127.0.0.1"
+PANIC = "panicked at "
 
 
 class Window:
-    """A viewer that shows a recording's file, or what a recorder serves.
+    """A viewer that shows a recording's files, or what a recorder serves; with a `port` it takes orders there.
 
     Raises `Failure` when none is installed, or when there is no screen and `headless` does not ask for none.
     """
 
-    def __init__(self, source: str, headless: bool = False) -> None:
+    def __init__(self, *sources: str, headless: bool = False, port: int | None = None) -> None:
         if not (headless or has_screen()):
-            raise Failure(f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; where there is one: rerun {source}")
+            raise Failure(
+                f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; where there is one: rerun {' '.join(sources)}"
+            )
         # A file, no pipe: nobody reads what the viewer says while it is open.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window
         self._process = subprocess.Popen(
             # Without an address of its own the viewer would listen to every machine around.
-            [executable(), "--bind", HOST, source, *(["--headless"] if headless else [])],
+            [
+                *(executable(), "--bind", HOST, *sources),
+                *(["--headless", "--hide-welcome-screen"] if headless else []),
+                *([] if port is None else ["--port", str(port)]),
+            ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._said,
@@ -51,7 +58,21 @@ class Window:
             return ""
         self._said.seek(0)
         said = self._said.read().decode(errors="replace").strip().splitlines()
-        return ": ".join([f"the viewer ended with status {status}", *said[-1:]])
+        # A panic names its cause first, and a trace follows.
+        panic = [line.partition(PANIC)[2] for line in said if PANIC in line]
+        return ": ".join([f"the viewer ended with status {status}", *(panic or said[-1:])[:1]])
+
+    def await_end(self, bound_s: float) -> None:
+        """Wait for its end. Raises `TimeoutError`."""
+        try:
+            self._process.wait(bound_s)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError from None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the viewer runs."""
+        return self._process.poll() is None
 
     def close(self) -> None:
         """Close it."""
@@ -60,6 +81,7 @@ class Window:
             # The command is a script around the viewer: both are of its process group.
             os.killpg(self._process.pid, signal.SIGTERM)
             self._process.wait()
+        self._said.close()
 
 
 def has_screen() -> bool:

@@ -1,0 +1,42 @@
+"""A level that sends its launcher a signal at the moment of its life that MOMENT names, as often as SIGNALS has it."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from levels.level import Ports
+from tests.processes import parent_of
+from tests.two_levels import Upper
+
+TICK = 24
+
+
+def send(moment: str) -> None:
+    """Send the signals when this is their moment."""
+    if os.environ["MOMENT"] == moment:
+        # The launcher starts the crate, and the crate forks the boards.
+        here = {"config": os.getpid, "crate": os.getppid}.get(moment, lambda: parent_of(os.getppid()))
+        for number in os.environ["SIGNALS"].split():
+            os.kill(here(), int(number))
+
+
+send("crate" if "boards.crate" in sys.argv[0] or sys.argv[0].endswith("crate.py") else "config")
+
+
+class Signalling(Upper):
+    """Counts, and sends."""
+
+    def self_test(self) -> None:
+        """Send during the launch, when there is a segment."""
+        send("self-test")
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Send during the run."""
+        super().process(read, write, tick)
+        if tick == TICK:
+            send("cycle")
+
+    def close(self) -> None:
+        """Send while the rack is taken down."""
+        send("close")

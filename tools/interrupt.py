@@ -1,0 +1,168 @@
+"""What SIGINT, SIGTERM and SIGHUP do to a command: it ends with 128 + their number, within 2 s, and leaves nothing.
+
+A command that has nothing to finish ends inside the signal's handler. An exception raised there, as Python does for
+Ctrl-C, may come between the making of a segment and the line that remembers it, and libraries turn it into errors of
+their own while they are imported. A command that has something to finish says so with `orderly`, and gets BOUND_S.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple, NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+BOUND_S = 1.7
+"""From the first signal to the end of whatever is still being finished."""
+GONE_S = 0.25
+"""Bound of the wait for killed children."""
+SHOW_CURSOR = b"\x1b[?25h\n"
+
+
+class Interrupted(BaseException):
+    """Raised where a command waits, so that it withdraws what it has asked for."""
+
+
+class _Way(NamedTuple):
+    stop: Callable[[], object]
+    unfinished: str = ""
+    bound_s: float = BOUND_S
+
+
+class Interrupt:
+    """The signals of this process. `number` is that of the first one received, 0 before it."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._ways: list[_Way] = [_Way(self.end)]
+
+    @property
+    def name(self) -> str:
+        """Name of the signal received, as in SIGINT; empty before it."""
+        return signal.Signals(self.number).name if self.number else ""
+
+    def catch(self) -> None:
+        """Take the signals over; before it they kill the process, with the same exit status for a shell."""
+        for number in SIGNALS:
+            # A command under nohup shall outlive its terminal.
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self._receive)
+        signal.signal(signal.SIGALRM, lambda number, frame: self.end())
+
+    @contextmanager
+    def orderly(
+        self, stop: Callable[[], object] = lambda: None, unfinished: str = "", bound_s: float = BOUND_S
+    ) -> Iterator[None]:
+        """While this lasts the first signal calls `stop`, in its handler; the command then comes to its own end.
+
+        It has `bound_s` for that; `unfinished` tells the user what to do when that did not suffice.
+        """
+        self._ways.append(_Way(stop, unfinished, bound_s))
+        try:
+            if self.number:
+                stop()
+            yield
+        finally:
+            self._ways.pop()
+
+    def at_once(self) -> AbstractContextManager[None]:
+        """While this lasts a signal ends the process in its handler, also inside `orderly`."""
+        return self.orderly(self.end)
+
+    def raising(self) -> AbstractContextManager[None]:
+        """While this lasts the first signal raises `Interrupted`: for waits, and for files that go with a context."""
+        return self.orderly(_interrupted)
+
+    def settle(self) -> None:
+        """End the process as the signal demands, where there was one; to be called when the command is through."""
+        if self.number:
+            for stream in (sys.stdout, sys.stderr):
+                with suppress(OSError, ValueError):
+                    stream.flush()
+            self._ways = [_Way(self.end)]
+            self.end()
+
+    def end(self) -> NoReturn:
+        """Kill this process's children, remove its racks, and end, in this very moment."""
+        try:
+            signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
+            for step in (_kill_family, _remove_racks, self._take_leave):
+                # One that fails must not keep the others from their work, nor the process from its end.
+                with suppress(Exception):
+                    step()
+        finally:
+            os._exit(128 + self.number)
+
+    def _take_leave(self) -> None:
+        if os.isatty(1):
+            os.write(1, SHOW_CURSOR)
+        if unfinished := self._ways[-1].unfinished:
+            os.write(2, f"{unfinished}\n".encode())
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGHUP:
+            _leave_terminal()
+        if self.number:
+            self.end()
+        self.number = number
+        signal.setitimer(signal.ITIMER_REAL, self._ways[-1].bound_s)
+        self._ways[-1].stop()
+
+
+INTERRUPT = Interrupt()
+"""Signals are the process's, so there is one of it."""
+
+
+def _interrupted() -> None:
+    raise Interrupted
+
+
+def _leave_terminal() -> None:
+    """Have what is still printed go nowhere: writing to a terminal that is gone is an error."""
+    for fd in (1, 2):
+        with suppress(OSError):
+            if stat.S_ISCHR(os.fstat(fd).st_mode):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, fd)
+                os.close(nowhere)
+
+
+def _kill_family() -> None:
+    """Kill every descendant in this session, and wait for them; a viewer's window has a session of its own."""
+    family = list(_descendants(os.getpid(), os.getsid(0)))
+    for pid in family:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    deadline = time.monotonic() + GONE_S
+    while any(Path(f"/proc/{pid}/exe").exists() for pid in family) and time.monotonic() < deadline:
+        # Reaped where they are children; others go to whoever adopts them.
+        with suppress(ChildProcessError):
+            os.waitpid(-1, os.WNOHANG)
+        time.sleep(0.002)
+
+
+def _descendants(pid: int, session: int) -> Iterator[int]:
+    # Of a process that ends meanwhile nothing is left to read.
+    children: list[int] = []
+    with suppress(OSError):
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            children += map(int, (thread / "children").read_text().split())
+    for child in children:
+        with suppress(OSError):
+            if os.getsid(child) == session:
+                yield from _descendants(child, session)
+                yield child
+
+
+def _remove_racks() -> None:
+    # Looked up, not imported: in a handler a module may be half imported. Without it there are no racks.
+    remove_own = getattr(sys.modules.get("boards.clean"), "remove_own", None)
+    if remove_own is not None:
+        remove_own()
