@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
@@ -13,9 +14,11 @@ from backplane.fault_table import FaultTable
 from backplane.segment import Segment, unlink
 from backplane.words import Demand
 from boards.alarm_text import MISSES, event_of
-from boards.config import wire
+from boards.config import load, wire
+from boards.config.cell import geom_name
 from boards.events import Event
 from boards.faults.request import injections
+from levels.cell import build_cell
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
@@ -156,3 +159,17 @@ def test_the_end_of_a_fault_tells_how_often_it_acted(segment: Segment) -> None:
     FaultTable(segment).entries[2].acted(400, 1)
     event = heard(segment, CLOCK, Alarm.FAULT_ENDS, 2, 1.0)
     assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; it acted 1 time(s)")
+
+
+def test_a_collision_names_both_geoms(segment: Segment) -> None:
+    config = load("crossing")
+    assert config.robot is not None
+    robot, scene, clock_ns = config.robot, config.scene, config.clock_ns
+    cell = build_cell(robot, scene, clock_ns)
+    post, palm = (cell.model.geom(name).id for name in ("post", "palm"))
+    AlarmWriter(segment, "wave").ring(400, Alarm.COLLISION, post, palm)
+    row = alarm_ring(segment, "wave").drain().rows[-1]
+    geom = partial(geom_name, robot, scene, clock_ns)
+    event = event_of(row, "wave", segment.layout, FaultTable(segment), JOINTS, geom)
+    assert (event.code, event.subject) == ("collision", "post")
+    assert event.text == "unintended contact: 'post' touches 'palm'"
