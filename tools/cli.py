@@ -74,14 +74,15 @@ def main() -> None:
     # First of all: to import what commands need takes longer than many a command.
     INTERRUPT.catch()
     try:
-        _run()
+        run_commands()
     except Interrupted:
         return
     finally:
         INTERRUPT.settle()
 
 
-def _run() -> None:
+def run_commands() -> None:
+    """Run the command line in this process, its signals left alone."""
     from boards.errors import shown
     from tools.answer import Failure, fail
 

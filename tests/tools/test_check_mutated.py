@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from boards.config import CONFIGS, load, names
 from boards.config.text import to_toml
 from tools.answer import LONGEST_LINE
-from tools.cli import main
+from tools.cli import run_commands
 
 EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "300"))
 BOUND_S = 20
@@ -157,7 +157,7 @@ def check(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dic
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["rack", "check", *arguments, "--json"])
         with bounded(), pytest.raises(SystemExit) as ended:
-            main()
+            run_commands()
     document = json.loads(capsys.readouterr().out, parse_constant=no_constant)
     return int(ended.value.code or 0), document
 

@@ -23,6 +23,7 @@ from tools.campaign.interrupt import Interrupt
 from tools.campaign.plan import Plan
 from tools.campaign.results import Judged, keep
 from tools.campaign.trial import run_trial
+from tools.interrupt import INTERRUPT
 
 LOOK_S = 0.2
 """How often a campaign that waits for its trials looks whether it is to end."""
@@ -114,6 +115,7 @@ class Workers:
 
 def main() -> None:
     """Make the trials that come over a line, one after the other."""
+    INTERRUPT.catch()
     line, parent = Connection(int(sys.argv[1])), int(sys.argv[2])
     die_with_parent(parent)
     with Interrupt() as interrupt, suppress(EOFError):
