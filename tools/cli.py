@@ -46,7 +46,7 @@ def commands() -> typer.Typer:
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
-        epilog="Exit status: 0 it worked, 1 it did not, 2 usage or config error.",
+        epilog="Exit status: 0 it worked, 1 it did not, 2 usage or config error, 128 + N ended by signal N.",
     )
     app.command()(run)
     app.command()(check)
