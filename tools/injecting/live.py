@@ -105,7 +105,8 @@ class LiveRack:
         # Two faults of one run must not throw the same dice.
         given.setdefault("seed", (self._config.seed + words[System.INJECTED]) % SEEDS)
         try:
-            fault = FaultConfig.model_validate(given)
+            # What stands in a command line is text: there numbers are read, as in a config they are not.
+            fault = FaultConfig.model_validate(given, strict=False)
         except ValidationError as error:
             raise ConfigError(mistakes_of(error, FaultConfig, given)) from None
         if fault.kind == "self-test":
