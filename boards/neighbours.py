@@ -56,9 +56,10 @@ def _held(segment: Segment) -> dict[int, list[str]]:
     for task in segment.layout.tasks:
         if segment.block(task.name)[Block.PRIORITY]:
             held.setdefault(task.core, []).append(task.name)
-    clock = tomllib.loads(segment.config)["clock"]
+    # Any program may have made the segment: its config is a stranger's.
+    clock = tomllib.loads(segment.config).get("clock", {})
     # Where a board was refused its priority the clock was, too.
-    if held and clock["priority"]:
+    if held and clock.get("priority"):
         held.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
     return held
 
