@@ -71,6 +71,7 @@ class SensorMonitor:
         joints = len(home)
         self.position, self.velocity, self.doubt = home.copy(), np.zeros(joints), np.zeros(joints)
         self._raw = (home.copy(), np.zeros(joints))
+        self._unchanged = np.zeros(joints, dtype=bool)
         self._still, self._still_way, self._claimed = np.zeros(joints, dtype=int), np.zeros(joints), np.zeros(joints)
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
@@ -125,12 +126,21 @@ class SensorMonitor:
         if self.faulty or not stirs or np.count_nonzero(fits) < fits.size:
             self._doubtful(q, qd, way, fits & (np.abs(qd) <= fastest), room, passed_s)
             return
-        self._take(q, qd, change != 0.0)
+        self._take(q, qd, way, room)
 
-    def _take(self, q: Array, qd: Array, changed: Mask) -> None:
+    def doubt_unchanged(self) -> None:
+        """Doubt what showed no change in the last sample: a motor that seems to fail may be a sensor that is stuck."""
+        np.maximum(self.doubt, STUCK_RAD, out=self.doubt, where=self._unchanged)
+
+    def _take(self, q: Array, qd: Array, way: Array, room: Array) -> None:
+        """Trust a sample; say where that moves a joint by more than `room`, rad."""
+        np.equal(q, self._raw[0], out=self._unchanged)
         if np.count_nonzero(self.doubt):
+            off = q - self.position - way
+            for joint in np.flatnonzero(np.abs(off) > room):
+                self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
             # What does not change proves nothing: it may be stuck.
-            self.doubt[changed] = 0.0
+            self.doubt[~self._unchanged] = 0.0
         np.copyto(self.position, q)
         np.copyto(self.velocity, qd)
         np.copyto(self._raw[0], q)
@@ -185,8 +195,7 @@ class SensorMonitor:
         self._blame(good, q, q - self.position - way)
         self._suspect |= ~good
         if self._settled(bool(good.all())):
-            self._tell_offsets(q - self.position - way)
-            self._take(q, qd, (q != self._raw[0]) | (qd != self._raw[1]))
+            self._take(q, qd, way, self._room)
             return
         np.copyto(self._raw[0], q)
         np.copyto(self._raw[1], qd)
@@ -198,11 +207,6 @@ class SensorMonitor:
             amount = np.where(np.isfinite(off), np.abs(off), np.inf)
             joint = int(np.where(good, -1.0, amount).argmax())
             self.blamed = joint, float(q[joint]), float(off[joint])
-
-    def _tell_offsets(self, off: Array) -> None:
-        """Tell of joints that are taken over at another place than they were thought to be."""
-        for joint in np.flatnonzero(np.abs(off) > self._room):
-            self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
 
     def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
         """Let suspects go on, with their velocity where that is known; take the others as sensed.

@@ -177,3 +177,22 @@ def test_nasrem_goes_on_after_all_sensors_were_stuck_for_half_a_second() -> None
     done = rack.move.done
     rack.run(3.0, lambda rack: rack.read("elemental_move.status").done > done)
     assert rack.move.done > done
+
+
+def test_a_stuck_sensor_taken_for_a_failing_motor_is_trusted_again_where_the_joint_has_crept_to() -> None:
+    speed = np.full(6, 0.0015)  # too slow for a still sensor to be noticed
+    rig = ServoRig(ROBOT, SCENE, **{"patience": 5.0, "retry": 0.05})
+    rig.run(60, lambda time_s: (HOME, 0.0 * speed))
+    since = rig.status.target.copy()
+    rig.inject("sensor-stuck", joint=-1)
+    begun = 60 * 0.0025
+    for _ in range(2000):
+        rig.run(1, lambda time_s: (since + speed * (time_s - begun), speed))
+        if any(f.finding.alarm is Alarm.ACTUATOR for f in rig.found):
+            break
+    assert rig.status.braked, [f.finding for f in rig.found]
+    rest = rig.status.target.copy()
+    rig.heal()
+    rig.run(RECOVERS_TICKS, lambda time_s: (rest, 0.0 * speed))
+    assert follows(rig), rig.status.reason
+    assert [f for f in rig.found if f.finding.alarm is Alarm.RE_REFERENCED]
