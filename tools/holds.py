@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ from tools.campaign.ending import arm_of
 
 STILL_S = 5.0
 """Simulated time without motion after which a rack that is held says so as an event."""
+PASSED_ON = re.compile(r"(?:holding|waiting for \w+): ")
+SAME = 60
+"""Characters of a reason that tell it from others: the end of a long one is cut off on its way up."""
 OPERATED = frozenset({"standing", "order", "answer"})
 """Fields of a status by which a level that an operator commands is known."""
 
@@ -51,6 +55,15 @@ def resume_command(rack: str, level: str) -> str:
     return f"rack command {rack} {level} resume"
 
 
+def is_news(reason: str, told: list[str]) -> bool:
+    """Say whether a reason is none of those `told`, and add it: levels pass on the reason of the level below."""
+    origin = PASSED_ON.split(reason)[-1][:SAME]
+    if any(origin in other for other in told):
+        return False
+    told.append(reason)
+    return True
+
+
 class Holds:
     """Finds what holds a rack that runs."""
 
@@ -67,7 +80,9 @@ class Holds:
         """Return what holds the rack now, the arm first; nothing once its run is over."""
         if self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive:
             return ()
-        return (*self._stopped(), *(hold for level in self._statuses for hold in self._held(level)))
+        told: list[str] = []
+        held = (hold for level in self._statuses for hold in self._held(level))
+        return (*self._stopped(), *(hold for hold in held if hold.release or is_news(hold.why, told)))
 
     def _stopped(self) -> Iterator[Hold]:
         if self._lines.emergency_stop:

@@ -10,6 +10,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from tools.holds import is_news
 from tools.snapshot import DEAD, LOST, Progress, Snapshot, TaskRow
 from tools.text_table import fitting
 
@@ -112,7 +113,8 @@ def _reasons(snapshot: Snapshot) -> list[str]:
     """Return what tasks complain of; a hold gives its reason itself."""
     held = {hold.level for hold in snapshot.holds}
     rows = [row for row in snapshot.tasks if row.reason and not (row.state == "holding" and row.task in held)]
-    return [f"{row.task}: {row.reason}" for row in rows]
+    told = [hold.why for hold in snapshot.holds]
+    return [f"{row.task}: {row.reason}" for row in rows if is_news(row.reason, told)]
 
 
 def _tasks(rows: tuple[TaskRow, ...], width: int) -> Table:

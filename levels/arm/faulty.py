@@ -20,8 +20,8 @@ COMMAND_KINDS = ("command-nan", "command-limit")
 KINDS = SENSOR_KINDS + MOTOR_KINDS + COMMAND_KINDS
 
 APART = np.array([1e-2, 1e-2])
-"""Distance from the truth, rad and rad/s, from which on a sensor that is stuck is counted as wrong: of a joint that only
-creeps it need not be noticed before it has come that far."""
+"""Distance from the truth, rad and rad/s, from which on a sensor that is stuck is counted as wrong: while a joint only
+creeps, that need not be noticed before it has come that far."""
 SLIGHT = 0.02
 """Part of its torque limit that a motor must lack to count, beside what dry friction may hide."""
 
