@@ -190,7 +190,7 @@ def stranger(rack: str) -> str | None:
     """Return what stands under a rack's name that no rack has made, as in "directory"; None for a file, or nothing."""
     try:
         mode = shm_path(rack).lstat().st_mode
-    except FileNotFoundError:
+    except OSError:  # no such file, or a name that none can have
         return None
     kinds = {stat.S_IFDIR: "directory", stat.S_IFLNK: "symbolic link"}
     return None if stat.S_ISREG(mode) else kinds.get(stat.S_IFMT(mode), "special file")

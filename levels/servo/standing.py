@@ -48,7 +48,8 @@ class Standing:
             return ""
         if self.orders.standing is What.NONE:
             return "goes back to where the operator took over, then follows the level above"
-        return f"operator's {self.orders.standing.name.lower()}, until resume"
+        what = "held" if self.orders.standing is What.HOLD else f"at the {self.orders.standing.name.lower()}"
+        return f"{what} by the operator; `resume` goes on"
 
     def _judge(self, command: Message) -> None:
         """Take the goal of a set point, or refuse it."""

@@ -15,7 +15,7 @@ def test_a_counter_of_violations_that_counts_passes() -> None:
 
 
 def test_a_counter_of_violations_that_does_not_count_ends_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(LimitMonitor, "_count", lambda monitor, time_s: None)
+    monkeypatch.setattr(LimitMonitor, "_count", lambda monitor, *_: None)
     with pytest.raises(Failure, match=r"violation counter: joint 'j1' at \d+.* rad/s, twice its limit, is not counted"):
         examine(load("nasrem"))
 

@@ -24,7 +24,7 @@ TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 4)
 def recorded(folder: Path, missed: list[list[int]]) -> Path:
     """Write blocks of 400 cycles with misses at those ticks."""
     times = Timelines(TICK_NS)
-    stream = Stream("misses", folder / "run.rrd", times, rrb.Blueprint(), None)
+    stream = Stream("misses", "run", folder / "run.rrd", times, rrb.Blueprint(), None)
     part = Misses(stream, TASK)
     for number, ticks in enumerate(missed):
         rows = np.zeros(400, dtype=RECORD)
