@@ -64,7 +64,8 @@ class SystemController:
             away = tick - task.lost_tick
             task.rejoin()
             self._driver.alarms.ring(tick, Alarm.REJOINED, task.index, away)
-        elif task.is_given_up and not self._words[_EMERGENCY]:
+        elif task.is_given_up:
+            # Also where the latch is set already, as it is before the start.
             self._words[_EMERGENCY] = 1
             # The arm comes to rest before the run ends.
             ends = tick + self._wiring.linger
