@@ -39,11 +39,14 @@ class RealtimeDriver(ClockDriver):
         """Wait for nothing: time does not."""
 
     def _sleep_until_next(self, tick: int, epoch: int, period: int) -> int:
-        """Sleep to the next grid point; return the newest tick that has come by then."""
+        """Sleep to the next grid point; return the newest tick of the run that has come by then, or the one after."""
         wait = epoch + (tick + 1) * period - time.monotonic_ns()
         if wait > 0:
             time.sleep(wait * 1e-9)
         now = (time.monotonic_ns() - epoch) // period
+        if stop := self.words[System.STOP_TICK]:
+            # A late clock gives out the run's last tick all the same: who was to work in it is seen to be late.
+            now = min(now, stop - 1)
         # Never early: the wait may end a rounding error before its grid point.
         next_tick = max(tick + 1, now)
         self.words[System.CLOCK_SKIPPED] += next_tick - tick - 1

@@ -56,18 +56,19 @@ class NextCycle:
         self.skipped = 0
 
     def wait(self) -> int | None:
-        """Wait for the next release and return its tick; None when the run is over.
+        """Wait for the next release and return its tick; None when the run is over and every release was taken.
 
         Sets `skipped` to the releases that passed since the last one.
         """
-        while not self._clock.is_stopped:
+        while True:
+            # Looked at first: who is late for the run's last release still takes it, so that the miss is seen.
+            is_over = self._clock.is_stopped
             # The task's own release, not the clock's tick: in lockstep its turn may come later in a tick.
             newest = self._block[_RELEASED]
             if newest > self._last and newest >= self._not_before:
                 return self._take(newest)
-            if not (self._spin() if self._poll else self._block_on_semaphore()):
+            if is_over or not (self._spin() if self._poll else self._block_on_semaphore()):
                 return None
-        return None
 
     def _take(self, newest: int) -> int:
         """Take the oldest release that has not passed."""

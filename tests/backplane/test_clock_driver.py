@@ -78,6 +78,30 @@ def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> Non
     assert segment.words[System.CLOCK_SKIPPED] == left_out
 
 
+class Lagging:
+    """A controller that takes six ticks for every one of a run."""
+
+    def __init__(self) -> None:
+        self.ticks: list[int] = []
+
+    def begin(self, tick: int) -> None:
+        self.ticks.append(tick)
+        time.sleep(0.006)
+
+    def released(self, tick: int) -> None:
+        pass
+
+
+def test_a_late_clock_gives_out_the_last_tick_of_a_run(make_bus: MakeBus) -> None:
+    segment, controller = make_bus(), Lagging()
+    start(segment)
+    driver = RealtimeDriver(segment, lambda _: 5)
+    driver.controller = controller
+    driver.run()
+    assert controller.ticks[-1] == 4
+    assert segment.words[System.CLOCK_SKIPPED] == 5 - len(controller.ticks)
+
+
 def test_a_clock_that_starts_late_does_not_shift_its_grid(make_bus: MakeBus) -> None:
     segment = make_bus()
     start(segment, -10 * PERIOD_NS)

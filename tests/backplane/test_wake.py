@@ -112,6 +112,16 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment, poll: bool) -> None:
 
 
 @POLL
+def test_who_is_late_for_the_last_release_takes_it_all_the_same(bus: Segment, poll: bool) -> None:
+    cycle = NextCycle(bus, "level", poll)
+    for tick in (0, 4, 8):
+        release(bus, tick)
+    bus.words[System.STATE] = Run.STOPPED
+    assert (cycle.wait(), cycle.skipped) == (8, 2)
+    assert cycle.wait() is None
+
+
+@POLL
 def test_the_launchers_end_ends_a_wait(bus: Segment, poll: bool) -> None:
     bus.words[Head.LAUNCHER_START] += 1
     assert NextCycle(bus, "level", poll).wait() is None
