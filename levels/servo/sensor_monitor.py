@@ -23,6 +23,8 @@ STILL_CYCLES = 10
 """Cycles without the least change, under way, that no joint is capable of."""
 UNDER_WAY = 0.002
 """Velocity of the set point, rad/s, from which on a joint is under way."""
+PLAUSIBLE_RAD = 1e-3
+"""Offset of a joint that came with a fault of its sensor and is taken over at rest: a millimetre at the arm's reach."""
 STUCK_RAD = 0.01
 """How far a joint may have come until it is noticed that its sensor does not tell."""
 STUCK_STEPS = 3.0
@@ -42,11 +44,11 @@ class SensorMonitor:
 
     `position`, `velocity` (joints,), rad, rad/s, are the sample's if it is good. Where it is not, they go on with the
     sensed velocity or, without one, as the brakes stop the arm; `doubt` (joints,), rad, is how far off that may be.
-    A joint is good again where what it says fits to that, and from sample to sample to itself: an offset that is
-    greater than the doubt is never taken for the truth. `blamed`: joint, what it reads, rad, and by how much that is
-    off, rad; -1 and the age, ticks, of a sample that does not come. `fresh`: there is a sample of this cycle. `faulty`:
-    not yet `good_cycles` in a row were good, or `retry_cycles` where a joint that was stuck shows no change at rest.
-    `drivable`: velocities are known, so the arm could still be driven.
+    A joint is good again where what it says fits to that, and from sample to sample to itself, `good_cycles` in a row:
+    an offset that is greater than the doubt is never taken for the truth. `blamed`: joint, what it reads, rad, and by
+    how much that is off, rad; -1 and the age, ticks, of a sample that does not come. `fresh`: there is a sample of this
+    cycle. `faulty`: not yet `good_cycles` in a row were good, or `retry_cycles` where a joint that was stuck shows no
+    change at rest. `drivable`: velocities are known, so the arm could still be driven.
     """
 
     def __init__(
@@ -117,7 +119,7 @@ class SensorMonitor:
             fastest = STRUCK_SPEED * fastest
             room += passed_s * fastest
         # Never true for what is no number.
-        fits = np.abs(q - self.position - way) <= room + self.doubt
+        fits = np.abs(q - self.position - way) <= (room + self.doubt if self.faulty else room)
         stirs = self._stirs(q, qd, change, wanted, passed_s)
         if self._coarse:
             # Exact sensors that do not change show it in the next sample.
@@ -188,7 +190,10 @@ class SensorMonitor:
         self._unproven |= still
         self._unproven &= unchanged
         if begins:
-            # A sensor that shows no change beside one at fault may be stuck as well, since before that was found.
+            np.maximum(self.doubt, PLAUSIBLE_RAD, out=self.doubt)
+            # One that showed no change may have been stuck while its joint crept: it is off by that now it shows one.
+            self.doubt_unchanged()
+            # One that shows none now, beside another at fault, may be stuck as well, since before that was found.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged)
         self._still[still] = 0

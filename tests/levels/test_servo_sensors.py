@@ -128,6 +128,49 @@ def test_a_sensor_stuck_at_rest_is_found_once_its_joint_is_to_move() -> None:
     assert rig.status.position == pytest.approx(home, abs=1e-3)
 
 
+def test_a_joint_that_crept_while_its_sensor_was_stuck_is_trusted_again_where_it_is() -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    rig.inject("sensor-stuck", joint=3)
+    begun, crept = rig.rack.tick, home + np.array([0.0, 0.0, 0.0, 5e-4, 0.0, 0.0])
+    rig.run(200, lambda t: Course(home, crept, 0.5).at(t - begun * 0.0025))
+    assert rig.alarms() == []
+    rig.heal()
+    rig.run(40, lambda _: (crept, np.zeros(6)))
+    assert rig.alarms(*BRAKES) == [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED]
+    assert rig.status.reason == ""
+    assert rig.status.position == pytest.approx(rig.servo.arm.sense().position, abs=1e-6)
+
+
+def test_noise_on_a_joint_that_was_in_doubt_is_not_taken_for_where_it_is() -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    rig.inject("sensor-nan", joint=0)
+    rig.run(40, lambda _: (home, np.zeros(6)))
+    rig.heal()
+    rig.run(40, lambda _: (home, np.zeros(6)))
+    assert rig.status.stopped == 0
+    rig.inject("sensor-noise", size=0.01, joint=5)
+    for _ in range(100):
+        rig.run(1, lambda _: (home, np.zeros(6)))
+        assert rig.status.position == pytest.approx(home, abs=1e-3)
+    assert rig.alarms(*BRAKES)[-1] is Alarm.SENSOR_MODEL
+    rig.heal()
+    rig.run(40, lambda _: (home, np.zeros(6)))
+    assert rig.status.stopped == 0
+
+
+def test_an_offset_too_small_to_matter_is_taken_over_at_rest() -> None:
+    rig, slow = ServoRig(*config("puma560")), Course(move().start, GOAL, 30.0)
+    rig.run(400, slow.at)
+    rig.inject("sensor-bias", size=3e-4, joint=0)
+    rig.run(100, slow.at)
+    assert (rig.alarms(*BRAKES), rig.status.stopped) == ([Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED], 0)
+    rig.heal()
+    rig.run(100, slow.at)
+    assert (rig.alarms(*BRAKES), rig.status.stopped) == ([Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED] * 2, 0)
+
+
 def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:
     rig = rig_under_way()
     torque = rig.status.torque.copy()

@@ -102,3 +102,6 @@ def test_groups_of_fields_become_one_column_a_field() -> None:
     assert columns["a.path.points.at"].array(rows)[2].as_py() == list(np.arange(24.0, 36.0))
     assert columns["a.path.points.id"].array(rows)[4].as_py() == [16, 17, 18, 19]
     assert columns["a.path.why"].array(rows).to_pylist() == ["because"] * 5
+    # A message that was damaged on its way is recorded too.
+    rows["why"][3] = b"bec\x80use"
+    assert columns["a.path.why"].array(rows).to_pylist()[3] == "bec\ufffduse"

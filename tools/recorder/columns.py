@@ -40,7 +40,7 @@ class Column:
         for key in self.path:
             messages = messages[key]
         flat = np.ascontiguousarray(messages).reshape(-1)
-        values = pa.array(flat.astype(str) if self.kind[1] == "S" else flat)
+        values = pa.array(np.strings.decode(flat, "ascii", "replace") if self.kind[1] == "S" else flat)
         if not self.shape:
             return values
         offsets = np.arange(len(messages) + 1, dtype=np.int32) * prod(self.shape)
