@@ -23,8 +23,8 @@ LACKING = 0.02
 SURE_CYCLES = 4
 """Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
 WATCHED_CYCLES = 20
-"""Cycles in which it must be told more: the joint loop soon asks more of a motor that lacks torque, and only slowly more
-where a part is set down with so little force that dry friction hides it at the other joints."""
+"""Cycles in which it must be told more: of a motor that lacks torque the joint loop soon asks more; where a part is set
+down with so little force that dry friction hides it at the other joints, only slowly."""
 FOLLOWS = 0.3
 """Part of a rise in torque that a sound motor gives at least."""
 DEAD = 0.5

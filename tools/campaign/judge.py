@@ -90,7 +90,8 @@ class Circumstances:
 def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> Verdict:
     """Judge the faults of a run by what happened in it.
 
-    One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet.
+    One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet. A
+    fault of the arm that is over before it must be found, and is not found, has not struck.
     """
     return _Judge(strikes, events, run).verdict()
 
@@ -112,9 +113,11 @@ class _Judge:
         windows = [self._window(strike) for strike in self._strikes]
         for place, strike in enumerate(self._strikes):
             found = self._detections(strike, windows[place][1], used)
-            best = min(found, key=lambda detection: detection.order, default=None)
+            best = min((d for d in found if not self._is_of(d, place)), key=lambda d: d.order, default=None)
             if best is not None:
                 used.add(id(best.event))
+            elif self._is_brief(strike):
+                strike = replace(strike, tick=-1)
             judged.append(self._judgement(strike, best, self._horizon(place, windows[place][1])))
         stray = [event for event in self._events if self._is_stray(event, windows)]
         detections = tuple(event for event in stray if event.kind != "miss")
@@ -139,6 +142,17 @@ class _Judge:
     def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
         fresh = [e for e in candidates(self._events, strike, until) if id(e) not in used]
         return [self._detection(event, strike) for event in fresh]
+
+    def _is_of(self, late: Detection, place: int) -> bool:
+        """Say whether a detection, too late for one fault, is in time for one that struck after it."""
+        after = (strike for strike in self._strikes[place + 1 :] if fits(late.event, strike))
+        return not late.is_within and any(self._detection(late.event, strike).is_within for strike in after)
+
+    def _is_brief(self, strike: Strike) -> bool:
+        """Say whether a fault of the arm acted in fewer cycles than it may take to be found."""
+        if strike.tick < 0 or KINDS[NUMBERS[table_kind(strike.kind)]].where != "arm":
+            return False
+        return strike.count * self._cycles[strike.board] < (self._bound(strike, None) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
         delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
