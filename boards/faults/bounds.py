@@ -19,7 +19,8 @@ from boards.faults.kinds import Kind
 RACK_NS = 5_000_000
 """Within this time the Rack knows of a death: the kernel tells it by a pidfd."""
 MEMORY_NS = 45_000_000
-"""Real time that the kernel may take, before that, to give back the memory of a process that was killed."""
+"""Real time that the kernel may take, before that, to give back the memory of a process that was killed: up to half a
+millisecond a megabyte on a busy machine, and a planner with its libraries has 80."""
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
