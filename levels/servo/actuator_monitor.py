@@ -47,6 +47,10 @@ class ActuatorMonitor:
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
         self._limits, self._dry = cell.bounds.torque, np.array(cell.model.dof_frictionloss[cell.dof])
         self._following, self._period_s = following, period_s
+        # Simulated friction slows a joint as a damper of that time constant does: where the joint brakes harder, the
+        # friction turns round before the velocity does.
+        model, dof = cell.model, cell.dof
+        self._early = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
         self._fastest = TOO_FAST * cell.bounds.velocity
         self._least, self._speed_off = NOISE * self._limits, cell.encoders.speed_off
         self._exact, self._off = cell.encoders.exact, cell.encoders.off
@@ -101,9 +105,11 @@ class ActuatorMonitor:
         left *= -0.5
         left += self._torque
         left -= mat_vec(self._twice_inertia, gain)
+        gain *= self._early
+        gain += velocity
         friction = self._friction
-        np.minimum(velocity, self._velocity, out=friction[0])
-        np.maximum(velocity, self._velocity, out=friction[1])
+        np.minimum(gain, self._velocity, out=friction[0])
+        np.maximum(gain, self._velocity, out=friction[1])
         friction /= FRICTION_SPEED
         friction += TURNING
         friction[:] = each(math.tanh, friction)

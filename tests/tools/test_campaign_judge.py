@@ -261,6 +261,11 @@ def test_a_fault_that_may_be_latched_is_recovered_from_when_it_is_and_the_task_e
     assert not judged(strike("command-nan", "lower", 100, 2000), *events).is_recovered
 
 
+def test_what_is_latched_is_no_reaction_to_a_fault_that_cannot_be() -> None:
+    muted = judged(strike("mute", "lower", 100, 150), event(110, "reaction", "latched", "lower"))
+    assert (muted.reactions, muted.is_recovered) == ((), True)
+
+
 def test_misses_that_no_fault_explains_are_counted_apart_from_detections() -> None:
     miss = event(105, "miss", "late", "clock", "upper")
     assert verdict([strike("mute", "lower", 100, 150)], miss).misses == (miss,)

@@ -12,6 +12,8 @@ from tools.campaign.detection import table_kind
 from tools.campaign.ending import Strike
 
 BRAKES = "brakes_closed"
+LATCHED = "latched"
+"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Reactions, and the recovery that undoes each."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
@@ -48,7 +50,12 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermat
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles."""
+    """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles.
+
+    What is latched is a fault of a kind that may be.
+    """
+    if reaction.code == LATCHED:
+        return consequence(table_kind(strike.kind)).latches
     for_misses = reaction.code == BRAKES and reaction.value > 0
     return not for_misses or takes_cycles(strike)
 

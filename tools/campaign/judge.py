@@ -12,7 +12,7 @@ from boards.events import Event
 from boards.faults.bounds import MEMORY_NS, RACK_NS, bound_ticks, cycle_ticks, last_read
 from boards.faults.consequences import consequence, recovery_ticks
 from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.aftermath import Aftermath, aftermath, takes_cycles
+from tools.campaign.aftermath import LATCHED, Aftermath, aftermath, takes_cycles
 from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, explains, fits, table_kind
 from tools.campaign.ending import Strike
 from tools.campaign.plan import EXTERNAL
@@ -22,8 +22,6 @@ Seen = Literal["detected", "missed", "not struck"]
 Bound = Callable[[Strike, str | None], int | None]
 """Ticks in which a fault must be found, by a reader or, None, by whoever else."""
 
-LATCHED = "latched"
-"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
 SETTLE_S = 0.25
 """Simulated time behind a fault's bounds in which its traces may still be found."""
 
