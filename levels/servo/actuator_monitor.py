@@ -20,6 +20,8 @@ NOISE = 0.005
 """Part of a torque limit that the equation of motion leaves unexplained; ten times what faultless runs show."""
 LACKING = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
+RESTING = 0.1
+"""The same while most joints of an arm that holds a part rest: dry friction hides the push at all joints but one."""
 SURE_CYCLES = 4
 """Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
 WATCHED_CYCLES = 20
@@ -64,7 +66,6 @@ class ActuatorMonitor:
         self._cycles, self._joint = 0, -1
         self._told = self._gave = self._most = 0.0
         self._alone = True  # it is the one motor that lacks torque
-        self._pressed = np.full(joints, PRESSING)
 
     def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
         """Take the arm's state, rad/s, N m, at the beginning of a cycle, and the torques that it was given."""
@@ -79,8 +80,11 @@ class ActuatorMonitor:
         self._begun = self._pushed = False
         self._cycles = 0
 
-    def look(self, velocity: Array, terms: Terms, astray: Array) -> Finding | None:
-        """Judge the cycle that ends now, at `velocity`, rad/s, and `astray`, rad, from the set points."""
+    def look(self, velocity: Array, terms: Terms, astray: Array, holds: bool) -> Finding | None:
+        """Judge the cycle that ends now, at `velocity`, rad/s, and `astray`, rad, from the set points.
+
+        `holds`: the gripper holds a part, which may touch something.
+        """
         if not self._begun:
             return None
         far = np.abs(astray) - self._off
@@ -94,7 +98,7 @@ class ActuatorMonitor:
         if not np.count_nonzero(np.abs(left) > self._noise):
             self._cycles, self._pushed = 0, False
             return None
-        return self._lacking(left, velocity)
+        return self._lacking(left, velocity, holds)
 
     def _left_over(self, velocity: Array, terms: Terms) -> Array:
         """Return the torques, N m, that neither the motion nor any dry friction took."""
@@ -116,7 +120,7 @@ class ActuatorMonitor:
         friction *= self._dry
         return np.asarray(left - np.minimum(np.maximum(left, friction[0]), friction[1]))
 
-    def _lacking(self, left: Array, velocity: Array) -> Finding | None:
+    def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
         """Follow cycles in which motors that lack torque explain what is left over, until it is sure."""
         told = np.abs(self._torque)
         lacks = left * np.sign(self._torque)
@@ -124,7 +128,10 @@ class ActuatorMonitor:
         if not self._pushed and not explained.all():
             self._pushed, self._cycles = True, 0
         share = np.where(explained, lacks / self._limits, 0.0)
-        least = self._pressed if self._pushed else np.maximum(LACKING, self._noise / self._limits)
+        # Where a joint turns its dry friction is known, and any push shows.
+        rests = 2 * np.count_nonzero(self._friction[1] - self._friction[0] > self._noise) > len(left)
+        part = PRESSING if self._pushed else RESTING if rests and holds else LACKING
+        least = np.maximum(part, self._noise / self._limits)
         joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
         if share[joint] <= least[joint]:
             self._cycles = 0
@@ -134,7 +141,7 @@ class ActuatorMonitor:
             self._told, self._gave, self._most, self._alone = told[joint], told[joint] - lacks[joint], 0.0, True
         self._cycles += 1
         self._most = max(self._most, abs(told[joint] - lacks[joint]))
-        self._alone &= self._is_alone(joint, left)
+        self._alone &= not rests and np.count_nonzero(np.abs(left) > self._noise) == 1
         ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
         if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
             self._cycles = 0
@@ -142,12 +149,6 @@ class ActuatorMonitor:
         if self._cycles == WATCHED_CYCLES:
             self._cycles = 0
         return None
-
-    def _is_alone(self, joint: int, left: Array) -> bool:
-        """Say whether a motor is the only one that lacks torque, and most others turn, so that any push would show."""
-        unknown = self._friction[1] - self._friction[0] > self._noise
-        unknown[joint] = False
-        return bool(np.count_nonzero(np.abs(left) > self._noise) == 1 and 2 * np.count_nonzero(unknown) < len(left))
 
     def _sure(self, joint: int, told: float, lacks: float) -> bool:
         """Say whether the motor gives nothing, or no more though it is told more; or less than what pushes may take.

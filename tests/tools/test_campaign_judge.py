@@ -261,6 +261,31 @@ def test_a_fault_that_may_be_latched_is_recovered_from_when_it_is_and_the_task_e
     assert not judged(strike("command-nan", "lower", 100, 2000), *events).is_recovered
 
 
+def test_an_obstacle_that_moves_may_meet_an_arm_that_a_fault_has_kept_and_nothing_else_may() -> None:
+    hit = replace(found(300, "collision", "lower", "arm"), text="unintended contact: 'arm' touches 'post'")
+    events = (
+        event(100, "reaction", "brakes_closed", "lower"),
+        event(110, "recovery", "brakes_opened", "lower"),
+        hit,
+        event(300, "reaction", "brakes_closed", "lower"),
+    )
+    off = strike("actuator-off", "lower", 100, 110, count=9)
+    in_the_way = verdict([off], *events, run=replace(REAL_TIME, moving=("post",)))
+    assert in_the_way.unexplained == ()
+    # The brakes that it brings on are no reaction to the motor.
+    assert in_the_way.faults[0].recovery == 10
+    assert verdict([off], *events, run=replace(REAL_TIME, moving=("door",))).unexplained == (hit,)
+    after = replace(off, tick=301, began=301, ends=310)
+    assert verdict([after], *events, run=replace(REAL_TIME, moving=("post",))).unexplained == (hit,)
+
+
+def test_a_run_that_ends_before_the_bound_of_a_recovery_says_nothing_about_it() -> None:
+    events = (found(100, "command_invalid", "lower"), event(100, "reaction", "brakes_closed", "lower"))
+    nan = strike("command-nan", "lower", 100, 110)
+    assert judge([nan], [*events, event(209, "end", "")], REAL_TIME).faults[0].is_recovered
+    assert not judge([nan], [*events, event(210, "end", "")], REAL_TIME).faults[0].is_recovered
+
+
 def test_what_is_latched_is_no_reaction_to_a_fault_that_cannot_be() -> None:
     muted = judged(strike("mute", "lower", 100, 150), event(110, "reaction", "latched", "lower"))
     assert (muted.reactions, muted.is_recovered) == ((), True)

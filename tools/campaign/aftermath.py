@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from backplane.alarms import Alarm
 from boards.events import Event
 from boards.faults.consequences import consequence
 from boards.faults.kinds import KINDS, NUMBERS, Where
@@ -14,6 +15,8 @@ from tools.campaign.ending import Strike
 BRAKES = "brakes_closed"
 LATCHED = "latched"
 """Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
+COLLISION = Alarm.COLLISION.name.lower()
+"""Code of the detection to which brakes in the same tick are a reaction, and to no fault."""
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Reactions, and the recovery that undoes each."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
@@ -38,7 +41,9 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermat
     if strike.tick < 0:
         return Aftermath()
     after = [event for event in events if event.tick >= strike.tick]
-    reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon and _can_react(strike, e)]
+    struck = {e.tick for e in after if e.code == COLLISION}
+    to_fault = (e for e in after if e.kind == "reaction" and not (e.code == BRAKES and e.tick in struck))
+    reactions = [e for e in to_fault if e.tick < horizon and _can_react(strike, e)]
     undone = [_undone(reaction, after) for reaction in reactions]
     names = tuple(dict.fromkeys(event.code for event in reactions))
     required = consequence(table_kind(strike.kind)).reactions

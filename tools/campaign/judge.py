@@ -12,7 +12,7 @@ from boards.events import Event
 from boards.faults.bounds import MEMORY_NS, RACK_NS, bound_ticks, cycle_ticks, last_read
 from boards.faults.consequences import consequence, recovery_ticks
 from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.aftermath import LATCHED, Aftermath, aftermath, takes_cycles
+from tools.campaign.aftermath import COLLISION, LATCHED, Aftermath, aftermath, takes_cycles
 from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, explains, fits, table_kind
 from tools.campaign.ending import Strike
 from tools.campaign.plan import EXTERNAL
@@ -75,7 +75,8 @@ class Circumstances:
     """The run whose faults are judged.
 
     `offset_ns` turns CLOCK_MONOTONIC into the events' time. `restart_s`: simulated time that a restart may take.
-    `has_failed`: the task ended with an error, as some kinds have it.
+    `has_failed`: the task ended with an error, as some kinds have it. `moving`: obstacles that move, and may run into
+    an arm that a fault has kept where they pass.
     """
 
     layout: Layout
@@ -83,6 +84,7 @@ class Circumstances:
     is_lockstep: bool = False
     restart_s: float = 2.0
     has_failed: bool = False
+    moving: tuple[str, ...] = ()
 
 
 def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> Verdict:
@@ -181,6 +183,7 @@ class _Judge:
         seen: Seen = "not struck" if strike.tick < 0 else "missed" if best is None else "detected"
         bound = self._recovery_bound(strike, best)
         is_latched = self._is_latched(strike, after)
+        is_undone = after.is_undone and (after.recovery or 0) <= bound
         return Judgement(
             kind=strike.kind,
             board=strike.board,
@@ -200,7 +203,8 @@ class _Judge:
             bound_ms=best.bound_ms if best else None,
             is_within=best is not None and best.is_within,
             reactions=after.reactions,
-            is_recovered=is_latched or (after.is_undone and (after.recovery or 0) <= bound),
+            # A run that ends before the bound says nothing.
+            is_recovered=is_latched or self._last < strike.tick + bound or is_undone,
             recovery=after.recovery,
             recovery_bound=bound,
             lacking=() if strike.tick < 0 else after.lacking,
@@ -220,13 +224,18 @@ class _Judge:
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
         """Say whether no fault explains a detection, a death or a miss."""
-        if event.kind not in ("detection", "died", "miss"):
+        if event.kind not in ("detection", "died", "miss") or self._is_met(event):
             return False
         # What a task tells of has the tick of its release, and may come of anything until the end of its cycle.
         until = event.tick + self._cycles.get(event.board, 1) - 1
         windowed = zip(self._strikes, windows, strict=True)
         around = [strike for strike, (first, last) in windowed if first <= until and event.tick <= last]
         return not any(_explains(strike, event) for strike in around if strike.tick >= 0)
+
+    def _is_met(self, event: Event) -> bool:
+        """Say whether an obstacle has met an arm that was kept by a fault before, or waits for another way since."""
+        is_moving = event.code == COLLISION and any(f"'{name}'" in event.text for name in self._run.moving)
+        return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
 
 
 def _shown(strike: Strike, events: Sequence[Event]) -> Strike:
