@@ -50,6 +50,9 @@ class Limits:
 EDGE_TIMING_S = 0.1
 """A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
 the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and without the lag of a filter behind one."""
+PRESSING = 0.2
+"""Part of a torque limit that a contact takes at most where a task means one, as when a part is set down: a third more
+than tasks show."""
 SIGMAS = 6.0
 """Standard deviations of noise that a monitor allows for: less than one sample in a billion is farther off."""
 

@@ -19,7 +19,8 @@ from boards.faults.kinds import Kind
 RACK_NS = 5_000_000
 """Within this time the Rack knows of a death: the kernel tells it by a pidfd."""
 MEMORY_NS = 45_000_000
-"""Real time that the kernel may take, before that, to give back the memory of a process that was killed."""
+"""Real time that the kernel may take, before that, to give back the memory of a process that was killed: up to half a
+millisecond a megabyte on a busy machine, and a planner with its libraries has 80."""
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
@@ -94,8 +95,10 @@ BOUNDS: Mapping[str, Callable[[_Case], int]] = {
     "sensor-stuck": _cycles(20),
     "sensor-dropout": _cycles(2),
     "actuator-off": _cycles(5),
-    # What it gives is like a load that pulls, until it is told more and gives no more.
-    "actuator-saturated": _cycles(20),
+    # What it gives is like a load that pulls, until it is told more and gives no more. The joint loop tells it more by
+    # 0.3 of what it lacks in a cycle (twice its bandwidth, 60 rad/s, times the cycle), and a sound motor gives 0.3 of
+    # that at least. Dry friction that turns round may give all that it lacks when it strikes: 1 / (0.3 * 0.3) cycles.
+    "actuator-saturated": _cycles(12),
     # At the gate, in the same cycle: they never reach the arm.
     "command-nan": _cycles(0),
     "command-limit": _cycles(0),

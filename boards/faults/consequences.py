@@ -39,8 +39,9 @@ class Consequence(NamedTuple):
 _BRAKED = ("brakes_closed",)
 _DEATH = Consequence(own=(Alarm.STALE, Alarm.MUTE, Alarm.CLOCK_STOPPED), reactions=("restart",), ends_process=True)
 _SENSOR = Consequence(arm=SENSOR_ALARMS, reactions=_BRAKED, undone_s=1.0, latches=True)
-# A motor is tried again every half second, and for 20 cycles more before it is trusted.
-_MOTOR = Consequence(arm=(Alarm.ACTUATOR,), reactions=_BRAKED, undone_s=1.0, latches=True)
+# A motor is tried again every half second: then brakes open, and close again within 12 cycles if it still fails. What
+# one motor lacks is never laid to another: such an alarm is a false one.
+_MOTOR = Consequence(reactions=_BRAKED, undone_s=0.6, latches=True)
 _COMMAND = Consequence(reactions=_BRAKED)
 # What is damaged may be any word of the message's head: its serial, its ticks, its writer.
 _DAMAGE = Consequence(own=(Alarm.GAP, Alarm.HELD_BACK, Alarm.DISORDER, Alarm.MASQUERADE, Alarm.MUTE))

@@ -224,7 +224,7 @@ KINDS: tuple[Kind, ...] = (
         "arm",
         "a motor gives no more than a part of its torque",
         (Alarm.ACTUATOR,),
-        "20 cycles",
+        "12 cycles",
         (Parameter("part", "1", "of its largest torque", 0.1, 0.0, 0.9), _joint(1)),
     ),
     Kind("command-nan", "arm", "a torque is no number", (Alarm.COMMAND_INVALID,), "0 cycles", (_joint(),)),

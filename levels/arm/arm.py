@@ -63,6 +63,10 @@ class Arm(Link, Protocol):
     def contact(self) -> tuple[int, int] | None:
         """The geoms of an unintended contact of the arm, or of what it holds, since the last `step` began."""
 
+    @property
+    def leans(self) -> bool:
+        """Whether the arm, or what it holds, touches anything else."""
+
     def named(self, contact: tuple[int, int]) -> str:
         """Return what touches what."""
 

@@ -41,6 +41,12 @@ class ContactMonitor:
         if len(ours):
             self.struck = int(ours[0, 0]), int(ours[0, 1])
 
+    def leans(self, data: mujoco.MjData) -> bool:
+        """Say whether the arm, or what it holds, touches anything else."""
+        ours = self._arm | self._held(data)
+        one_sided = ours[data.contact.geom].sum(axis=1) == 1
+        return bool((one_sided & (data.contact.dist < 0.0)).any())
+
     def named(self, pair: tuple[int, int] | NDArray[np.int32]) -> str:
         """Return what touches what."""
         first, second = (geom_name(self._model, geom) for geom in pair)

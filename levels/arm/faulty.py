@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from levels.arm.arm import Arm, Sensed
 from levels.cell import Cell
 from levels.level import Fault, Finding
+from levels.limits import PRESSING
 
 Array = NDArray[np.float64]
 
@@ -23,7 +24,7 @@ APART = np.array([1e-2, 1e-2])
 """Distance from the truth, rad and rad/s, from which on a sensor that is stuck is counted as wrong: while a joint only
 creeps, that need not be noticed before it has come that far."""
 SLIGHT = 0.02
-"""Part of its torque limit that a motor must lack to count, beside what dry friction may hide."""
+"""Part of its torque limit that a motor must lack to count, beside what dry friction and a contact may hide."""
 
 
 class _Active(NamedTuple):
@@ -60,6 +61,8 @@ class FaultyLink:
         self._limits = limits = cell.bounds.torque
         # Friction that helped may now resist: it hides twice its value.
         self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
+        # What carried may now press.
+        self._pressed = 2.0 * PRESSING * limits
         self._sensors: list[_Active] = []
         self._motors: list[_Active] = []
         self._commands: list[_Active] = []
@@ -131,9 +134,10 @@ class FaultyLink:
         found = self._arm.drive(torque, grip_force)
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
+            hidden = self._hidden + self._pressed if self._arm.leans else self._hidden
             for active in self._motors:
                 lacking = asked - active.part * self._limits
-                if (lacking > self._hidden)[active.joints].any():
+                if (lacking > hidden)[active.joints].any():
                     self._acted.append(active.place)
         return found
 

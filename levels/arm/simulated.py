@@ -88,6 +88,11 @@ class SimulatedArm:
         """The geoms of an unintended contact of the arm, or of what it holds, in the last `step`."""
         return self._contacts.struck
 
+    @property
+    def leans(self) -> bool:
+        """Whether the arm, or what it holds, touches anything else."""
+        return self._contacts.leans(self._data)
+
     def named(self, contact: tuple[int, int]) -> str:
         """Return what touches what."""
         return self._contacts.named(contact)

@@ -237,14 +237,17 @@ class ElementalMoveExecutor(Executor):
         report.progress = status.progress if is_begun else 0.0
         under_way_at = np.flatnonzero(command.moves["id"][: command.count] == report.current)
         report.verb = int(command.moves["verb"][under_way_at[0]]) if report.current and under_way_at.size else Verb.NONE
-        self._report_plans(command, status, report)
+        self._report_plans(command, status, segments, report)
         report.replan = self._request
         report.start = status.position
 
-    def _report_plans(self, command: Message, status: Message, report: Message) -> None:
+    def _report_plans(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
         """Say how far plans are at hand: from there the planner goes on."""
         report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
         end = self._plans.end(report.planned)
+        if end is None:
+            # Handed down before this board started anew, or in place of such a path since.
+            end = segments.end()
         if report.planned <= self._done and status.resting:
             report.end = status.position
         elif end is not None:

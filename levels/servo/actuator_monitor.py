@@ -12,6 +12,7 @@ from levels.algebra import each, mat_vec
 from levels.cell import Cell
 from levels.dynamics import FRICTION_SPEED, Terms
 from levels.level import Finding
+from levels.limits import PRESSING
 
 Array = NDArray[np.float64]
 
@@ -19,10 +20,17 @@ NOISE = 0.005
 """Part of a torque limit that the equation of motion leaves unexplained; ten times what faultless runs show."""
 LACKING = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
+RESTING = 0.1
+"""The same while most joints of an arm that holds a part rest: dry friction hides the push at all joints but one."""
 SURE_CYCLES = 4
 """Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
+WATCHED_CYCLES = 20
+"""Cycles in which it must be told more: of a motor that lacks torque the joint loop soon asks more; where a part is set
+down with so little force that dry friction hides it at the other joints, only slowly."""
 FOLLOWS = 0.3
 """Part of a rise in torque that a sound motor gives at least."""
+DEAD = 0.5
+"""Part of its torque that a motor must lack to be dead where dry friction hides how much it gives."""
 TOO_FAST = 0.99
 """Part of a velocity limit; a joint that may come to it while motors lack torque leaves no time to be sure."""
 TURNING = np.array([[-2.0], [2.0]])
@@ -33,13 +41,18 @@ class ActuatorMonitor:
     """Holds the torques that a motion took against the torques that were given for it.
 
     What is left over is explained by motors that gave less than they were told, or it is not: then something outside
-    pushes. A load that pulls looks like that for a cycle or two; but with a load a motor that is told more gives more.
+    pushes, until nothing is left over, and only a motor that lacks more than `PRESSING` is at fault. A load that pulls
+    looks like a motor that lacks torque for a cycle or two; but with a load a motor that is told more gives more.
     An arm that strays from its set points by more than `following`, rad, has a motor too few as well.
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
         self._limits, self._dry = cell.bounds.torque, np.array(cell.model.dof_frictionloss[cell.dof])
         self._following, self._period_s = following, period_s
+        # Simulated friction slows a joint as a damper of that time constant does: where the joint brakes harder, the
+        # friction turns round before the velocity does.
+        model, dof = cell.model, cell.dof
+        self._early = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
         self._fastest = TOO_FAST * cell.bounds.velocity
         self._least, self._speed_off = NOISE * self._limits, cell.encoders.speed_off
         self._exact, self._off = cell.encoders.exact, cell.encoders.off
@@ -49,8 +62,10 @@ class ActuatorMonitor:
         self._bias, self._velocity, self._torque = np.zeros((3, joints))
         self._friction = np.zeros((2, joints))
         self._begun = False
+        self._pushed = False  # what was left over is not explained by motors
         self._cycles, self._joint = 0, -1
         self._told = self._gave = self._most = 0.0
+        self._alone = True  # it is the one motor that lacks torque
 
     def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
         """Take the arm's state, rad/s, N m, at the beginning of a cycle, and the torques that it was given."""
@@ -62,10 +77,14 @@ class ActuatorMonitor:
 
     def drop(self) -> None:
         """Forget the cycle that was begun: brakes, missed cycles or wrong samples came in between."""
-        self._begun, self._cycles = False, 0
+        self._begun = self._pushed = False
+        self._cycles = 0
 
-    def look(self, velocity: Array, terms: Terms, astray: Array) -> Finding | None:
-        """Judge the cycle that ends now, at `velocity`, rad/s, and `astray`, rad, from the set points."""
+    def look(self, velocity: Array, terms: Terms, astray: Array, holds: bool) -> Finding | None:
+        """Judge the cycle that ends now, at `velocity`, rad/s, and `astray`, rad, from the set points.
+
+        `holds`: the gripper holds a part, which may touch something.
+        """
         if not self._begun:
             return None
         far = np.abs(astray) - self._off
@@ -77,9 +96,9 @@ class ActuatorMonitor:
             # What encoders may make of a gain in velocity that there is not.
             self._noise = self._least + mat_vec(np.abs(terms.inertia), 2.0 * self._speed_off / self._period_s)
         if not np.count_nonzero(np.abs(left) > self._noise):
-            self._cycles = 0
+            self._cycles, self._pushed = 0, False
             return None
-        return self._lacking(left, velocity)
+        return self._lacking(left, velocity, holds)
 
     def _left_over(self, velocity: Array, terms: Terms) -> Array:
         """Return the torques, N m, that neither the motion nor any dry friction took."""
@@ -90,41 +109,57 @@ class ActuatorMonitor:
         left *= -0.5
         left += self._torque
         left -= mat_vec(self._twice_inertia, gain)
+        gain *= self._early
+        gain += velocity
         friction = self._friction
-        np.minimum(velocity, self._velocity, out=friction[0])
-        np.maximum(velocity, self._velocity, out=friction[1])
+        np.minimum(gain, self._velocity, out=friction[0])
+        np.maximum(gain, self._velocity, out=friction[1])
         friction /= FRICTION_SPEED
         friction += TURNING
         friction[:] = each(math.tanh, friction)
         friction *= self._dry
         return np.asarray(left - np.minimum(np.maximum(left, friction[0]), friction[1]))
 
-    def _lacking(self, left: Array, velocity: Array) -> Finding | None:
-        """Follow cycles in which motors that lack torque explain all that is left over, until it is sure."""
+    def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
+        """Follow cycles in which motors that lack torque explain what is left over, until it is sure."""
         told = np.abs(self._torque)
         lacks = left * np.sign(self._torque)
         explained = (lacks >= -self._noise) & (lacks <= told + self._noise)
-        share = lacks / self._limits
-        least = np.maximum(LACKING, self._noise / self._limits)
+        if not self._pushed and not explained.all():
+            self._pushed, self._cycles = True, 0
+        share = np.where(explained, lacks / self._limits, 0.0)
+        # Where a joint turns its dry friction is known, and any push shows.
+        rests = 2 * np.count_nonzero(self._friction[1] - self._friction[0] > self._noise) > len(left)
+        part = PRESSING if self._pushed else RESTING if rests and holds else LACKING
+        least = np.maximum(part, self._noise / self._limits)
         joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
-        if not explained.all() or share[joint] <= least[joint]:
+        if share[joint] <= least[joint]:
             self._cycles = 0
             return None
         if self._cycles == 0 or joint != self._joint:
             self._joint, self._cycles = joint, 0
-            self._told, self._gave, self._most = told[joint], told[joint] - lacks[joint], 0.0
+            self._told, self._gave, self._most, self._alone = told[joint], told[joint] - lacks[joint], 0.0, True
         self._cycles += 1
         self._most = max(self._most, abs(told[joint] - lacks[joint]))
+        self._alone &= not rests and np.count_nonzero(np.abs(left) > self._noise) == 1
         ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
         if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
             self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
+        if self._cycles == WATCHED_CYCLES:
+            self._cycles = 0
         return None
 
     def _sure(self, joint: int, told: float, lacks: float) -> bool:
-        """Say whether the motor gives nothing, or no more though it is told more."""
+        """Say whether the motor gives nothing, or no more though it is told more; or less than what pushes may take.
+
+        One that gives nothing may seem to give what dry friction does: twice its value, where that turns round.
+        """
         if self._cycles < SURE_CYCLES:
             return False
+        if self._pushed:
+            return True
         more, rise = told - self._told, told - lacks - self._gave
         certain = 2.0 * self._noise[joint]
-        return bool(self._most <= certain or (more > certain and rise < FOLLOWS * more))
+        hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD * told else 0.0
+        return bool(self._most <= certain + hidden or (more > certain and rise < FOLLOWS * more))

@@ -148,7 +148,8 @@ class ServoExecutor(Executor):
         position, velocity = self.sensors.position, self.sensors.velocity
         wanted = self._next_motion(command, reaction, missed, tick)
         terms = self._loop.terms(position, velocity, plan)
-        failed = self.motors.look(velocity, terms, wanted.position - position)
+        holds = plan is not None and plan.held >= 0
+        failed = self.motors.look(velocity, terms, wanted.position - position, holds)
         if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
             return self._brake()
         if reaction is Reaction.STOP and (self._left or not wanted.velocity.any()):

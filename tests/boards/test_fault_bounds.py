@@ -45,7 +45,7 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
     "sensor-stuck": ({"kind": "sensor-stuck", "board": "driven"}, None, 40),
     "sensor-dropout": ({"kind": "sensor-dropout", "board": "driven"}, None, 4),
     "actuator-off": ({"kind": "actuator-off", "board": "driven"}, None, 10),
-    "actuator-saturated": ({"kind": "actuator-saturated", "board": "driven"}, None, 40),
+    "actuator-saturated": ({"kind": "actuator-saturated", "board": "driven"}, None, 24),
     "command-nan": ({"kind": "command-nan", "board": "driven"}, None, 0),
     "command-limit": ({"kind": "command-limit", "board": "driven"}, None, 0),
     "by its size": ({"kind": "sensor-bias", "board": "driven"}, None, None),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
 from backplane.alarms import Alarm
 from levels.arm import FaultyLink, SimulatedArm
+from levels.cell import Cell
 from levels.dynamics import Dynamics
 from levels.level import Fault
 from tests.levels.arms import CLOCK_NS, cell, config
@@ -130,3 +132,27 @@ def test_a_joint_that_the_arm_lacks_is_never_struck() -> None:
     assert np.array_equal(link.sense().position, arm.sense().position)
     link.drive(HOLDING, 0.0)
     assert acted == []
+
+
+def test_a_motor_that_is_off_counts_later_where_a_part_that_is_held_leans_on_something() -> None:
+    for leans, acts in ((False, [0]), (True, [])):
+        made, acted = cell("puma560"), list[int]()
+        arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
+        lay_against_a_finger(made, arm, blocks=1 + leans)
+        assert arm.leans is leans
+        link = FaultyLink(arm, made, 1, acted)
+        link.inject([fault("actuator-off", joint=1)])
+        link.drive(HOLDING, 0.0)
+        assert acted == acts
+
+
+def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
+    """Put a block where one finger is, so that it is held, and another so that it touches the first alone."""
+    data = arm._data
+    mujoco.mj_forward(made.model, data)
+    finger = next(int(geom) for geom in made.gripper_geoms if made.model.geom(int(geom)).name.startswith("pad"))
+    place = data.geom_xpos[finger].copy()
+    for nth, body in enumerate(made.bodies[:blocks]):
+        address = made.model.jnt_qposadr[made.model.body_jntadr[body]]
+        data.qpos[address : address + 3] = place + np.array([0.049 * nth, 0.0, 0.0])
+    mujoco.mj_forward(made.model, data)

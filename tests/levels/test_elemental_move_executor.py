@@ -302,6 +302,19 @@ def test_restarted_executor_goes_on_with_its_own_last_messages() -> None:
     assert bench.segments() == [(3, 3), (4, 4)]
 
 
+def test_after_a_restart_the_next_path_goes_on_from_the_one_that_replaced_what_was_blocked() -> None:
+    bench = planned_bench()
+    bench.restart("elemental_move")
+    bench.cycle(2, blocked=1, current=1)
+    bench.plan(1, bench.home, replan=bench.status.replan)
+    bench.cycle(1, blocked=0, current=3, resting=0)
+    assert [move for _, move in bench.segments()] == [1]
+    assert (bench.status.planned, bench.status.end) == (1, pytest.approx(bench.home + 0.1))
+    bench.plan(2, bench.home + 0.2)  # where move 2 was to end before it was withdrawn
+    bench.cycle(2)
+    assert [move for _, move in bench.segments()] == [1]
+
+
 def test_arm_is_held_while_the_board_above_is_lost() -> None:
     bench = planned_bench()
     bench.boxes["task.command"].lost = True

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from backplane.alarms import Alarm
 from tests.levels.arms import config
-from tests.levels.servo_rig import TICK_S, ServoRig
+from tests.levels.servo_rig import TICK_S, Course, ServoRig
 
 Array = NDArray[np.float64]
 
@@ -165,3 +165,20 @@ def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torqu
     rig.run(1600, lambda _: goal)
     assert rig.status.position == pytest.approx(goal[0], abs=1e-3)
     assert rig.status.violations == 0
+
+
+def test_a_motor_off_is_found_where_dry_friction_turns_round_and_hides_what_it_gives() -> None:
+    rig = ServoRig(*config("puma560"))
+    home = np.array(config("puma560")[0].home)
+    # The first joint comes to rest while the others go on.
+    first, others = Course(home, home + 0.4, 1.0), Course(home, home + 0.4, 2.0)
+    turning = np.array([True, *[False] * 5])
+
+    def motion(time_s: float) -> tuple[Array, Array]:
+        (q1, v1), (q, v) = first.at(time_s), others.at(time_s)
+        return np.where(turning, q1, q), np.where(turning, v1, v)
+
+    rig.run(380, motion)
+    begun = rig.inject("actuator-off", joint=0)
+    rig.run(10, motion)
+    assert [tick - begun for tick in found(rig)] == [4]

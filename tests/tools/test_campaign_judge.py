@@ -252,13 +252,43 @@ def test_a_fault_that_may_be_latched_is_recovered_from_when_it_is_and_the_task_e
         event(100, "reaction", "brakes_closed", "lower"),
         event(900, "reaction", "latched", "lower"),
     )
-    stuck = strike("sensor-stuck", "lower", 100, 2000)
+    stuck = strike("sensor-stuck", "lower", 100, 2000, count=1900)
     failed = judged(stuck, *events, run=replace(REAL_TIME, has_failed=True))
     assert (failed.is_latched, failed.is_recovered) == (True, True)
     assert not judged(stuck, *events).is_recovered
     # A rack that just waits has not latched anything.
     assert not judged(stuck, events[0], run=replace(REAL_TIME, has_failed=True)).is_recovered
     assert not judged(strike("command-nan", "lower", 100, 2000), *events).is_recovered
+
+
+def test_an_obstacle_that_moves_may_meet_an_arm_that_a_fault_has_kept_and_nothing_else_may() -> None:
+    hit = replace(found(300, "collision", "lower", "arm"), text="unintended contact: 'arm' touches 'post'")
+    events = (
+        event(100, "reaction", "brakes_closed", "lower"),
+        event(110, "recovery", "brakes_opened", "lower"),
+        hit,
+        event(300, "reaction", "brakes_closed", "lower"),
+    )
+    off = strike("actuator-off", "lower", 100, 110, count=9)
+    in_the_way = verdict([off], *events, run=replace(REAL_TIME, moving=("post",)))
+    assert in_the_way.unexplained == ()
+    # The brakes that it brings on are no reaction to the motor.
+    assert in_the_way.faults[0].recovery == 10
+    assert verdict([off], *events, run=replace(REAL_TIME, moving=("door",))).unexplained == (hit,)
+    after = replace(off, tick=301, began=301, ends=310)
+    assert verdict([after], *events, run=replace(REAL_TIME, moving=("post",))).unexplained == (hit,)
+
+
+def test_a_run_that_ends_before_the_bound_of_a_recovery_says_nothing_about_it() -> None:
+    events = (found(100, "command_invalid", "lower"), event(100, "reaction", "brakes_closed", "lower"))
+    nan = strike("command-nan", "lower", 100, 110)
+    assert judge([nan], [*events, event(209, "end", "")], REAL_TIME).faults[0].is_recovered
+    assert not judge([nan], [*events, event(210, "end", "")], REAL_TIME).faults[0].is_recovered
+
+
+def test_what_is_latched_is_no_reaction_to_a_fault_that_cannot_be() -> None:
+    muted = judged(strike("mute", "lower", 100, 150), event(110, "reaction", "latched", "lower"))
+    assert (muted.reactions, muted.is_recovered) == ((), True)
 
 
 def test_misses_that_no_fault_explains_are_counted_apart_from_detections() -> None:
@@ -279,6 +309,38 @@ def test_in_lockstep_a_death_that_the_clock_knows_nothing_of_has_neighbours_for_
     died = Event(900 * TICK_NS, 190, "died", "lower", "died", "died")
     fault = judged(strike(EXTERNAL, "lower", 100), died, run=LOCKSTEP)
     assert (fault.seen, fault.delay, fault.bound, fault.is_within) == ("detected", 90, None, True)
+
+
+def test_brakes_that_are_engaged_when_a_fault_strikes_need_not_be_engaged_for_it() -> None:
+    torque = strike("command-limit", "lower", 100, 110, joint="elbow")
+    refused = found(100, "command_limit", "lower", "elbow")
+    engaged, released = event(60, "reaction", "brakes_closed"), event(110, "recovery", "brakes_opened")
+    assert judged(torque, refused, engaged, released).lacking == ()
+    assert judged(torque, refused, engaged, replace(released, tick=99)).lacking == ("brakes_closed",)
+    # For missed cycles they were engaged until there was torque again.
+    assert judged(torque, refused, replace(engaged, value=3.0), released).lacking == ("brakes_closed",)
+
+
+def test_what_is_too_late_for_one_fault_and_in_time_for_the_next_is_of_the_next() -> None:
+    stuck = strike("sensor-stuck", "lower", 100, 200, joint="elbow", count=90)
+    noise = strike("sensor-noise", "lower", 300, 350, place=1, joint="elbow", size=1.0)
+    first, second = verdict([stuck, noise], found(300, "sensor_model", "lower", "elbow")).faults
+    assert (first.seen, second.seen, second.delay) == ("missed", "detected", 0)
+
+
+@pytest.mark.parametrize(("count", "seen"), [(4, "not struck"), (5, "missed")])
+def test_a_fault_of_the_arm_that_is_over_before_it_must_be_found_has_not_struck(count: int, seen: str) -> None:
+    off = strike("actuator-off", "lower", 100, 150, joint="elbow", count=count)
+    assert judged(off).seen == seen
+    late = replace(off, count=4)
+    assert judged(late, found(103, "actuator", "lower", "elbow")).seen == "detected"
+
+
+def test_no_motor_at_fault_explains_an_alarm_about_another() -> None:
+    wrist = found(104, "actuator", "lower", "wrist")
+    off = strike("actuator-off", "lower", 100, 150, joint="elbow")
+    assert verdict([off], wrist).unexplained == (wrist,)
+    assert verdict([replace(off, joint="")], wrist).unexplained == ()
 
 
 def test_a_fault_of_the_arm_that_is_found_has_struck_however_slight_it_was() -> None:

@@ -88,6 +88,16 @@ def test_a_task_is_safely_stopped_when_the_arm_stands_and_no_limit_was_violated(
     assert Judged.of(replace(lost, arm=Arm(violations=1))).ended == "neither"
 
 
+def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -> None:
+    events = (found(100, "command_invalid", "lower"), event(100, "reaction", "brakes_closed"))
+    released = event(110, "recovery", "brakes_opened")
+    braked = trial(*events, released, strikes=(strike("command-nan", "lower", 100, 110),))
+    late = replace(braked, outcome=outcome("task refused"), is_late=True)
+    assert Judged.of(late).shortfalls == []
+    assert Judged.of(replace(late, is_late=False)).shortfalls != []
+    assert Judged.of(replace(late, strikes=(FAULT,), events=(SEEN,))).shortfalls != []
+
+
 def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_it() -> None:
     good = refused("self-test", "board 'lower': the self-test fails")
     assert (good.ended, good.shortfalls) == ("not armed", [])

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from backplane.alarms import Alarm
 from boards.events import Event
 from boards.faults.consequences import consequence
 from boards.faults.kinds import KINDS, NUMBERS, Where
 from tools.campaign.detection import table_kind
 from tools.campaign.ending import Strike
 
-UNDONE_BY: Mapping[str, str] = {"brakes_closed": "brakes_opened", "demand": "demand", "restart": "rejoined"}
+BRAKES = "brakes_closed"
+LATCHED = "latched"
+"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
+COLLISION = Alarm.COLLISION.name.lower()
+"""Code of the detection to which brakes in the same tick are a reaction, and to no fault."""
+UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Reactions, and the recovery that undoes each."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
 """Where faults strike that keep boards from their cycles."""
@@ -20,7 +26,8 @@ TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
 class Aftermath(NamedTuple):
     """Reactions by code, whether all of them were undone, and the ticks from the strike to the last undone.
 
-    `lacking`: codes of reactions that must come after a fault of this kind, and did not.
+    `lacking`: codes of reactions that must come after a fault of this kind, and did not; brakes that were engaged
+    when it struck cannot be engaged again.
     """
 
     reactions: tuple[str, ...] = ()
@@ -34,10 +41,13 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermat
     if strike.tick < 0:
         return Aftermath()
     after = [event for event in events if event.tick >= strike.tick]
-    reactions = [e for e in after if e.kind == "reaction" and e.tick < horizon and _can_react(strike, e)]
+    struck = {e.tick for e in after if e.code == COLLISION}
+    to_fault = (e for e in after if e.kind == "reaction" and not (e.code == BRAKES and e.tick in struck))
+    reactions = [e for e in to_fault if e.tick < horizon and _can_react(strike, e)]
     undone = [_undone(reaction, after) for reaction in reactions]
     names = tuple(dict.fromkeys(event.code for event in reactions))
-    lacking = tuple(code for code in consequence(table_kind(strike.kind)).reactions if code not in names)
+    required = consequence(table_kind(strike.kind)).reactions
+    lacking = tuple(c for c in required if c not in names and not (c == BRAKES and _are_engaged(strike.tick, events)))
     last = max((tick for tick in undone if tick is not None), default=None)
     if None in undone or last is None:
         return Aftermath(names, None not in undone, None, lacking)
@@ -45,8 +55,13 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermat
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles."""
-    for_misses = reaction.code == "brakes_closed" and reaction.value > 0
+    """Say whether a reaction can be to a fault: brakes that close for missed cycles are to one that takes cycles.
+
+    What is latched is a fault of a kind that may be.
+    """
+    if reaction.code == LATCHED:
+        return consequence(table_kind(strike.kind)).latches
+    for_misses = reaction.code == BRAKES and reaction.value > 0
     return not for_misses or takes_cycles(strike)
 
 
@@ -55,9 +70,16 @@ def takes_cycles(strike: Strike) -> bool:
     return KINDS[NUMBERS[table_kind(strike.kind)]].where in TAKE_CYCLES
 
 
+def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
+    """Say whether the brakes were engaged before a tick, and are released after it."""
+    before = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
+    undone = (_undone(event, events) for event in before)
+    return any(released is None or released > tick for released in undone)
+
+
 def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
     """Return the tick at which a reaction was undone; None when it was not."""
-    if reaction.code == "brakes_closed" and reaction.value > 0:
+    if reaction.code == BRAKES and reaction.value > 0:
         # They were closed for the cycles without torque, which are told of when there is torque again.
         return reaction.tick
     code, board = UNDONE_BY.get(reaction.code), reaction.board if reaction.code == "restart" else None

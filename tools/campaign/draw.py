@@ -71,6 +71,12 @@ class Card:
     seed: int
     phase: float
 
+    @property
+    def quiet(self) -> int:
+        """Ticks from the last message that a fault has touched to the next fault."""
+        held = self.shape.parameters.get("by", 0) * self.target.cycle if self.target.kind == "delay" else 0
+        return self.window - self.shape.ticks - round(held)
+
 
 def ends_alone(kind: str) -> bool:
     """Say whether a kind needs a trial of its own: nothing goes on after it."""
@@ -156,7 +162,7 @@ def _chosen(course: Course, waiting: list[Card]) -> list[Card]:
             chosen.append(card)
             waiting.remove(card)
             free -= card.window
-            if target.mailbox is not None and EPISODE * max(target.reader, target.cycle) > card.window:
+            if target.mailbox is not None and EPISODE * max(target.reader, target.cycle) > card.quiet:
                 busy.add(target.mailbox)
     return chosen
 

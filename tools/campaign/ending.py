@@ -10,10 +10,11 @@ import numpy as np
 from backplane.address_map import CLOCK
 from backplane.fault_table import Entry, FaultTable, Injection, Stage
 from backplane.layout import MailboxSpec
-from backplane.message import State
+from backplane.message import Message, State
 from backplane.protocols import open_observer
 from backplane.segment import Segment
 from boards.faults.kinds import KINDS
+from levels.messages import Error
 from tools.campaign.external import Killed
 from tools.campaign.plan import EXTERNAL
 
@@ -73,16 +74,26 @@ def arm_of(segment: Segment) -> Arm:
 def levels_of(segment: Segment) -> str:
     """Return the state that each level was left in, with its reason, as one readable text."""
     told = []
+    for writer, status in _statuses(segment):
+        state, reason = State(status.state).name.lower(), status.reason
+        told.append(f"{writer} {state}{f' ({reason})' if reason else ''}")
+    return ", ".join(told)
+
+
+def is_late(segment: Segment) -> bool:
+    """Say whether a level gave up because it cannot keep a time."""
+    return any(status.state == State.ERROR and status.error == Error.TOO_LATE for _, status in _statuses(segment))
+
+
+def _statuses(segment: Segment) -> Iterator[tuple[str, Message]]:
+    """Yield the newest status of each level, with its writer."""
     for box in segment.layout.mailboxes:
-        # An arm's state, of the simulation, is no level's.
         units = {field.name: field.unit for field in box.fields}
         # An arm's state, that of its simulation, is no level's.
         if units.get("state") != State.__name__ or "reason" not in units:
             continue
         if (status := open_observer(segment, box.name).peek()).is_there:
-            state, reason = State(status.value.state).name.lower(), status.value.reason
-            told.append(f"{box.writer} {state}{f' ({reason})' if reason else ''}")
-    return ", ".join(told)
+            yield box.writer, status.value
 
 
 def _strike(segment: Segment, index: int, joints: Sequence[str], table: FaultTable) -> Strike:

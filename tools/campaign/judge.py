@@ -12,7 +12,7 @@ from boards.events import Event
 from boards.faults.bounds import MEMORY_NS, RACK_NS, bound_ticks, cycle_ticks, last_read
 from boards.faults.consequences import consequence, recovery_ticks
 from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.aftermath import Aftermath, aftermath, takes_cycles
+from tools.campaign.aftermath import COLLISION, LATCHED, Aftermath, aftermath, takes_cycles
 from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, explains, fits, table_kind
 from tools.campaign.ending import Strike
 from tools.campaign.plan import EXTERNAL
@@ -22,8 +22,6 @@ Seen = Literal["detected", "missed", "not struck"]
 Bound = Callable[[Strike, str | None], int | None]
 """Ticks in which a fault must be found, by a reader or, None, by whoever else."""
 
-LATCHED = "latched"
-"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
 SETTLE_S = 0.25
 """Simulated time behind a fault's bounds in which its traces may still be found."""
 
@@ -77,7 +75,8 @@ class Circumstances:
     """The run whose faults are judged.
 
     `offset_ns` turns CLOCK_MONOTONIC into the events' time. `restart_s`: simulated time that a restart may take.
-    `has_failed`: the task ended with an error, as some kinds have it.
+    `has_failed`: the task ended with an error, as some kinds have it. `moving`: obstacles that move, and may run into
+    an arm that a fault has kept where they pass.
     """
 
     layout: Layout
@@ -85,12 +84,14 @@ class Circumstances:
     is_lockstep: bool = False
     restart_s: float = 2.0
     has_failed: bool = False
+    moving: tuple[str, ...] = ()
 
 
 def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> Verdict:
     """Judge the faults of a run by what happened in it.
 
-    One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet.
+    One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet. A
+    fault of the arm that is over before it must be found, and is not found, has not struck.
     """
     return _Judge(strikes, events, run).verdict()
 
@@ -112,9 +113,11 @@ class _Judge:
         windows = [self._window(strike) for strike in self._strikes]
         for place, strike in enumerate(self._strikes):
             found = self._detections(strike, windows[place][1], used)
-            best = min(found, key=lambda detection: detection.order, default=None)
+            best = min((d for d in found if not self._is_of(d, place)), key=lambda d: d.order, default=None)
             if best is not None:
                 used.add(id(best.event))
+            elif self._is_brief(strike):
+                strike = replace(strike, tick=-1)
             judged.append(self._judgement(strike, best, self._horizon(place, windows[place][1])))
         stray = [event for event in self._events if self._is_stray(event, windows)]
         detections = tuple(event for event in stray if event.kind != "miss")
@@ -139,6 +142,17 @@ class _Judge:
     def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
         fresh = [e for e in candidates(self._events, strike, until) if id(e) not in used]
         return [self._detection(event, strike) for event in fresh]
+
+    def _is_of(self, late: Detection, place: int) -> bool:
+        """Say whether a detection, too late for one fault, is in time for one that struck after it."""
+        after = (strike for strike in self._strikes[place + 1 :] if fits(late.event, strike))
+        return not late.is_within and any(self._detection(late.event, strike).is_within for strike in after)
+
+    def _is_brief(self, strike: Strike) -> bool:
+        """Say whether a fault of the arm acted in fewer cycles than it may take to be found."""
+        if strike.tick < 0 or KINDS[NUMBERS[table_kind(strike.kind)]].where != "arm":
+            return False
+        return strike.count * self._cycles[strike.board] < (self._bound(strike, None) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
         delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
@@ -169,6 +183,7 @@ class _Judge:
         seen: Seen = "not struck" if strike.tick < 0 else "missed" if best is None else "detected"
         bound = self._recovery_bound(strike, best)
         is_latched = self._is_latched(strike, after)
+        is_undone = after.is_undone and (after.recovery or 0) <= bound
         return Judgement(
             kind=strike.kind,
             board=strike.board,
@@ -188,7 +203,8 @@ class _Judge:
             bound_ms=best.bound_ms if best else None,
             is_within=best is not None and best.is_within,
             reactions=after.reactions,
-            is_recovered=is_latched or (after.is_undone and (after.recovery or 0) <= bound),
+            # A run that ends before the bound says nothing.
+            is_recovered=is_latched or self._last < strike.tick + bound or is_undone,
             recovery=after.recovery,
             recovery_bound=bound,
             lacking=() if strike.tick < 0 else after.lacking,
@@ -208,13 +224,18 @@ class _Judge:
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
         """Say whether no fault explains a detection, a death or a miss."""
-        if event.kind not in ("detection", "died", "miss"):
+        if event.kind not in ("detection", "died", "miss") or self._is_met(event):
             return False
         # What a task tells of has the tick of its release, and may come of anything until the end of its cycle.
         until = event.tick + self._cycles.get(event.board, 1) - 1
         windowed = zip(self._strikes, windows, strict=True)
         around = [strike for strike, (first, last) in windowed if first <= until and event.tick <= last]
         return not any(_explains(strike, event) for strike in around if strike.tick >= 0)
+
+    def _is_met(self, event: Event) -> bool:
+        """Say whether an obstacle has met an arm that was kept by a fault before, or waits for another way since."""
+        is_moving = event.code == COLLISION and any(f"'{name}'" in event.text for name in self._run.moving)
+        return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
 
 
 def _shown(strike: Strike, events: Sequence[Event]) -> Strike:

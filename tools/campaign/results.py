@@ -39,6 +39,7 @@ class Judged:
             is_lockstep=trial.plan.lockstep,
             restart_s=trial.restart_s,
             has_failed=trial.outcome is not None and not trial.outcome.worked,
+            moving=trial.moving,
         )
         return cls(trial, judge(trial.strikes, trial.events, run))
 
@@ -69,9 +70,15 @@ class Judged:
         lines += [f"left behind: {thing}" for thing in trial.left]
         if self.ended == "neither":
             lines.append(f"the task is neither done nor safely stopped: {self._why_neither()}")
-        if self.ended == "safely stopped" and not lines and not any(f.is_latched for f in self.verdict.faults):
+        if self.ended == "safely stopped" and not lines and not self._had_to_end:
             lines.append(f"the task is not done, and no fault had to end it: {self._why_neither()}")
         return lines
+
+    @property
+    def _had_to_end(self) -> bool:
+        """Whether a fault had to end the task: it is latched, or what was done about it has taken the task's time."""
+        faults = self.verdict.faults
+        return any(f.is_latched for f in faults) or (self.trial.is_late and any(f.reactions for f in faults))
 
     def _why_neither(self) -> str:
         trial, outcome = self.trial, self.trial.outcome

@@ -13,7 +13,7 @@ from boards.errors import BoardError, ConfigError
 from boards.events import Event
 from boards.outcome import Outcome
 from boards.rack import Rack
-from tools.campaign.ending import Arm, Strike, arm_of, levels_of, strikes
+from tools.campaign.ending import Arm, Strike, arm_of, is_late, levels_of, strikes
 from tools.campaign.external import Killer
 from tools.campaign.interrupt import Interrupt
 from tools.campaign.leftovers import children, left_behind
@@ -37,7 +37,8 @@ RESTART_S = 2.0
 class Trial:
     """A trial that was made. `refused` is why the rack did not launch, else empty; `left` what it left behind.
 
-    `levels` tells what state each level was left in. `offset_ns` turns CLOCK_MONOTONIC into the events' CLOCK_REALTIME.
+    `levels` tells what state each level was left in, `is_late` that one gave up for a time that it cannot keep.
+    `moving` are obstacles that move. `offset_ns` turns CLOCK_MONOTONIC into the events' CLOCK_REALTIME.
     """
 
     plan: Plan
@@ -52,6 +53,8 @@ class Trial:
     offset_ns: int
     restart_s: float = RESTART_S
     levels: str = ""
+    is_late: bool = False
+    moving: tuple[str, ...] = ()
     is_interrupted: bool = False
 
 
@@ -65,7 +68,7 @@ def run_trial(
     """
     before, started = children(), time.monotonic()
     rack = Rack(plan.config(config, rack_name))
-    refused, levels, arm = "", "", Arm()
+    refused, levels, late, arm = "", "", False, Arm()
     found: tuple[Strike, ...] = ()
     try:
         with rack:
@@ -73,7 +76,7 @@ def run_trial(
             _watch(rack, killer, ticks, seconds, interrupt)
             joints = config.robot.joints if config.robot is not None else ()
             found, arm = strikes(rack.segment, joints, killer.done), arm_of(rack.segment)
-            levels = levels_of(rack.segment)
+            levels, late = levels_of(rack.segment), is_late(rack.segment)
     except ConfigError:
         raise
     except (BackplaneError, BoardError) as error:
@@ -91,6 +94,8 @@ def run_trial(
         offset_ns=time.time_ns() - time.monotonic_ns(),
         restart_s=restart_s(config, plan.lockstep),
         levels=levels,
+        is_late=late,
+        moving=tuple(motion.body for motion in config.scene.motion),
         is_interrupted=interrupt.is_set,
     )
 
