@@ -22,6 +22,7 @@ from boards.faults.request import injections
 from boards.outcome import Cause
 from boards.transfer import Transfer
 from boards.wiring import TaskWiring
+from levels.messages import TASK_STATUS
 
 LINGER_S = 0.5
 """Simulated time that a run goes on behind the task's end: the arm is seen at rest."""
@@ -89,10 +90,8 @@ class Launch:
         """Return state and reason of the level that ends the run, as last written."""
         if self.ends_run is None:
             return "", ""
-        status = open_observer(segment, self.ends_run).peek()
-        if not status.is_there:
-            return State.IDLE.name.lower(), ""
-        return State(status.value.state).name.lower(), status.value.reason
+        status = open_observer(segment, self.ends_run).peek().value
+        return State(status.state).name.lower(), status.reason
 
     def latched(self, segment: Segment) -> list[str]:
         """Return a line for every level but the one that ends the run whose last status holds an error."""
@@ -106,10 +105,14 @@ class Launch:
                 found.append(f"level '{board}': {status.value.reason}")
         return found
 
-    def cause_of(self, state: str) -> Cause:
+    def cause_of(self, segment: Segment) -> Cause:
         """Return why a run ended that nothing stopped from outside."""
-        ends: dict[str, Cause] = {State.DONE.name.lower(): "task done", State.ERROR.name.lower(): "task refused"}
-        return ends.get(state, "time over")
+        if self.ends_run is None:
+            return "time over"
+        status, kind = open_observer(segment, self.ends_run).peek().value, segment.layout.mailbox(self.ends_run).message
+        if status.state != State.ERROR:
+            return "task done" if status.state == State.DONE else "time over"
+        return "task refused" if kind == TASK_STATUS.name and not status.moves else "task failed"
 
     def notes(self, segment: Segment) -> list[str]:
         """Return what the launch must say: cores shared out, real-time priority refused."""
