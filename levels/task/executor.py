@@ -9,7 +9,7 @@ from backplane.message import Message, MessageType, State
 from levels.level import Executor, Input, LevelContext, Ports, Reading
 from levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
 from levels.operator import OPERATOR_COMMAND, Commands, Goal, What
-from levels.orders import HELD_FROM_ABOVE, Orders
+from levels.orders import BELOW_LOST, HELD_FROM_ABOVE, Orders
 from levels.params import read_params
 from levels.task.detour import Detour
 from levels.task.params import TaskParams
@@ -114,7 +114,7 @@ class TaskExecutor(Executor):
         if orders.standing is not What.NONE:
             return orders.keeps(self.context.board)
         if below.is_lost:
-            return "no status from the level below: waiting for its board"
+            return BELOW_LOST
         is_held = below.value.state == State.HOLDING and below.value.reason != HELD_FROM_ABOVE
         return str(below.value.reason) if is_held else ""
 
