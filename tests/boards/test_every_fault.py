@@ -111,6 +111,18 @@ def test_a_fault_that_takes_real_time_is_over_or_latched_in_the_end(
             assert rack.outcome.reason.startswith("nothing heard of the wave for")
 
 
+def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> None:
+    fault = FaultConfig(kind="lock-held", board="watch", tick=FIRST + 1)
+    found = config("clock.mode=realtime", LOCKED, text=FOLLOWED).model_copy(update={"fault": (fault,)})
+    with Rack(found) as rack:
+        rack.start()
+        entry, deadline = FaultTable(rack.segment).entries[0], time.monotonic() + BOUND_S
+        while entry.stage != Stage.OVER and rack.watch(0.02):
+            assert time.monotonic() < deadline
+        assert entry[Entry.STRUCK_TICK] > FIRST + 1
+        assert rack.watch(0.02)
+
+
 @pytest.mark.parametrize("kind", [kind for kind in OTHERS if kind.where == "start"])
 def test_a_rack_whose_start_fails_does_not_arm(config: MakeConfig, kind: Kind) -> None:
     with pytest.raises(LaunchError, match="wave"), rack_with(config, kind, {}):
