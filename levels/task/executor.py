@@ -126,11 +126,8 @@ class TaskExecutor(Executor):
         if operated or mark != self._mark:
             self._mark, self._moved_at = mark, tick
         elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
-            waits = (
-                f"move {below.current} is under way" if plan.id else "no plan; do all objects rest, is the arm seen?"
-            )
             self._error = Error.STALLED
-            self._reason = f"nothing has moved for {self._stalled_s:g} s: {kept_from or waits}"
+            self._reason = f"nothing has moved for {self._stalled_s:g} s: {kept_from or _awaited(plan, below)}"
 
     def _actions_done(self, plan: Message) -> int:
         if not plan.count:
@@ -173,3 +170,10 @@ class TaskExecutor(Executor):
         if not self._actions:
             return State.IDLE
         return State.DONE if plan.count and self._done == plan.count else State.EXECUTING
+
+
+def _awaited(plan: Message, below: Message) -> str:
+    """Return what a task waits for that nobody holds."""
+    if not plan.id:
+        return "no plan; do all objects rest, is the arm seen?"
+    return f"move {below.current} is under way" if below.current else f"no path yet for move {below.done + 1}"
