@@ -54,9 +54,9 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.SENSOR_SILENT: ("nothing", "the sensors have given no new sample for {span}"),
     Alarm.SENSOR_MODEL: ("joint", "sensor of {subject}: off the model's motion by {value:.3g}"),
     Alarm.ACTUATOR: ("joint", "{subject} does not do what its torque should: off by {value:.3g}"),
-    Alarm.COMMAND_INVALID: ("joint", "torque of {subject} is no number: not let through"),
+    Alarm.COMMAND_INVALID: ("joint", "rejected: torque of {subject} is not a number"),
     Alarm.COMMAND_LIMIT: ("joint", "torque of {subject}, {value:.3g} N m, is beyond its limit: cut"),
-    Alarm.BRAKES_OPENED: ("nothing", "brakes opened after {span}"),
+    Alarm.BRAKES_OPENED: ("nothing", "brakes released after {span}"),
     Alarm.RE_REFERENCED: ("joint", "sensor of {subject} trusted again, {value:.3g} rad from where it was estimated"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
     Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
@@ -138,4 +138,4 @@ def _demand(demand: Demand, subject: str) -> str:
 
 
 def _closed(ticks: float, layout: Layout) -> str:
-    return f"brakes closed: {_span(ticks, layout)} without torque" if ticks else "brakes closed"
+    return f"brakes engaged: {_span(ticks, layout)} without torque" if ticks else "brakes engaged"

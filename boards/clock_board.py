@@ -14,7 +14,7 @@ from backplane.message import State
 from backplane.protocols import open_observer
 from backplane.realtime_driver import RealtimeDriver
 from backplane.segment import Segment
-from backplane.words import Run, System
+from backplane.words import Block, Run, System
 from boards.clock_wiring import ClockWiring
 from boards.system_controller import SystemController
 
@@ -29,12 +29,18 @@ class EndOfRun:
         self._stop_tick = wiring.stop_tick or None
         self._linger = wiring.linger
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
+        self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
+        self._silent = wiring.silent
+        self._heard: int | None = None
 
     def __call__(self, tick: int) -> int | None:
         """Return the tick at which the run stops; None as long as that is open."""
-        if self._stop_tick is None and self._reader is not None:
+        if self._stop_tick is None and self._reader is not None and self._writer is not None:
             reading = self._reader.read(tick)
-            if reading.is_new and reading.value.state in (State.DONE, State.ERROR):
+            if reading.is_new or self._heard is None or self._writer[Block.LOST]:
+                self._heard = tick
+            is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
+            if is_over or tick - self._heard >= self._silent:
                 self._stop_tick = tick + self._linger
         return self._stop_tick
 

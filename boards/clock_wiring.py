@@ -13,8 +13,8 @@ class ClockWiring:
     """How a run goes in time. `period_ns` is of the wall clock, the speed factor counted in.
 
     The run ends after `stop_tick` ticks (0: never), or `linger` ticks after the mailbox `ends_run` says
-    done or error. In lockstep a lost board rejoins `restart_ticks` behind its loss. `on_loss` is what the loss of a
-    task asks of the arm.
+    done or error, or its writer, which is not lost, has said nothing for `silent` ticks. In lockstep a lost board
+    rejoins `restart_ticks` after its loss. `on_loss` is what the loss of a task asks of the arm.
     """
 
     lockstep: bool
@@ -22,6 +22,7 @@ class ClockWiring:
     stop_tick: int
     ends_run: str | None
     linger: int
+    silent: int
     history: int
     core: int
     priority: int

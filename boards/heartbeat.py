@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 
 from backplane.address_map import CLOCK
+from backplane.process import GONE, STOPPED, WAITING, state_of
 from backplane.segment import Segment
 from backplane.words import Block, Run, System
 
@@ -30,6 +31,7 @@ class Heartbeat:
         self._bounds = {**dict.fromkeys(self._blocks, LOCKSTEP_S), CLOCK: LOCKSTEP_S if watched else bound_s}
         self._seen = {name: (-1, time.monotonic()) for name in self._bounds}
         self._reported: set[str] = set()
+        self._waited_at = -1
 
     def hanging(self) -> list[str]:
         """Return the tasks that have come to hang since the last call; "clock" is the system clock."""
@@ -45,6 +47,16 @@ class Heartbeat:
         if self._words[System.TICK] != self._seen[CLOCK][0]:
             self._seen[CLOCK] = self._words[System.TICK], now
             self._reported.discard(CLOCK)
-        found = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]
+        late = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]
+        found = [name for name in late if name != CLOCK or self._clock_is_stuck()]
         self._reported.update(found)
         return found
+
+    def _clock_is_stuck(self) -> bool:
+        """Say whether a silent clock has stopped, is dead, or waits; one that could run is only starved."""
+        state, tick = state_of(self._words[System.CLOCK_PID]), self._seen[CLOCK][0]
+        # Seen twice: after a pause of the whole machine it is about to be woken.
+        waits = state in WAITING
+        is_stuck = state in STOPPED + GONE or (waits and self._waited_at == tick)
+        self._waited_at = tick if waits else -1
+        return is_stuck

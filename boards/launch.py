@@ -9,7 +9,7 @@ from backplane.layout import Layout
 from backplane.message import State
 from backplane.protocols import open_observer
 from backplane.segment import Segment
-from backplane.words import Block, Demand
+from backplane.words import Block, Demand, System
 from boards.clock_wiring import ClockWiring
 from boards.config import context, shared_out, wire
 from boards.config.cores import obtained_core
@@ -22,9 +22,12 @@ from boards.faults.request import injections
 from boards.outcome import Cause
 from boards.transfer import Transfer
 from boards.wiring import TaskWiring
+from levels.messages import TASK_STATUS
 
 LINGER_S = 0.5
 """Simulated time that a run goes on behind the task's end: the arm is seen at rest."""
+SILENT_S = 30.0
+"""Simulated time, at least, for which nothing may be heard of the level that ends the run; a slow one has 8 cycles."""
 HISTORY_S = 1.0
 """Simulated time by which lockstep may be ahead of a recorder: half of what the rings hold."""
 
@@ -63,6 +66,7 @@ class Launch:
             stop_tick=0 if seconds is None else max(1, round(seconds * 1e9 / tick_ns)),
             ends_run=self.ends_run,
             linger=round(LINGER_S * 1e9 / tick_ns),
+            silent=self._silent_ticks,
             history=round(HISTORY_S * 1e9 / tick_ns),
             core=obtained_core(clock.core),
             priority=clock.priority,
@@ -89,10 +93,10 @@ class Launch:
         """Return state and reason of the level that ends the run, as last written."""
         if self.ends_run is None:
             return "", ""
-        status = open_observer(segment, self.ends_run).peek()
-        if not status.is_there:
-            return State.IDLE.name.lower(), ""
-        return State(status.value.state).name.lower(), status.value.reason
+        status = open_observer(segment, self.ends_run).peek().value
+        silent_s = self._silence(segment) * self.layout.clock_ns * 1e-9
+        reason = f"nothing heard of '{self.ends_run}' for {silent_s:g} s" if silent_s else status.reason
+        return State(status.state).name.lower(), reason
 
     def latched(self, segment: Segment) -> list[str]:
         """Return a line for every level but the one that ends the run whose last status holds an error."""
@@ -106,10 +110,29 @@ class Launch:
                 found.append(f"level '{board}': {status.value.reason}")
         return found
 
-    def cause_of(self, state: str) -> Cause:
+    def cause_of(self, segment: Segment) -> Cause:
         """Return why a run ended that nothing stopped from outside."""
-        ends: dict[str, Cause] = {State.DONE.name.lower(): "task done", State.ERROR.name.lower(): "task refused"}
-        return ends.get(state, "time over")
+        if self.ends_run is None:
+            return "time over"
+        status, kind = open_observer(segment, self.ends_run).peek().value, segment.layout.mailbox(self.ends_run).message
+        if status.state != State.ERROR and not self._silence(segment):
+            return "task done" if status.state == State.DONE else "time over"
+        return "task refused" if kind == TASK_STATUS.name and not status.moves else "task failed"
+
+    def _silence(self, segment: Segment) -> int:
+        """Return the ticks since the last status of the level that ends the run; 0: they are not too many."""
+        assert self.ends_run is not None, "some level ends the run"
+        observer = open_observer(segment, self.ends_run)
+        reading = observer.peek()
+        if reading.value.state in (State.DONE, State.ERROR):
+            return 0
+        ticks = segment.words[System.TICK] - (observer.newest if reading.is_there else 0)
+        return ticks if ticks > self._silent_ticks else 0
+
+    @property
+    def _silent_ticks(self) -> int:
+        every = 0 if self.ends_run is None else self.layout.task(self.layout.mailbox(self.ends_run).writer).every
+        return max(round(SILENT_S * 1e9 / self.layout.clock_ns), 8 * every)
 
     def notes(self, segment: Segment) -> list[str]:
         """Return what the launch must say: cores shared out, real-time priority refused."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Cause = Literal["task done", "task refused", "time over", "stopped", "board lost", "launcher lost"]
+Cause = Literal["task done", "task refused", "task failed", "time over", "stopped", "board lost", "launcher lost"]
+"""A task is refused when it was never begun: it has no moves. Any other that ends with an error has failed."""
 
 
 @dataclass(frozen=True)
@@ -24,5 +25,5 @@ class Outcome:
 
     @property
     def worked(self) -> bool:
-        """Whether the run did what it was for: no fault, and no task that was refused or cut short."""
+        """Whether the run did what it was for: no fault, and no task that was refused, failed or was cut short."""
         return not self.faults and self.cause in ("task done", "time over")

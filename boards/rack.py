@@ -295,7 +295,7 @@ class Rack:
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
         state, reason = self._plan.final_state(self.segment)
         # A stop may also be requested from outside, by a word in the segment.
-        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._plan.cause_of(state))
+        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._plan.cause_of(self.segment))
         if cause in ("task done", "time over"):
             self._faults += self._plan.latched(self.segment)
         self._let_go()

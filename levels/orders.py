@@ -16,6 +16,7 @@ DOING = {What.HOLD: "held", What.SETPOINT: "kept at a set point", What.GOTO: "di
 HELD_FROM_ABOVE = "held by the level above"
 """Reason of a level that is held from above. Above it is no news, and not passed on."""
 ABOVE_LOST = "no command from the level above: held until its board is back"
+BELOW_LOST = "no status from the level below: waiting for its board"
 
 
 class Orders:

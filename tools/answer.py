@@ -32,8 +32,20 @@ Json = Annotated[bool, typer.Option("--json", help="print one JSON document on s
 ConfigName = Annotated[
     str, typer.Argument(metavar="CONFIG", help="config by name, or a path to a .toml file", autocompletion=configs)
 ]
+
+
+def named(rack: str | None) -> str | None:
+    """Return the name of a rack. Raises `Failure` for one that no rack can have."""
+    if rack == "":
+        raise Failure('RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2)
+    return rack
+
+
 RackName = Annotated[
-    str, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", autocompletion=running)
+    str,
+    typer.Argument(
+        metavar="RACK", help="running rack by name, as 'rack list' shows it", autocompletion=running, callback=named
+    ),
 ]
 Settings = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")

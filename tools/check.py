@@ -41,6 +41,7 @@ def check(
     """Validate a config, show what it makes, and predict its timing.
 
     Slots, cores, rates, mailboxes with their bus addresses; or every mistake, one a line.
+    On a terminal the tables show as many columns as fit; --json has all.
 
     The timing comes from budgets, the longest that each part of a level's cycle may take, as processor time:
     [board.<name>.budget] in the config, with read_ms (R), process_ms (X), write_ms (W), exchange_ms (C, reading the
@@ -61,6 +62,7 @@ def check(
     """
     from boards.config import budgets, load, shared_out
     from tools.inventory import Inventory
+    from tools.live_table import print_wrapped, terminal_width
     from tools.timing.forecast import Forecast
     from tools.timing.repair import repair
     from tools.timing.trial import Trial
@@ -79,7 +81,8 @@ def check(
     if as_json:
         print_json(inventory.document() | {"timing": forecast.document() | {"repair": fitting.document()}})
     else:
-        print(inventory.text(), *forecast.lines(), "", *fitting.lines(), sep="\n")
+        width = terminal_width()
+        print_wrapped("\n".join([*inventory.lines(width), *forecast.lines(width), "", *fitting.lines()]))
     sys.exit(0 if forecast.holds else 1)
 
 

@@ -6,10 +6,9 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Failure, Json, print_json
+from tools.answer import Failure, Json, RackName, print_json
 from tools.interrupt import INTERRUPT
 
-Rack = Annotated[str, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it")]
 Level = Annotated[
     str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or your own")
 ]
@@ -19,10 +18,11 @@ Goals = Annotated[
     typer.Argument(metavar="GOAL", help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1"),
 ]
 Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
-At = Annotated[float | None, typer.Option(metavar="S", help="instead of --tick: simulated time, s")]
+At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="instead of --tick: simulated time, s")]
 Wait = Annotated[bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")]
 Timeout = Annotated[
-    float | None, typer.Option(metavar="S", min=0.0, help="with --wait: wall-clock seconds, then exit status 1")
+    float | None,
+    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: wall-clock seconds, then exit status 1"),
 ]
 List = Annotated[bool, typer.Option("--list", help="list each level, the commands that it takes, and what is in force")]
 
@@ -44,7 +44,7 @@ Examples:
 
 
 def command(
-    rack: Rack,
+    rack: RackName,
     level: Level = None,
     what: Said = None,
     goal: Goals = None,
@@ -69,10 +69,11 @@ def command(
     from tools.commanding.goals import goal_of
     from tools.commanding.live import LiveDesk
     from tools.holds import resume_command
+    from tools.live_table import terminal_width
 
     desk = LiveDesk(rack)
     if is_list:
-        print_json(desk.levels()) if as_json else print("\n".join(desk.text()))
+        print_json(desk.levels()) if as_json else print("\n".join(desk.text(terminal_width())))
         return
     if level is None or what is None:
         raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)

@@ -6,9 +6,12 @@ from typing import Annotated, Any
 
 import typer
 
-from tools.answer import Failure, Json, print_json
+from tools.answer import Failure, Json, named, print_json
 
-Rack = Annotated[str | None, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it")]
+Rack = Annotated[
+    str | None,
+    typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named),
+]
 BoardName = Annotated[
     str | None, typer.Argument(metavar="BOARD", help="task concerned: servo, servo.planner, ..., or clock")
 ]
@@ -29,7 +32,8 @@ Phase = Annotated[str | None, typer.Option(metavar="X", help="when in its first 
 Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of what is random in it")]
 Wait = Annotated[bool, typer.Option("--wait", help="wait until it is over, or the run is")]
 Timeout = Annotated[
-    float | None, typer.Option(metavar="S", min=0.0, help="with --wait: wall-clock seconds, then exit status 1")
+    float | None,
+    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: wall-clock seconds, then exit status 1"),
 ]
 Withdraw = Annotated[
     int | None, typer.Option(metavar="NO", help="take back a fault that still waits; --list shows its number")

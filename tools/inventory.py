@@ -90,11 +90,8 @@ class Inventory:
         """Return everything as plain data."""
         return asdict(self)
 
-    def text(self) -> str:
-        """Return everything as text for people."""
-        return "\n".join(self._lines())
-
-    def _lines(self) -> Iterator[str]:
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield everything that fits into `width` as text for people."""
         boards = len({task.slot for task in self.tasks})
         yield f"rack {self.rack}: {boards} board{'s' * (boards > 1)} and the clock, {self.clock_ms:g} ms, {self.mode}"
         yield from self.notes
@@ -103,11 +100,15 @@ class Inventory:
         yield from table(
             ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", "slice, ms", "trace at"],
             [clock, *(_task_row(task) for task in self.tasks)],
+            width,
+            ("trace at", "slice, ms"),
         )
         yield ""
         yield from table(
             ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"],
             [_mailbox_row(mailbox) for mailbox in self.mailboxes],
+            width,
+            ("slots", "bytes", "message", "protocol"),
         )
         yield ""
         yield f"segment: {self.segment_bytes} bytes; board windows: {_windows(self.windows)}"

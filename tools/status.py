@@ -6,12 +6,13 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Failure, Json, print_json
+from tools.answer import Failure, Json, named, print_json
 
 
 def status(
     rack: Annotated[
-        str | None, typer.Argument(metavar="[RACK]", help="running rack by name; not needed when only one runs")
+        str | None,
+        typer.Argument(metavar="[RACK]", help="running rack by name; not needed when only one runs", callback=named),
     ] = None,
     as_json: Json = False,
 ) -> None:

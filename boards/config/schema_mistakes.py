@@ -18,8 +18,10 @@ ALONE = {"robot": "; a [robot] that names its model is another arm, and takes no
 def mistakes_of(error: ValidationError, model: type[BaseModel], tables: Any, place: str = "") -> list[Mistake]:
     """Return the mistakes of `tables`, which stand at `place` in the config and failed as a `model`."""
     found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
-    # A value that may be of several kinds is none of them by one mistake each: the first will do.
-    return list({mistake.place: mistake for mistake in reversed(found)}.values())[::-1]
+    # A value that may be of several kinds is none of them by one mistake each: the first will do, or that of its item.
+    first = {mistake.place: mistake for mistake in reversed(found)}
+    within = {place for place in first if any(other.startswith((f"{place}[", f"{place}.")) for other in first)}
+    return [first[place] for place in reversed(first) if place not in within]
 
 
 def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:

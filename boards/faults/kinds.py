@@ -191,7 +191,7 @@ KINDS: tuple[Kind, ...] = (
         (Parameter("late", "ticks", "largest lateness; the least is 0.6", 0.9, 0.65, 0.95),),
         realtime=True,
     ),
-    Kind("sensor-nan", "arm", "a position is no number", (Alarm.SENSOR_RANGE,), "1 cycle", (_joint(),)),
+    Kind("sensor-nan", "arm", "a position is not a number", (Alarm.SENSOR_RANGE,), "1 cycle", (_joint(),)),
     Kind(
         "sensor-stuck",
         "arm",
@@ -227,7 +227,7 @@ KINDS: tuple[Kind, ...] = (
         "12 cycles",
         (Parameter("part", "1", "of its largest torque", 0.1, 0.0, 0.9), _joint(1)),
     ),
-    Kind("command-nan", "arm", "a torque is no number", (Alarm.COMMAND_INVALID,), "0 cycles", (_joint(),)),
+    Kind("command-nan", "arm", "a torque is not a number", (Alarm.COMMAND_INVALID,), "0 cycles", (_joint(),)),
     Kind(
         "command-limit",
         "arm",

@@ -49,7 +49,7 @@ class FaultStage:
         for entry in self._open:
             if entry.stage == Stage.WAITING and self._is_due(entry, tick):
                 self._begin(entry, tick)
-            elif entry.stage == Stage.ACTIVE:
+            if entry.stage == Stage.ACTIVE:
                 self._strikes.during(entry, tick)
 
     def within(self, tick: int) -> None:
@@ -76,7 +76,9 @@ class FaultStage:
         words, kind = entry.words, KINDS[entry[Entry.KIND]]
         words[Entry.FROM] = tick
         lasts = entry[Entry.TICKS]
-        words[Entry.UNTIL] = tick + 1 if kind.once else tick + lasts if lasts else NEVER
+        # A lock is held by the task itself, in its next cycle, whenever that comes.
+        is_over_at_once = kind.once and kind.where != "lock"
+        words[Entry.UNTIL] = tick + 1 if is_over_at_once else tick + lasts if lasts else NEVER
         words[Entry.STAGE] = Stage.ACTIVE
         self._words[System.FAULTS] += 1
         self._alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)

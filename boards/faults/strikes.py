@@ -60,8 +60,11 @@ class Strikes:
             strike(entry, tick)
 
     def is_void(self, entry: FaultEntry) -> bool:
-        """Say whether there is nothing left of a fault: what it had stopped has been found and is lost."""
-        if KINDS[entry[Entry.KIND]].name != "hang":
+        """Say whether there is nothing left of a fault: what it stops has stopped, or is found lost."""
+        kind = KINDS[entry[Entry.KIND]]
+        if kind.where == "lock":
+            return entry[Entry.COUNT] > 0
+        if kind.name != "hang":
             return False
         task = self._target(entry)
         return task is not None and task.lost_tick >= 0

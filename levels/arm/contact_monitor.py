@@ -35,7 +35,7 @@ class ContactMonitor:
         if not len(pairs):
             return
         if not self.first:
-            self.first = f"{self.named(pairs[0])} at {time_s:.3f} s"
+            self.first = f"unintended contact: {self.named(pairs[0])} at {time_s:.3f} s"
         self.count += len(pairs)
         ours = pairs[(self._arm | self._held(data))[pairs].any(axis=1)]
         if len(ours):

@@ -23,7 +23,7 @@ from levels.messages import (
     Verb,
 )
 from levels.operator import OPERATOR_COMMAND, Commands, What
-from levels.orders import ABOVE_LOST, HELD_FROM_ABOVE, Orders
+from levels.orders import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, Orders
 from levels.params import read_params
 
 
@@ -81,7 +81,7 @@ class ElementalMoveExecutor(Executor):
         if self._error:
             segments.clear()
         write.command.hold = self._request > 0 or self._error > 0 or read.command.is_lost or self._is_told_to(read)
-        self._report(read.command, status, segments, write.status)
+        self._report(read, segments, write.status)
         self._answer(read, write)
 
     def _go_on(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
@@ -218,10 +218,11 @@ class ElementalMoveExecutor(Executor):
             self._error, self._reason = error, reason
             self._request = 0
 
-    def _report(self, command: Reading, status: Message, segments: SegmentWindow, report: Message) -> None:
+    def _report(self, read: Ports, segments: SegmentWindow, report: Message) -> None:
+        command, status = read.command, read.status.value
         report.echo = command.value.id
         report.state = self._state(command.value)
-        kept_from = self._kept_from(command, status) if report.state == State.EXECUTING else ""
+        kept_from = self._kept_from(command, read.status) if report.state == State.EXECUTING else ""
         if kept_from:
             report.state = State.HOLDING
         report.error, report.reason = self._error, self._reason if self._error else kept_from
@@ -267,16 +268,18 @@ class ElementalMoveExecutor(Executor):
             self._orders.done()
         self._orders.report(write.status, above)
 
-    def _kept_from(self, command: Reading, status: Message) -> str:
+    def _kept_from(self, command: Reading, below: Reading) -> str:
         """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
         if self._orders.standing is not What.NONE:
             return self._orders.keeps(self.context.board)
         if command.is_lost:
             return ABOVE_LOST
+        if below.is_lost:
+            return BELOW_LOST
         if self._reason:
             return self._reason
-        if status.state == State.HOLDING and status.reason != HELD_FROM_ABOVE:
-            return str(status.reason)
+        if below.value.state == State.HOLDING and below.value.reason != HELD_FROM_ABOVE:
+            return str(below.value.reason)
         return HELD_FROM_ABOVE if command.value.hold else ""
 
     def _state(self, command: Message) -> State:

@@ -17,12 +17,15 @@ from levels.planning.path_planner import SEARCHES, PathPlanner
 from levels.planning.payload import Payloads
 from levels.planning.pose import Pose
 from levels.planning.situation import Situation
+from levels.primitive.path import BlendedPath
 from levels.scene import SceneConfig
 
 Array = NDArray[np.float64]
 
 CLOSE_PART = 0.9
 """Of the room that is left where the arm rests too close to something: the clearance of the way out."""
+LOAD_STEP_RAD = 0.25
+"""Spacing of the configurations at which the motors must carry what is held."""
 AHEAD_PART = 0.5
 """Part of the clearance that a path planned before must still have: sensed and predicted poses differ a little."""
 
@@ -51,12 +54,17 @@ class MotionPlanner:
 
         `attempt` counts tries in the same situation. With `goal` (joints,) the path ends there, so that paths planned
         from there stay good. `searches` as in `PathPlanner.plan`. Raises `Refused`: UNREACHABLE when no configuration
-        serves, NO_PATH when all are blocked.
+        serves, NO_PATH when all are blocked, OVERLOAD when the motors cannot carry along it what is held.
         """
         self.lay_out(move, situation)
         if move.touches:
-            return self._line(move, start, goal)
-        return self._path_to(move, start, self.goal(move, start) if goal is None else goal, attempt, searches)
+            path = self._line(move, start, goal)
+        else:
+            path = self._path_to(move, start, self.goal(move, start) if goal is None else goal, attempt, searches)
+        if situation.held is not None and situation.grip is not None:
+            along = BlendedPath(*path).sample(LOAD_STEP_RAD)
+            self.payloads.check_motors(situation.held, situation.grip, along)
+        return path
 
     def lay_out(self, move: Move, situation: Situation) -> None:
         """Set the collision checker to `situation` with the contacts that `move` means."""

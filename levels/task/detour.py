@@ -117,4 +117,4 @@ def _checked(goal: Message) -> None:
     """Raise `ValueError` for a place or an orientation that is none."""
     turned = goal.quaternion if goal.goal == Goal.POSE else goal.direction
     if not (np.isfinite(goal.position).all() and np.isfinite(turned).all() and turned.any()):
-        raise ValueError("position, quaternion or direction is no number, or all zero")
+        raise ValueError("position, quaternion or direction is not a number, or all zero")

@@ -9,7 +9,7 @@ from backplane.message import Message, MessageType, State
 from levels.level import Executor, Input, LevelContext, Ports, Reading
 from levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
 from levels.operator import OPERATOR_COMMAND, Commands, Goal, What
-from levels.orders import HELD_FROM_ABOVE, Orders
+from levels.orders import BELOW_LOST, HELD_FROM_ABOVE, Orders
 from levels.params import read_params
 from levels.task.detour import Detour
 from levels.task.params import TaskParams
@@ -114,7 +114,7 @@ class TaskExecutor(Executor):
         if orders.standing is not What.NONE:
             return orders.keeps(self.context.board)
         if below.is_lost:
-            return "no status from the level below: waiting for its board"
+            return BELOW_LOST
         is_held = below.value.state == State.HOLDING and below.value.reason != HELD_FROM_ABOVE
         return str(below.value.reason) if is_held else ""
 
@@ -126,11 +126,8 @@ class TaskExecutor(Executor):
         if operated or mark != self._mark:
             self._mark, self._moved_at = mark, tick
         elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
-            waits = (
-                f"move {below.current} is under way" if plan.id else "no plan; do all objects rest, is the arm seen?"
-            )
             self._error = Error.STALLED
-            self._reason = f"nothing has moved for {self._stalled_s:g} s: {kept_from or waits}"
+            self._reason = f"nothing has moved for {self._stalled_s:g} s: {kept_from or _awaited(plan, below)}"
 
     def _actions_done(self, plan: Message) -> int:
         if not plan.count:
@@ -173,3 +170,10 @@ class TaskExecutor(Executor):
         if not self._actions:
             return State.IDLE
         return State.DONE if plan.count and self._done == plan.count else State.EXECUTING
+
+
+def _awaited(plan: Message, below: Message) -> str:
+    """Return what a task waits for that nobody holds."""
+    if not plan.id:
+        return "no plan; do all objects rest, is the arm seen?"
+    return f"move {below.current} is under way" if below.current else f"no path yet for move {below.done + 1}"

@@ -12,13 +12,9 @@ from levels.planning.motion import MotionPlanner
 from levels.planning.move import Move
 from levels.planning.pose import Pose
 from levels.planning.situation import Situation
-from levels.primitive.path import BlendedPath
 from levels.task.finish import Rehearsed
 
 Array = NDArray[np.float64]
-
-LOAD_STEP_RAD = 0.25
-"""Spacing of the configurations at which the motors must carry what is held."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +51,5 @@ class Rehearsal:
             return replace(self, situation=self.situation.after(move), moves=(*self.moves, Rehearsed(move, 0.0)))
         # One search is enough: the level below takes the quickest of several, this one among them.
         path = self.motion.plan(move, self.q, self.situation, searches=1)
-        if self.situation.held is not None and self.situation.grip is not None:
-            along = BlendedPath(*path).sample(LOAD_STEP_RAD)
-            self.motion.payloads.check_motors(self.situation.held, self.situation.grip, along)
         rehearsed = Rehearsed(move, self.motion.paths.duration(path))
         return replace(self, q=path.end, moves=(*self.moves, rehearsed))

@@ -1,10 +1,12 @@
-"""A level for tests of faults: it drives something that sensors and motors can fail of."""
+"""Levels for tests of faults: one drives something that sensors and motors can fail of, one follows a wave."""
 
 from __future__ import annotations
 
-from backplane.message import Field, status
+from wave_levels import Watch
+
+from backplane.message import Field, State, status
 from boards.faults.kinds import KINDS
-from levels.level import Executor, Ports
+from levels.level import Executor, LevelContext, Ports
 
 PLACE = status("place", 1, Field("position", "f8", "rad", "where it is"), Field("mode", "i2", "1", "how it moves"))
 
@@ -18,3 +20,25 @@ class Driven(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Say where it is."""
         write.status.position = 0.5
+
+
+class Follower(Watch):
+    """Holds while it hears nothing of the wave, and fails when its patience, in ticks, is over."""
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._patience = context.params["patience"]
+        self._since: int | None = None
+        self._latched = ""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Follow the wave, wait for it, or give it up for good."""
+        super().process(read, write, tick)
+        self._since = (self._since or tick) if read.status.is_there and read.status.is_lost else None
+        if self._since is not None and tick - self._since > self._patience:
+            self._latched = f"nothing heard of the wave for {tick - self._since} ticks"
+        waits = f"waiting for the wave; latched at tick {(self._since or 0) + self._patience}"
+        write.status.reason = self._latched or (waits if self._since is not None else "")
+        write.status.state = (
+            State.ERROR if self._latched else State.HOLDING if self._since is not None else State.EXECUTING
+        )

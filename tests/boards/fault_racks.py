@@ -14,6 +14,12 @@ slot = 4
 rate_hz = 200
 executor = "fault_levels:Driven"
 """
+PATIENCE_TICKS = 300
+"""Longer than a restart in lockstep, shorter than the longest faults of a test."""
+FOLLOWED = PLANNED.replace(
+    'executor = "wave_levels:Watch"',
+    f'executor = "fault_levels:Follower"\nparams = {{ patience = {PATIENCE_TICKS} }}',
+)
 LOCKED = "protocol.default=lock"
 TARGETS = {"overrun": "wave", "planner-slow": "wave.planner", "clock": "clock", "arm": "driven"}
 """A task that can have a fault, by kind or by where the kind strikes; for any other it is the wave."""

@@ -100,9 +100,9 @@ def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
         ("driven", Alarm.SENSOR_MODEL, -1, 0.05, "sensor of all joints: off the model's motion by 0.05"),
         ("driven", Alarm.ACTUATOR, 7, 0.5, "joint 7 does not do what its torque should: off by 0.5"),
         ("driven", Alarm.COMMAND_LIMIT, 0, 512.25, "torque of shoulder, 512 N m, is beyond its limit: cut"),
-        ("driven", Alarm.BRAKES_CLOSED, -1, 0, "brakes closed"),
-        ("driven", Alarm.BRAKES_CLOSED, -1, 4, "brakes closed: 4 ticks (10 ms) without torque"),
-        ("driven", Alarm.BRAKES_OPENED, -1, 40, "brakes opened after 40 ticks (100 ms)"),
+        ("driven", Alarm.BRAKES_CLOSED, -1, 0, "brakes engaged"),
+        ("driven", Alarm.BRAKES_CLOSED, -1, 4, "brakes engaged: 4 ticks (10 ms) without torque"),
+        ("driven", Alarm.BRAKES_OPENED, -1, 40, "brakes released after 40 ticks (100 ms)"),
     ],
 )
 def test_an_alarm_is_told_with_names_and_units(

@@ -204,6 +204,16 @@ def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("setting", "place"), [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")]
+)
+def test_a_value_of_several_kinds_makes_one_mistake(setting: str, place: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load("nasrem", [f"robot.sensors.{setting}"])
+    (mistake,) = error.value.mistakes
+    assert (mistake.place, mistake.value) == (f"robot.sensors.{place}", -1)
+
+
 def test_lists_of_another_length_than_the_joints_are_told_together() -> None:
     with pytest.raises(ConfigError) as error:
         load("nasrem", ["robot.home=[0, 0]", "robot.jerk=[1]", "robot.model=none.xml"])

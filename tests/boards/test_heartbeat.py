@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 
 import pytest
 
 from backplane.address_map import CLOCK
+from backplane.process import state_of
 from backplane.segment import Segment, unlink
 from backplane.words import Block, Run, System
 from boards import heartbeat
 from boards.heartbeat import LOCKSTEP_S, Heartbeat
 from tests.backplane.bus import layout, task
+from tests.processes import FORKS, forked, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
 
 PERIOD_NS = 2_500_000
 FAST, SLOW = "fast", "slow"
@@ -45,6 +51,12 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
     monkeypatch.setattr(heartbeat, "time", clock)
     return clock
+
+
+def compute() -> None:
+    """Never wait."""
+    while True:
+        pass
 
 
 def run_on(segment: Segment, clock: Clock, seconds: float, *hanging: str) -> None:
@@ -113,6 +125,31 @@ def test_a_clock_that_gives_out_no_tick_hangs(bus: Segment, clock: Clock) -> Non
     clock.now_s += 2.5
     assert beat.hanging() == [CLOCK]
     assert beat.hanging() == []
+
+
+@pytest.mark.parametrize(
+    ("doing", "number", "looks"),
+    [
+        ("computes", 0, [[], [], []]),
+        ("waits", 0, [[], [CLOCK], []]),
+        ("waits", signal.SIGSTOP, [[CLOCK], [], []]),
+    ],
+)
+def test_a_silent_clock_hangs_only_where_it_waits_or_was_stopped(
+    bus: Segment, clock: Clock, doing: str, number: int, looks: list[list[str]]
+) -> None:
+    bus.words[System.LOCKSTEP] = 0
+    with forked(compute if doing == "computes" else signal.pause) as pid:
+        bus.words[System.CLOCK_PID] = pid
+        if number:
+            os.kill(pid, number)
+        state = "T" if number else "S" if doing == "waits" else "R"
+        wait_until(lambda: state_of(pid) == state)
+        beat = Heartbeat(bus)
+        run_on(bus, clock, 0.5)
+        assert beat.hanging() == []
+        clock.now_s += 2.5
+        assert [beat.hanging() for _ in range(3)] == looks
 
 
 @pytest.mark.parametrize("state", [Run.STARTING, Run.STOPPED])

@@ -30,10 +30,19 @@ def test_a_run_ends_when_its_task_is_done(config: MakeConfig) -> None:
     assert (outcome.cause, outcome.state, outcome.ticks, outcome.worked) == ("task done", "done", 56 + 200, True)
 
 
-def test_a_task_that_ends_in_error_is_refused_with_its_reason(config: MakeConfig) -> None:
+def test_a_task_that_ends_in_error_has_failed_with_its_reason(config: MakeConfig) -> None:
     outcome = run(Rack(config("board.wave.params.done_at=8", "board.wave.params.final=ERROR")))
-    assert (outcome.cause, outcome.state, outcome.reason) == ("task refused", "error", "the tide")
+    assert (outcome.cause, outcome.state, outcome.reason) == ("task failed", "error", "the tide")
     assert not outcome.worked
+
+
+@pytest.mark.parametrize(("moves", "cause"), [(0, "task refused"), (3, "task failed")])
+def test_a_task_that_was_never_begun_is_refused_and_any_other_has_failed(
+    config: MakeConfig, moves: int, cause: str
+) -> None:
+    program = f'executor = "wave_levels:Program"\nparams = {{ moves = {moves} }}'
+    text = PLAIN.replace('executor = "wave_levels:Watch"', program).replace('below = "wave"\n', "")
+    assert run(Rack(config(text=text))).cause == cause
 
 
 @pytest.mark.parametrize(("seconds", "ticks"), [(0.1, 40), (0.0025, 1), (0.5051, 202)])

@@ -13,6 +13,7 @@ from typing import Any
 from backplane.message import Field, Message, MessageType, State, status
 from levels.errors import LevelError
 from levels.level import Executor, Input, LevelContext, Planner, Ports
+from levels.messages import TASK_STATUS
 
 WAVE = status("wave", 1, Field("value", "f8", "1", "height of the wave"))
 GAIN = MessageType("gain", 1, (Field("gain", "f8", "1", "factor"), Field("made_at", "i8", "tick", "release")))
@@ -133,6 +134,17 @@ class Watch(Executor):
         write.status.state = read.status.value.state
         write.status.reason = read.status.value.reason
         write.status.value = read.status.value.value
+
+
+class Program(Executor):
+    """Fails at tick 8, with as many moves as its parameters say."""
+
+    outputs = {"status": TASK_STATUS}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Say that it goes on, and then that it does not."""
+        write.status.state = State.ERROR if tick >= 8 else State.EXECUTING
+        write.status.moves = self.context.params["moves"]
 
 
 class Endless(Watch):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from backplane.message import Message, State
 from levels.elemental_move import ElementalMoveExecutor
 from levels.messages import MOVE_PLAN, PRIMITIVE_STATUS, TASK_COMMAND, Error, SegmentKind, Verb
-from levels.orders import ABOVE_LOST
+from levels.orders import ABOVE_LOST, BELOW_LOST
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
 
@@ -325,6 +325,16 @@ def test_arm_is_held_while_the_board_above_is_lost() -> None:
     bench.boxes["task.command"].lost = False
     bench.cycle(2)
     assert (bench.command.hold, bench.status.error) == (0, 0)
+
+
+def test_level_says_that_it_waits_for_the_board_below() -> None:
+    bench = planned_bench()
+    bench.boxes["primitive.status"].lost = True
+    bench.cycle(2)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, BELOW_LOST)
+    bench.boxes["primitive.status"].lost = False
+    bench.cycle(2)
+    assert (bench.status.state, bench.status.reason) == (State.EXECUTING, "")
 
 
 def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() -> None:

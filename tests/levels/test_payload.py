@@ -9,8 +9,9 @@ import pytest
 
 from levels.cell import Cell, build_cell
 from levels.errors import Refused
-from levels.messages import Error
+from levels.messages import Error, Verb
 from levels.planning.motion import MotionPlanner
+from levels.planning.move import Move
 from levels.planning.payload import Payloads
 from levels.planning.pose import Pose, pose
 from levels.planning.situation import Situation
@@ -78,6 +79,16 @@ def test_motors_are_weighed_with_the_payload_and_the_weakest_is_named() -> None:
         Payloads(made, SCENE.objects).check_motors(BLOCK1, grip_of(made, BLOCK1), made.home[None, :] + 0.3)
     assert got.value.code == Error.OVERLOAD
     Payloads(weighing(0.1), SCENE.objects).check_motors(BLOCK1, grip_of(made, BLOCK1), made.home[None, :] + 0.3)
+
+
+def test_any_move_with_what_is_held_is_weighed_an_operators_goto_too() -> None:
+    made = weighing(40.0)
+    move = Move(1, 0, Verb.MOVE_JOINTS, None, pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0)), made.home + 0.3, False, 0.0)
+    motion, empty = MotionPlanner(made, SCENE, 1990), situation_of(made)
+    motion.plan(move, made.home, empty)
+    with pytest.raises(Refused, match=r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'") as got:
+        motion.plan(move, made.home, empty.holding(BLOCK1, grip_of(made, BLOCK1)))
+    assert got.value.code == Error.OVERLOAD
 
 
 def test_object_that_the_fingers_do_not_meet_is_not_judged() -> None:

@@ -289,6 +289,15 @@ def test_task_without_a_plan_ends_and_says_so() -> None:
     assert "no plan" in bench.status.reason
 
 
+@pytest.mark.parametrize(("current", "why"), [(1, "move 1 is under way"), (0, "no path yet for move 1")])
+def test_task_that_nobody_holds_says_what_it_waits_for(current: int, why: str) -> None:
+    bench = Bench(HOME, stalled_s=5.0)
+    bench.plan([0])
+    for _ in range(8):
+        bench.cycle(current=current)
+    assert bench.status.reason == f"nothing has moved for 5 s: {why}"
+
+
 def test_task_that_an_operator_holds_stands_still_as_long_as_that_lasts() -> None:
     bench, below = Bench(HOME, stalled_s=5.0), {"state": State.HOLDING, "reason": "primitive held by the operator"}
     bench.plan([0])

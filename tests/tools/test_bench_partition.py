@@ -69,6 +69,7 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
     lines = list(lines_of(found))
     assert sum("watch" in line for line in lines) == len(PARTITIONS)
     assert sum("wave" in line for line in lines) == 2 * len(PARTITIONS)
+    assert max(map(len, lines_of(found, 80))) <= 80
 
 
 @needs_fifo

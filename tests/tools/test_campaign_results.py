@@ -65,8 +65,8 @@ def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_noth
             "command-nan of lower, struck at tick 100: no brakes closed follows",
         ),
         (
-            replace(trial(SEEN), outcome=outcome("task refused", "level 'lower': blocked")),
-            "the task is not done, and no fault had to end it: task refused; level 'lower': blocked",
+            replace(trial(SEEN), outcome=outcome("task failed", "level 'lower': blocked")),
+            "the task is not done, and no fault had to end it: task failed; level 'lower': blocked",
         ),
         (replace(trial(SEEN), arm=Arm(violations=3)), "limits violated at 3 substeps"),
         (replace(trial(SEEN), left=("process 7 (x:servo)",)), "left behind: process 7 (x:servo)"),

@@ -12,6 +12,8 @@ import pytest
 
 from boards.config import budgets, load
 from tests.tools.test_commands import rack
+from tools.inventory import Inventory
+from tools.timing.forecast import Forecast
 from tools.timing.trial import Trial
 
 FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
@@ -59,6 +61,17 @@ def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
     done = rack("check", small)
     assert done.returncode == 0
     assert "for want of a budget (in the config, or --from a run): upper, lower" in done.stdout
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
+    found = load("nasrem")
+    trial = Trial.of(found, budgets(found))
+    lines = [*Inventory.of(found, trial.layout, []).lines(width), *Forecast.of(trial).lines(width)]
+    # Text that is no table is wrapped as it is printed.
+    rows = [line for line in lines if "  " in line.strip()]
+    assert len(rows) > 50
+    assert max(map(len, rows)) <= width
 
 
 def test_json_holds_everything_with_both_sides(small: Path) -> None:

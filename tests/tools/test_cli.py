@@ -49,6 +49,20 @@ def test_no_run_lasts_for_ever_or_less_than_nothing(seconds: str) -> None:
     assert "Invalid value for '--seconds'" in done.stderr
 
 
+@pytest.mark.parametrize("command", ["status", "stop", "record", "estop", "command", "inject"])
+def test_an_empty_name_is_no_rack(command: str) -> None:
+    done = rack(command, "")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == 'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it\n'
+
+
+@pytest.mark.parametrize("option", ["--faultless=nan", "--faultless=inf", "--faultless=-1", "--seconds=inf"])
+def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
+    done = rack("campaign", "fig2", option)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"Invalid value for '{option.partition('=')[0]}'" in done.stderr
+
+
 def test_bytes_that_are_no_text_are_refused() -> None:
     command = [sys.executable, "-m", "tools.cli", "check", b"\xff"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)

@@ -124,7 +124,7 @@ REFUSED = {
     "not for this level": (("lower", "setpoint", "joints=1"), "'lower' takes no setpoint; it takes: hold, resume"),
     "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' has one of: home"),
     "no word": (("upper", "goto", "hom"), "'hom' is no goal; permitted: home, joints=..., position=..."),
-    "no number": (("upper", "goto", "joints=1,x"), "'joints=1,x': 'x' is no number; permitted: numbers with commas"),
+    "no number": (("upper", "goto", "joints=1,x"), "'joints=1,x': 'x' is not a number; permitted: numbers with commas"),
     "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),
     "a tick that has passed": (("upper", "hold", "--tick", "0"), "tick = 0: has passed; the rack is at tick "),
 }

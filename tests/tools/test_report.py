@@ -211,7 +211,25 @@ def standstills(folder: Path) -> list[str]:
     return [event["text"] for event in Recording(folder).events if event.get("code") == "standstill"]
 
 
-def test_the_reason_that_ended_a_run_is_its_headline(folder: Path) -> None:
-    why = "nothing has moved for 30 s: elemental_move holds"
-    outcome = {"cause": "task refused", "reason": why, "faults": []}
-    assert markdown(write_report(folder)[0] | {"outcome": outcome}).splitlines()[0].endswith(f": task refused: {why}")
+HELD = "nothing has moved for 30 s: elemental_move holds"
+TOUCHED = "level 'servo': unintended contact: 'post' touches 'link4' at 3.125 s"
+
+
+@pytest.mark.parametrize(
+    ("outcome", "headline"),
+    [
+        ({"cause": "task failed", "reason": HELD, "faults": []}, f"task failed: {HELD}"),
+        ({"cause": "task done", "reason": "", "faults": [TOUCHED]}, f"task done: {TOUCHED}"),
+    ],
+)
+def test_what_ended_a_run_or_is_latched_is_its_headline(
+    folder: Path, outcome: dict[str, object], headline: str
+) -> None:
+    text = markdown(write_report(folder)[0] | {"outcome": outcome})
+    assert text.splitlines()[0].endswith(f": {headline}")
+
+
+def test_limits_that_a_push_broke_stand_beside_those_that_the_arm_broke(folder: Path) -> None:
+    motion = {"tracking_rms_mrad": 0.1, "tracking_peak_mrad": 0.5, "touches": 4, "clipped_cycles": 0}
+    text = markdown(write_report(folder)[0] | {"motion": motion | {"violations": 0, "pushed": 7}})
+    assert "limits exceeded in 0 substeps, by a push from outside in 7." in text

@@ -72,6 +72,6 @@ def test_a_sensor_that_stays_wrong_ends_the_task_with_its_joint_and_value(rack_n
     arguments = ("--lockstep", "--set", "board.servo.params.patience=0.5", "--faults", script, "--no-record", "--json")
     done = run("nasrem", rack_name, *arguments)
     outcome = json.loads(done.stdout)["outcome"]
-    assert done.returncode == 1
+    assert (done.returncode, outcome["cause"]) == (1, "task failed")
     assert "sensor of 'j3' reads -2.79 rad, off by 0.31; not over within 0.5 s" in json.dumps(outcome)
     assert outcome["ticks"] < 4000

@@ -45,6 +45,7 @@ def mailbox(as_json: Json = False) -> None:
 def recording(config: Config = "nasrem", as_json: Json = False) -> None:
     """Misses and lateness of a rack without a recorder, with it, and with a live viewer, interleaved."""
     from tools.bench.recording import measure
+    from tools.live_table import terminal_width
     from tools.text_table import table
 
     costs = measure(config)
@@ -63,6 +64,8 @@ def recording(config: Config = "nasrem", as_json: Json = False) -> None:
             ]
             for cost in costs
         ],
+        terminal_width(),
+        ("cycles", "p99.9", "late p50, ms"),
     ):
         print(line)
 
@@ -94,6 +97,7 @@ def partition(
     plan ages; and beside them what the timing model predicts of each from the budgets of the config.
     """
     from tools.bench.partition import compare, lines_of
+    from tools.live_table import print_wrapped, terminal_width
     from tools.progress import progress_for
 
     with progress_for(as_json) as progress:
@@ -101,8 +105,7 @@ def partition(
     if as_json:
         print_json({"config": config, "seconds": seconds, "rounds": rounds, "partitions": [asdict(p) for p in found]})
         return
-    for line in lines_of(found):
-        print(line)
+    print_wrapped("\n".join(lines_of(found, terminal_width())))
 
 
 @bench.command()
@@ -122,11 +125,15 @@ def response(
     Exit status 1 where one does not, or is beyond a bound.
     """
     from tools.bench.response import Bench
+    from tools.live_table import print_wrapped, terminal_width
     from tools.progress import progress_for
 
     with progress_for(as_json) as progress:
         measured = Bench(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)
-    print_json(measured.document()) if as_json else print("\n".join(measured.lines()))
+    if as_json:
+        print_json(measured.document())
+    else:
+        print_wrapped("\n".join(measured.lines(terminal_width())))
     if out is not None:
         from tools.responding.plot import plot
 

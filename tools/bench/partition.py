@@ -26,6 +26,8 @@ from tools.timing.verdicts import context_switch_ns
 
 LAUNCH_S = 3.0
 """About what launching and recording a run take besides its time."""
+PLANNERS_DROPPED = ("plans", "median left", "median age")
+"""Columns that a narrow terminal does without, the first first."""
 
 
 @dataclass(frozen=True)
@@ -129,16 +131,17 @@ def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], run
     )
 
 
-def lines_of(found: Sequence[PartitionFigures]) -> Iterator[str]:
-    """Yield two tables for people: executors, and planners with the ages of their plans; times in ms."""
+def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Iterator[str]:
+    """Yield two tables for people, into `width`: executors, and planners with the ages of their plans; times in ms."""
     levels = [(one.partition, level) for one in found for level in one.levels]
-    yield "executors: the worst response predicted from budgets, and what was left of the cycle, ms"
+    planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
+    yield "executors: the worst response predicted, and what was left of the cycle, ms"
     head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "median left", "worst"]
-    yield from table(head, [_executor_row(partition, level) for partition, level in levels])
+    yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "median left"))
     yield ""
-    yield "planners: the same of the time slice of a plan, and how old the plans were that were read, ms"
+    yield "planners: the same of a plan's time slice, and how old plans were when read, ms"
     head = ["partition", "level", "slice", "predicted", "plans", "late", "median left", "worst", "median age", "oldest"]
-    yield from table(head, [_planner_row(partition, level) for partition, level in levels if level.planner is not None])
+    yield from table(head, planned, width, PLANNERS_DROPPED)
 
 
 def _executor_row(partition: str, level: LevelFigures) -> list[str]:

@@ -48,9 +48,9 @@ class Measured:
         head = {"config": self.config, "mode": self.mode, "seed": self.seed, "runs": self.runs, "held": self.held}
         return {**head, **self.response.document(), "twins": [asdict(t) | {"agrees": t.agrees} for t in self.twins]}
 
-    def lines(self) -> Iterator[str]:
-        """Yield the figures as text for people."""
-        yield self.response.text()
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield the figures as text for people, the table into `width`."""
+        yield self.response.text(width)
         count = len(self.response.measured)
         yield f"{len(self.response.beyond)} of {count} beyond a bound, {len(self.response.off)} off the predicted tick"
         for twin in self.twins:

@@ -19,15 +19,20 @@ if TYPE_CHECKING:
 INJECTIONS = 3
 SIZES = 10
 FAULTLESS_S = 60.0
+MOST = 100_000
+"""Faults of a kind, kills or sizes of one campaign."""
 
 Injections = Annotated[
     int,
-    typer.Option("--injections", metavar="N", min=0, help="how often each kind strikes, as many faults a trial as fit"),
+    typer.Option(
+        "--injections", metavar="N", min=0, max=MOST, help="how often each kind strikes, as many faults a trial as fit"
+    ),
 ]
 Seed = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="the same seed draws the same plans")]
 Kinds = Annotated[str | None, typer.Option(metavar="A,B", help="these kinds alone; default: all that it can have")]
 Kills = Annotated[
-    int | None, typer.Option(metavar="N", min=1, help="nothing but N kills from outside, in as many runs as it takes")
+    int | None,
+    typer.Option(metavar="N", min=1, max=MOST, help="nothing but N kills from outside, in as many runs as it takes"),
 ]
 LockstepOnly = Annotated[bool, typer.Option("--lockstep", help="trials in lockstep alone; default: both")]
 RealtimeOnly = Annotated[
@@ -36,15 +41,20 @@ RealtimeOnly = Annotated[
 Faultless = Annotated[
     float | None,
     typer.Option(
-        metavar="S", min=0.0, help=f"faultless seconds in real time, alone and loaded, each; default {FAULTLESS_S:g}"
+        metavar="S",
+        min=0.0,
+        max=1e6,
+        help=f"faultless seconds in real time, alone and loaded, each; default {FAULTLESS_S:g}",
     ),
 ]
 Load = Annotated[bool, typer.Option("--load", help="faultless time beside a load alone: stress-ng where there is one")]
 Sizes = Annotated[
-    int | None, typer.Option(metavar="N", min=0, help=f"sizes for the curves of bias and noise; default {SIZES}")
+    int | None,
+    typer.Option(metavar="N", min=0, max=MOST, help=f"sizes for the curves of bias and noise; default {SIZES}"),
 ]
 Seconds = Annotated[
-    float | None, typer.Option(metavar="S", min=1.0, help="simulated time of a run, for a rack that no task ends")
+    float | None,
+    typer.Option(metavar="S", min=1.0, max=1e9, help="simulated time of a run, for a rack that no task ends"),
 ]
 Out = Annotated[
     Path | None,

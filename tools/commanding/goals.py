@@ -30,5 +30,5 @@ def _number(text: str, word: str) -> float:
     try:
         return float(text)
     except ValueError:
-        why = f"'{text}' is no number; permitted: numbers with commas between, as in joints=0,0.5,1"
+        why = f"'{text}' is not a number; permitted: numbers with commas between, as in joints=0,0.5,1"
         raise Failure(f"'{word}': {why}", 2) from None

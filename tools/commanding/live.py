@@ -41,9 +41,9 @@ class LiveDesk:
         known = commandable(self._config)
         return [{"level": name, "stands": self._stands(name), "takes": listed(takes)} for name, takes in known.items()]
 
-    def text(self) -> Iterator[str]:
-        """Yield the same as a table."""
-        yield from table(["level", "in force", "takes"], [list(row.values()) for row in self.levels()])
+    def text(self, width: int | None = None) -> Iterator[str]:
+        """Yield the same as a table, into `width`."""
+        yield from table(["level", "in force", "takes"], [list(row.values()) for row in self.levels()], width)
 
     def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Told:
         """Hand a command over and wait for its level to take it up, with `wait` until that is done.

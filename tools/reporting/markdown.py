@@ -66,7 +66,8 @@ def show(report: Report, terminal: Console) -> None:
 
 def _blocks(report: Report) -> Iterator[str | Grid]:
     outcome = report["outcome"] or {"cause": "no outcome recorded", "reason": "", "faults": []}
-    yield f"# {report['rack']}: {outcome['cause']}{': ' + outcome['reason'] if outcome['reason'] else ''}"
+    why = outcome["reason"] or "; ".join(outcome["faults"])
+    yield f"# {report['rack']}: {outcome['cause']}{': ' + why if why else ''}"
     yield ""
     yield (
         f"{report['simulated_s']:.2f} s simulated in {report['wall_s']:.2f} s, {report['mode']}, "
@@ -213,7 +214,8 @@ def _motion(motion: Report | None) -> Iterator[str]:
     if motion is not None:
         yield (
             f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS, {motion['tracking_peak_mrad']:.3f} peak; "
-            f"{motion['touches']} touches, {motion['clipped_cycles']} cycles clipped."
+            f"{motion['touches']} touches, {motion['clipped_cycles']} cycles clipped; "
+            f"limits exceeded in {motion['violations']} substeps, by a push from outside in {motion['pushed']}."
         )
 
 

@@ -14,7 +14,7 @@ SERVO_STATUS = "servo_status"
 
 
 def motion(recording: Recording, layout: Layout) -> dict[str, Any] | None:
-    """Return tracking error, mrad, and the counts of touches and of cut set points; None without an arm."""
+    """Return tracking error, mrad, and the counts of touches, broken limits and cut set points; None without an arm."""
     mailbox = next((m.name for m in layout.mailboxes if m.message == SERVO_STATUS), None)
     if mailbox is None or mailbox not in recording.mailboxes:
         return None
@@ -22,6 +22,6 @@ def motion(recording: Recording, layout: Layout) -> dict[str, Any] | None:
     return {
         "tracking_rms_mrad": round(float(np.sqrt(np.mean(error**2))), 6),
         "tracking_peak_mrad": round(float(np.abs(error).max()), 6),
-        "touches": int(recording.signal(mailbox, "touches")[-1]),
+        **{name: int(recording.signal(mailbox, name)[-1]) for name in ("touches", "violations", "pushed")},
         "clipped_cycles": int(recording.signal(mailbox, "clipped")[-1]),
     }

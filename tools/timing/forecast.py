@@ -61,19 +61,19 @@ class Forecast:
             "holds": self.holds,
         }
 
-    def lines(self) -> Iterator[str]:
-        """Yield everything as text for people."""
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield everything that fits into `width` as text for people."""
         yield from self.system.lines()
         if self.levels:
             yield from ("", f"worst case by the budgets, ms, with t_cs {ms(self.context_switch_ns)} ms:", "")
-            yield from level_table(self.levels)
+            yield from level_table(self.levels, width)
         paper = [verdict for verdict in self.verdicts if verdict.equation not in (RESPONSE_TIME, LOAD)]
         if paper:
             yield ""
-            yield from verdict_table(paper)
+            yield from verdict_table(paper, width)
         if self.responses:
             yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
-            yield from response_table(self.responses)
+            yield from response_table(self.responses, width)
             yield ""
             loads = (f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}" for core, load in self.loads.items())
             yield f"load: {', '.join(loads)}"

@@ -1,4 +1,7 @@
-"""Verdicts and the times that they rest on, as tables for people; times in ms."""
+"""Verdicts and the times that they rest on, as tables for people; times in ms.
+
+To fit into a `width` they do without some columns.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from tools.timing.task_response import TaskResponse
 from tools.timing.verdict import Verdict
 
 
-def level_table(levels: Iterable[LevelTiming]) -> Iterator[str]:
+def level_table(levels: Iterable[LevelTiming], width: int | None = None) -> Iterator[str]:
     """Yield a line a level: its cycle, what fills it, and what is left of it for its planner."""
     head = [
         "level",
@@ -28,20 +31,20 @@ def level_table(levels: Iterable[LevelTiming]) -> Iterator[str]:
         "d",
         "d R_i",
     ]
-    yield from table(head, [_level_row(level) for level in levels])
+    yield from table(head, [_level_row(level) for level in levels], width, ("C", "R", "W", "U", "P", "d"))
 
 
-def verdict_table(verdicts: Iterable[Verdict]) -> Iterator[str]:
+def verdict_table(verdicts: Iterable[Verdict], width: int | None = None) -> Iterator[str]:
     """Yield a line a verdict: both sides, the margin, whether it holds."""
     head = ["eq.", "of", "left", "", "right", "margin", "", "which is"]
-    yield from table(head, [_verdict_row(verdict) for verdict in verdicts])
+    yield from table(head, [_verdict_row(verdict) for verdict in verdicts], width, ("which is", "margin"))
 
 
-def response_table(responses: Iterable[TaskResponse]) -> Iterator[str]:
+def response_table(responses: Iterable[TaskResponse], width: int | None = None) -> Iterator[str]:
     """Yield a line a task: what it computes, what keeps it waiting, and its deadline; a core after the other."""
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
-    yield from table(head, [_response_row(response) for response in ordered])
+    yield from table(head, [_response_row(response) for response in ordered], width, ("FIFO", "margin"))
 
 
 def ms(time_ns: float | None) -> str:

@@ -1,0 +1,140 @@
+"""Every kind of fault, for however long, ends: all goes on within the kind's bound, or what failed is latched."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from backplane.address_map import CLOCK
+from backplane.fault_table import Entry, FaultTable, Stage
+from backplane.message import State
+from backplane.trace import trace_ring
+from backplane.words import Block
+from boards.errors import LaunchError
+from boards.faults.bounds import bound_ticks, cycle_ticks
+from boards.faults.config import FaultConfig
+from boards.faults.consequences import recovery_ticks
+from boards.faults.kinds import KINDS, Kind
+from boards.faults.request import injections
+from boards.rack import Rack
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import FOLLOWED, LOCKED, PATIENCE_TICKS, TARGETS
+from tests.processes import BOUND_S
+
+FIRST = 104
+LENGTHS: dict[str, dict[str, Any]] = {
+    "one cycle": {"cycles": 1},
+    "25 cycles": {"cycles": 25},
+    "beyond patience": {"for": 1.0},
+}
+OTHERS = [kind for kind in KINDS if kind.where != "arm"]
+"""Kinds that strike something else than the arm: for the arm's see test_servo_patience."""
+
+
+def cases(realtime: bool) -> list[Any]:
+    """Return every kind that needs real time, or that does not, with every length that it can have."""
+    return [
+        pytest.param(kind, length, id=f"{kind.name}, {name}")
+        for kind in OTHERS
+        if kind.where != "start" and kind.realtime is realtime
+        for name, length in ({"once": {}} if kind.once else LENGTHS).items()
+    ]
+
+
+def rack_with(config: MakeConfig, kind: Kind, length: dict[str, Any]) -> Rack:
+    """Return a rack whose wave, or what else the kind strikes, has the fault."""
+    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
+    settings = ["clock.mode=realtime"] if kind.realtime else []
+    found = config(*settings, *([LOCKED] if kind.where == "lock" else []), text=FOLLOWED)
+    tick = {} if kind.where == "start" else {"tick": FIRST}
+    return Rack(found.model_copy(update={"fault": (FaultConfig(kind=kind.name, board=board, **tick, **length),)}))
+
+
+@pytest.mark.parametrize(("kind", "length"), cases(realtime=False))
+def test_a_fault_is_found_and_over_or_latched_within_its_bound(
+    config: MakeConfig, kind: Kind, length: dict[str, Any]
+) -> None:
+    with rack_with(config, kind, length) as rack:
+        layout = rack.segment.layout
+        outcome = rack.run(2.0)
+        (entry,) = FaultTable(rack.segment).staged((Stage.ACTIVE, Stage.OVER))
+        board = layout.tasks[entry[Entry.TASK]].name if entry[Entry.TASK] >= 0 else CLOCK
+        rows = trace_ring(rack.segment, "watch").drain().rows
+    bound = bound_ticks(kind, injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None)
+    codes = {alarm.name.lower() for alarm in kind.seen_as} | ({"died"} if kind.name == "kill" else set())
+    found = min((event.tick for event in rack.events if event.code in codes), default=None)
+    if found is None:
+        # One cycle may be too short to tell anything, or to hit a message.
+        assert length == LENGTHS["one cycle"]
+        found = FIRST
+    assert bound is not None
+    assert found - max(FIRST, entry[Entry.STRUCK_TICK]) <= bound
+    if outcome.state == "error":
+        latched = int(rows["tick"][rows["state"] == State.ERROR][0])
+        assert not outcome.worked
+        assert outcome.reason.startswith("nothing heard of the wave for")
+        assert latched <= found + bound + PATIENCE_TICKS + cycle_ticks(layout, "watch")
+        return
+    assert outcome.worked
+    restart_s = rack.config.supervision.lockstep_restart_s
+    over = max(entry[Entry.UNTIL] if entry.stage == Stage.OVER else 0, found)
+    if kind.name == "hang":
+        over = found
+    after = rows[rows["tick"] >= over + recovery_ticks(kind.name, board, layout, restart_s)]
+    assert len(after) > 20
+    assert np.all(after["state"] == State.EXECUTING)
+
+
+@pytest.mark.parametrize(("kind", "length"), cases(realtime=True))
+def test_a_fault_that_takes_real_time_is_over_or_latched_in_the_end(
+    config: MakeConfig, kind: Kind, length: dict[str, Any]
+) -> None:
+    with rack_with(config, kind, length) as rack:
+        rack.start()
+        entry, watch = FaultTable(rack.segment).entries[0], rack.segment.block("watch")
+        tasks = [rack.segment.block(task.name) for task in rack.segment.layout.tasks]
+        deadline = time.monotonic() + BOUND_S
+        while (entry.stage != Stage.OVER or any(task[Block.LOST] for task in tasks)) and rack.watch(0.02):
+            assert time.monotonic() < deadline
+        before = [task[Block.CYCLES] for task in tasks]
+        while (
+            any(task[Block.CYCLES] <= count for task, count in zip(tasks, before, strict=True))
+            or watch[Block.LEVEL_STATE] != State.EXECUTING
+        ) and rack.watch(0.02):
+            assert time.monotonic() < deadline
+        if rack.outcome is not None:
+            assert rack.outcome.reason.startswith("nothing heard of the wave for")
+        elif kind.where in ("clock", "lock"):
+            # A task that has lost its core to others may take none of the cycles of its fault.
+            assert entry[Entry.COUNT] > 0
+
+
+def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> None:
+    fault = FaultConfig(kind="lock-held", board="watch", tick=FIRST + 1)
+    found = config("clock.mode=realtime", LOCKED, text=FOLLOWED).model_copy(update={"fault": (fault,)})
+    with Rack(found) as rack:
+        rack.start()
+        entry, deadline = FaultTable(rack.segment).entries[0], time.monotonic() + BOUND_S
+        while entry.stage != Stage.OVER and rack.watch(0.02):
+            assert time.monotonic() < deadline
+        assert entry[Entry.STRUCK_TICK] > FIRST + 1
+        assert rack.watch(0.02)
+
+
+def test_a_run_ends_when_nothing_is_heard_any_more_of_the_level_that_ends_it(config: MakeConfig) -> None:
+    slow = FOLLOWED.replace("rate_hz = 400", "rate_hz = 40").replace("rate_hz = 50", "rate_hz = 5")
+    fault = FaultConfig(kind="mute", board="watch", tick=FIRST)
+    with Rack(config("clock.period_ms=25", text=slow).model_copy(update={"fault": (fault,)})) as rack:
+        outcome = rack.run()
+    assert (outcome.cause, outcome.worked) == ("task failed", False)
+    assert outcome.reason.startswith("nothing heard of 'watch.status' for 30.")
+    assert outcome.ticks < FIRST + 31 * 40
+
+
+@pytest.mark.parametrize("kind", [kind for kind in OTHERS if kind.where == "start"])
+def test_a_rack_whose_start_fails_does_not_arm(config: MakeConfig, kind: Kind) -> None:
+    with pytest.raises(LaunchError, match="wave"), rack_with(config, kind, {}):
+        pass
