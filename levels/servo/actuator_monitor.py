@@ -21,7 +21,9 @@ NOISE = 0.005
 LACKING = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
 RESTING = 0.1
-"""The same while most joints of an arm that holds a part rest: dry friction hides the push at all joints but one."""
+"""The same while an arm that holds a part hardly moves: dry friction may hide the push at all joints but one."""
+TURNING_JOINTS = 2
+"""Joints that turn, at which a push shows: fewer, and the arm hardly moves."""
 SURE_CYCLES = 4
 """Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
 WATCHED_CYCLES = 20
@@ -129,7 +131,7 @@ class ActuatorMonitor:
             self._pushed, self._cycles = True, 0
         share = np.where(explained, lacks / self._limits, 0.0)
         # Where a joint turns its dry friction is known, and any push shows.
-        rests = 2 * np.count_nonzero(self._friction[1] - self._friction[0] > self._noise) > len(left)
+        rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < TURNING_JOINTS
         part = PRESSING if self._pushed else RESTING if rests and holds else LACKING
         least = np.maximum(part, self._noise / self._limits)
         joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
