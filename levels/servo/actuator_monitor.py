@@ -26,9 +26,6 @@ TURNING_JOINTS = 2
 """Joints that turn, at which a push shows: fewer, and the arm hardly moves."""
 SURE_CYCLES = 4
 """Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
-WATCHED_CYCLES = 20
-"""Cycles in which it must be told more: of a motor that lacks torque the joint loop soon asks more; where a part is set
-down with so little force that dry friction hides it at the other joints, only slowly."""
 FOLLOWS = 0.3
 """Part of a rise in torque that a sound motor gives at least."""
 DEAD = 0.5
@@ -148,8 +145,6 @@ class ActuatorMonitor:
         if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
             self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
-        if self._cycles == WATCHED_CYCLES:
-            self._cycles = 0
         return None
 
     def _sure(self, joint: int, told: float, lacks: float) -> bool:
