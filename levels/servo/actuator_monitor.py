@@ -21,12 +21,11 @@ NOISE = 0.005
 LACKING = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
 RESTING = 0.1
-"""The same while most joints of an arm that holds a part rest: dry friction hides the push at all joints but one."""
+"""The same while an arm that holds a part hardly moves: dry friction may hide the push at all joints but one."""
+TURNING_JOINTS = 2
+"""Joints that turn, at which a push shows: fewer, and the arm hardly moves."""
 SURE_CYCLES = 4
 """Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
-WATCHED_CYCLES = 20
-"""Cycles in which it must be told more: of a motor that lacks torque the joint loop soon asks more; where a part is set
-down with so little force that dry friction hides it at the other joints, only slowly."""
 FOLLOWS = 0.3
 """Part of a rise in torque that a sound motor gives at least."""
 DEAD = 0.5
@@ -129,7 +128,7 @@ class ActuatorMonitor:
             self._pushed, self._cycles = True, 0
         share = np.where(explained, lacks / self._limits, 0.0)
         # Where a joint turns its dry friction is known, and any push shows.
-        rests = 2 * np.count_nonzero(self._friction[1] - self._friction[0] > self._noise) > len(left)
+        rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < TURNING_JOINTS
         part = PRESSING if self._pushed else RESTING if rests and holds else LACKING
         least = np.maximum(part, self._noise / self._limits)
         joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
@@ -146,8 +145,6 @@ class ActuatorMonitor:
         if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
             self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
-        if self._cycles == WATCHED_CYCLES:
-            self._cycles = 0
         return None
 
     def _sure(self, joint: int, told: float, lacks: float) -> bool:
