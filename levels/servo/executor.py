@@ -174,7 +174,6 @@ class ServoExecutor(Executor):
         return self.standing.wanted(reference, tick) if self.standing.stands else reference.at(command, tick)
 
     def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
-        self.sensors.doubt_unchanged()
         if not self.stopping.trying:
             self.findings.append(finding)
         return self.stopping.motor_fails(finding.subject, finding.value, tick)

@@ -20,9 +20,9 @@ ROOM_RAD = 5e-5
 BEYOND_RAD, BEYOND_SPEED = 0.05, 1.2
 """How far beyond its range, and at what multiple of its velocity limit, no joint can be."""
 STILL_CYCLES = 10
-"""Cycles without the least change, under way, that no joint is capable of."""
-UNDER_WAY = 0.002
-"""Velocity of the set point, rad/s, from which on a joint is under way."""
+"""Cycles without the least change, while the set point goes on, that no joint is capable of."""
+STILL_RAD = 5e-5
+"""Way of the set point in that time: however slow it is, a joint that is driven with a stuck sensor soon runs away."""
 PLAUSIBLE_RAD = 1e-3
 """Offset of a joint that came with a fault of its sensor and is taken over at rest: a millimetre at the arm's reach."""
 STUCK_RAD = 0.01
@@ -66,7 +66,7 @@ class SensorMonitor:
         self._retry_cycles = max(retry_cycles, good_cycles)
         self._room, self._speed_room = ROOM_RAD + 2.0 * encoders.off, encoders.speed_off
         self._coarse = not encoders.exact
-        self._unshown = STUCK_STEPS * 2.0 * encoders.off
+        self._unshown = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
         self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
         self._fastest = BEYOND_SPEED * bounds.velocity
         self._braking, self._tick_s, self._every, self._good_cycles = braking, tick_s, every, good_cycles
@@ -130,10 +130,6 @@ class SensorMonitor:
             return
         self._take(q, qd, way, room)
 
-    def doubt_unchanged(self) -> None:
-        """Doubt what showed no change in the last sample: a motor that seems to fail may be a sensor that is stuck."""
-        np.maximum(self.doubt, STUCK_RAD, out=self.doubt, where=self._unchanged)
-
     def _take(self, q: Array, qd: Array, way: Array, room: Array) -> None:
         """Trust a sample; say where that moves a joint by more than `room`, rad."""
         np.equal(q, self._raw[0], out=self._unchanged)
@@ -155,7 +151,7 @@ class SensorMonitor:
                 self._still[:] = 0
                 self._still_way[:] = 0.0
             return True
-        still = (change == 0.0) & (q == self._raw[0]) & (np.abs(wanted) > UNDER_WAY)
+        still = (change == 0.0) & (q == self._raw[0]) & (wanted != 0.0)
         self._still += 1
         self._still *= still
         self._still_way += passed_s * wanted
@@ -190,9 +186,8 @@ class SensorMonitor:
         self._unproven |= still
         self._unproven &= unchanged
         if begins:
-            np.maximum(self.doubt, PLAUSIBLE_RAD, out=self.doubt)
             # One that showed no change may have been stuck while its joint crept: it is off by that now it shows one.
-            self.doubt_unchanged()
+            np.maximum(self.doubt, np.where(self._unchanged, STUCK_RAD, PLAUSIBLE_RAD), out=self.doubt)
             # One that shows none now, beside another at fault, may be stuck as well, since before that was found.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged)

@@ -128,11 +128,22 @@ def test_a_sensor_stuck_at_rest_is_found_once_its_joint_is_to_move() -> None:
     assert rig.status.position == pytest.approx(home, abs=1e-3)
 
 
+@pytest.mark.parametrize("speed", [2e-4, 2e-3, 2e-2])
+def test_a_stuck_sensor_is_found_before_its_joint_runs_away_however_slow_the_set_points_are(speed: float) -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(60, lambda _: (home, np.zeros(6)))
+    begun, slow = rig.inject("sensor-stuck", joint=-1), np.full(6, speed)
+    rig.run(200, lambda t: (home + slow * (t - begun * 0.0025), slow))
+    # A joint that does not seem to start may as well have a motor at fault.
+    assert rig.alarms()[0] in (Alarm.SENSOR_STUCK, Alarm.ACTUATOR)
+    assert rig.servo.arm.sense().position == pytest.approx(home, abs=2e-3)
+
+
 def test_a_joint_that_crept_while_its_sensor_was_stuck_is_trusted_again_where_it_is() -> None:
     rig, home = ServoRig(*config("puma560")), move().start
     rig.run(200, lambda _: (home, np.zeros(6)))
     rig.inject("sensor-stuck", joint=3)
-    begun, crept = rig.rack.tick, home + np.array([0.0, 0.0, 0.0, 5e-4, 0.0, 0.0])
+    begun, crept = rig.rack.tick, home + np.array([0.0, 0.0, 0.0, 4e-5, 0.0, 0.0])
     rig.run(200, lambda t: Course(home, crept, 0.5).at(t - begun * 0.0025))
     assert rig.alarms() == []
     rig.heal()
