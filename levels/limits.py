@@ -53,6 +53,10 @@ the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and without the l
 PRESSING = 0.2
 """Part of a torque limit that a contact takes at most where a task means one, as when a part is set down: a third more
 than tasks show."""
+RESTING = 0.1
+"""The same while an arm that holds a part hardly moves: dry friction may hide the push at all joints but one."""
+TURNING_JOINTS = 2
+"""Joints that turn, at which a push shows: fewer, and the arm hardly moves."""
 SIGMAS = 6.0
 """Standard deviations of noise that a monitor allows for: less than one sample in a billion is farther off."""
 

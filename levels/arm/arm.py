@@ -64,6 +64,10 @@ class Arm(Link, Protocol):
         """The geoms of an unintended contact of the arm, or of what it holds, since the last `step` began."""
 
     @property
+    def holds(self) -> bool:
+        """Whether the gripper touches a part."""
+
+    @property
     def leans(self) -> bool:
         """Whether the arm, or what it holds, touches anything else."""
 

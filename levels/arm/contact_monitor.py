@@ -41,6 +41,10 @@ class ContactMonitor:
         if len(ours):
             self.struck = int(ours[0, 0]), int(ours[0, 1])
 
+    def holds(self, data: mujoco.MjData) -> bool:
+        """Say whether the gripper touches a free body."""
+        return bool(self._held(data).any())
+
     def leans(self, data: mujoco.MjData) -> bool:
         """Say whether the arm, or what it holds, touches anything else."""
         ours = self._arm | self._held(data)

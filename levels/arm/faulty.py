@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from levels.arm.arm import Arm, Sensed
 from levels.cell import Cell
+from levels.dynamics import FRICTION_SPEED
 from levels.level import Fault, Finding
-from levels.limits import PRESSING
+from levels.limits import PRESSING, RESTING, TURNING_JOINTS
 
 Array = NDArray[np.float64]
 
@@ -25,6 +26,8 @@ APART = np.array([1e-2, 1e-2])
 creeps, that need not be noticed before it has come that far."""
 SLIGHT = 0.02
 """Part of its torque limit that a motor must lack to count, beside what dry friction and a contact may hide."""
+TURNING = 5.0 * FRICTION_SPEED
+"""Velocity, rad/s, from which on the dry friction of a joint is known."""
 
 
 class _Active(NamedTuple):
@@ -134,12 +137,19 @@ class FaultyLink:
         found = self._arm.drive(torque, grip_force)
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
-            hidden = self._hidden + self._pressed if self._arm.leans else self._hidden
+            hidden = self._hidden + self._pushed()
             for active in self._motors:
                 lacking = asked - active.part * self._limits
                 if (lacking > hidden)[active.joints].any():
                     self._acted.append(active.place)
         return found
+
+    def _pushed(self) -> Array | float:
+        """Return what a push may hide of what a motor lacks, N m."""
+        if self._arm.leans:
+            return self._pressed
+        turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNING)
+        return RESTING * self._limits if self._arm.holds and turning < TURNING_JOINTS else 0.0
 
     def _corrupt(self, torque: Array) -> Array:
         corrupt = self._torque

@@ -89,6 +89,11 @@ class SimulatedArm:
         return self._contacts.struck
 
     @property
+    def holds(self) -> bool:
+        """Whether the gripper touches a part."""
+        return self._contacts.holds(self._data)
+
+    @property
     def leans(self) -> bool:
         """Whether the arm, or what it holds, touches anything else."""
         return self._contacts.leans(self._data)

@@ -12,7 +12,7 @@ from levels.algebra import each, mat_vec
 from levels.cell import Cell
 from levels.dynamics import FRICTION_SPEED, Terms
 from levels.level import Finding
-from levels.limits import PRESSING
+from levels.limits import PRESSING, RESTING, TURNING_JOINTS
 
 Array = NDArray[np.float64]
 
@@ -20,10 +20,6 @@ NOISE = 0.005
 """Part of a torque limit that the equation of motion leaves unexplained; ten times what faultless runs show."""
 LACKING = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
-RESTING = 0.1
-"""The same while an arm that holds a part hardly moves: dry friction may hide the push at all joints but one."""
-TURNING_JOINTS = 2
-"""Joints that turn, at which a push shows: fewer, and the arm hardly moves."""
 SURE_CYCLES = 4
 """Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
 FOLLOWS = 0.3

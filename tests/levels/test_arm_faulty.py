@@ -134,16 +134,18 @@ def test_a_joint_that_the_arm_lacks_is_never_struck() -> None:
     assert acted == []
 
 
-def test_a_motor_that_is_off_counts_later_where_a_part_that_is_held_leans_on_something() -> None:
-    for leans, acts in ((False, [0]), (True, [])):
-        made, acted = cell("puma560"), list[int]()
-        arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
-        lay_against_a_finger(made, arm, blocks=1 + leans)
-        assert arm.leans is leans
-        link = FaultyLink(arm, made, 1, acted)
-        link.inject([fault("actuator-off", joint=1)])
-        link.drive(HOLDING, 0.0)
-        assert acted == acts
+@pytest.mark.parametrize(("blocks", "more", "acts"), [(0, 0.0, [0]), (1, 0.0, []), (1, 20.0, [0]), (2, 20.0, [])])
+def test_a_motor_that_is_off_counts_later_where_an_arm_at_rest_holds_a_part_or_leans_on_it(
+    blocks: int, more: float, acts: list[int]
+) -> None:
+    made, acted = cell("puma560"), list[int]()
+    arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
+    lay_against_a_finger(made, arm, blocks)
+    assert (arm.holds, arm.leans) == (blocks > 0, blocks > 1)
+    link = FaultyLink(arm, made, 1, acted)
+    link.inject([fault("actuator-off", joint=1)])
+    link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
+    assert acted == acts
 
 
 def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
