@@ -80,8 +80,11 @@ class ClockDriver(ABC):
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @abstractmethod
-    def settle(self, task: ReleasedTask) -> None:
-        """Where time waits for tasks, wait until this one has finished what it was released for."""
+    def settle(self) -> None:
+        """Where time waits for tasks, wait until each has finished what it was released for, plans too.
+
+        To be called before anything changes that tasks look at whenever they run, and not as of a tick.
+        """
 
     @abstractmethod
     def await_state(self, condition: Callable[[], bool]) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from backplane.alarms import AlarmWriter
 from backplane.clock_driver import ClockDriver, Ended
 from backplane.process import GONE, STOPPED, state_of
-from backplane.released_task import ReleasedTask
 from backplane.segment import Segment
 from backplane.semaphores import clock_semaphore
 from backplane.wake import CHECK_S
@@ -67,9 +66,9 @@ class LockstepDriver(ClockDriver):
                     return False
         return True
 
-    def settle(self, task: ReleasedTask) -> None:
-        """Wait until a task has finished what it was released for, a plan too."""
-        self._wait(task.is_settled)
+    def settle(self) -> None:
+        """Wait until every task has finished what it was released for, plans too."""
+        self._wait(lambda: all(task.is_settled() for task in self.tasks))
 
     def await_state(self, condition: Callable[[], bool]) -> None:
         """Wait until `condition` holds."""

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 
 from backplane.clock_driver import ClockDriver
-from backplane.released_task import ReleasedTask
 from backplane.wake import CHECK_S
 from backplane.words import Run, System
 
@@ -32,7 +31,7 @@ class RealtimeDriver(ClockDriver):
             tick = self._sleep_until_next(tick, epoch, period)
         self.end()
 
-    def settle(self, task: ReleasedTask) -> None:
+    def settle(self) -> None:
         """Wait for nobody: in real time a task is met wherever it is."""
 
     def await_state(self, condition: Callable[[], bool]) -> None:

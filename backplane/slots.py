@@ -27,6 +27,7 @@ CHAIN_AT = Slot.CHAIN * 8
 _STAMP, _CRC, _EPOCH, _BASIS, _SERIAL, _TICK, _VISIBLE = range(7)
 _CLAIMANT = int(Box.CLAIMANT)
 EPOCH_BITS = 32
+EPOCH_MASK = (1 << EPOCH_BITS) - 1
 
 
 def claim(epoch: int, pid: int) -> int:
@@ -36,7 +37,7 @@ def claim(epoch: int, pid: int) -> int:
 
 def epoch_of(signature: int) -> int:
     """Return the epoch in a writer's signature."""
-    return signature & ((1 << EPOCH_BITS) - 1)
+    return signature & EPOCH_MASK
 
 
 def pid_of(signature: int) -> int:

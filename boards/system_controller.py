@@ -62,6 +62,7 @@ class SystemController:
         self._driver.await_state(lambda: task.is_ready or task.is_given_up)
         if task.is_ready:
             away = tick - task.lost_tick
+            self._driver.settle()
             task.rejoin()
             self._driver.alarms.ring(tick, Alarm.REJOINED, task.index, away)
         elif task.is_given_up:
@@ -77,6 +78,7 @@ class SystemController:
             asked.append((Demand.BRAKE, -1))
         demand, subject = max(asked, default=(Demand.NONE, -1))
         if demand != self._demand:
+            self._driver.settle()
             self._demand = demand
             self._words[System.DEMAND] = demand
             self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)

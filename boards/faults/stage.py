@@ -43,12 +43,15 @@ class FaultStage:
         """Begin what is due at `tick`, and end what is over."""
         self._injected = self._words[System.INJECTED]
         self._open = self._table.staged(OPEN)
+        over = [entry for entry in self._open if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)]
+        due = [entry for entry in self._open if entry.stage == Stage.WAITING and self._is_due(entry, tick)]
+        if over or due:
+            self._strikes.settle()
+        for entry in over:
+            self._finish(entry, tick)
+        for entry in due:
+            self._begin(entry, tick)
         for entry in self._open:
-            if entry.stage == Stage.ACTIVE and (entry[Entry.UNTIL] <= tick or self._strikes.is_void(entry)):
-                self._finish(entry, tick)
-        for entry in self._open:
-            if entry.stage == Stage.WAITING and self._is_due(entry, tick):
-                self._begin(entry, tick)
             if entry.stage == Stage.ACTIVE:
                 self._strikes.during(entry, tick)
 
@@ -59,6 +62,9 @@ class FaultStage:
             time.sleep(max(0, at - time.monotonic_ns()) * 1e-9)
             self._strikes.begin(entry, tick)
         self._phased.clear()
+
+    def _is_over(self, entry: FaultEntry, tick: int) -> bool:
+        return entry[Entry.UNTIL] <= tick or self._strikes.is_void(entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
         """Say whether a fault begins; its condition is read every tick, for only then does it see what is new."""

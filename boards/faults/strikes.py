@@ -42,6 +42,10 @@ class Strikes:
         }
         self._end: dict[str, Strike] = {"hang": self._go_on}
 
+    def settle(self) -> None:
+        """Have every cycle that is under way end as it began, with the faults that there were."""
+        self._driver.settle()
+
     def begin(self, entry: FaultEntry, tick: int) -> None:
         """Strike at the beginning of a fault, if it is this board that does."""
         strike = self._begin.get(KINDS[entry[Entry.KIND]].name)
@@ -80,16 +84,13 @@ class Strikes:
             self._acts(entry, tick)
             os.kill(os.getpid(), signal.SIGKILL)
             return
-        self._driver.settle(task)
         if self._send(entry, tick, task, signal.SIGKILL):
             self._driver.await_state(lambda: task.lost_tick >= 0)
 
     def _hang(self, entry: FaultEntry, tick: int) -> None:
         task = self._target(entry)
-        if task is not None:
-            self._driver.settle(task)
-            if self._send(entry, tick, task, signal.SIGSTOP):
-                task.is_stopped = True
+        if task is not None and self._send(entry, tick, task, signal.SIGSTOP):
+            task.is_stopped = True
 
     def _go_on(self, entry: FaultEntry, tick: int) -> None:
         task = self._target(entry)
@@ -97,7 +98,7 @@ class Strikes:
             with suppress(ProcessLookupError):
                 os.kill(task.block[Block.PID], signal.SIGCONT)
             task.is_stopped = False
-            self._driver.settle(task)
+            self.settle()
 
     def _send(self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals) -> bool:
         """Send a signal to a task's process; False when it is not there to be struck."""

@@ -12,9 +12,10 @@ from backplane.protocols import open_writer
 from backplane.ring import Ring, mailbox_ring
 from backplane.segment import Segment
 from backplane.slots import claim
+from boards.faults.masquerade import masquerade
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, fork, kill, wait_until
+from tests.processes import FORKS, exit_status, fork, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 DEPTH = 16
@@ -78,6 +79,26 @@ def test_rows_taken_are_copies(bus: Segment) -> None:
     rows = ring.drain().rows
     write(writer, 3 * DEPTH)
     assert rows["serial"].tolist() == [1]
+
+
+def test_only_messages_that_a_reader_takes_are_rows(bus: Segment) -> None:
+    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    write(writer, 2)
+    writer.publish(30, 31, 30, damage=(5, 70))
+    writer.lose()
+    write(writer, 1)
+    assert serials(ring) == ([1, 2, 5], 0)
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_a_forged_message_is_no_row_and_the_true_one_in_its_place_is(bus: Segment) -> None:
+    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    write(writer, 2)
+    assert serials(ring) == ([1, 2], 0)
+    assert exit_status(fork(lambda: masquerade(bus, NAME, 20))) == 0
+    assert serials(ring) == serials(ring) == ([], 0)
+    write(writer, 2)
+    assert serials(ring) == ([3, 4], 0)
 
 
 def test_a_second_reader_loses_nothing_by_the_first(bus: Segment) -> None:
