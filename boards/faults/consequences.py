@@ -54,7 +54,7 @@ CONSEQUENCES: Mapping[str, Consequence] = {
     "drop": Consequence(own=(Alarm.MUTE,)),
     # The first messages on time overtake the last ones held back.
     "delay": Consequence(own=(Alarm.DISORDER,)),
-    "reorder": Consequence(own=(Alarm.MUTE, Alarm.HELD_BACK)),
+    "reorder": Consequence(own=(Alarm.MUTE,)),
     "corrupt": _DAMAGE,
     "babble": Consequence(own=(Alarm.DISORDER, Alarm.GAP)),
     "masquerade": Consequence(own=(Alarm.DISORDER, Alarm.GAP, Alarm.DAMAGED)),

@@ -121,7 +121,8 @@ KINDS: tuple[Kind, ...] = (
         "reorder",
         "writer",
         "two messages change places",
-        (Alarm.DISORDER,),
+        # The last message held back may find none to change places with.
+        (Alarm.DISORDER, Alarm.HELD_BACK),
         "1 read",
         (_probability(0.3),),
         takes_mailbox=True,

@@ -117,10 +117,10 @@ class Reorder(Step):
     def send(self, message: Outgoing) -> None:
         """Hand on a message and then the one held back, or hold it back."""
         if self.held:
-            self.acts(message)
             self.onward(message)
             self.held.pop().send(self.writer, message.at, message.visible_at, self.onward)
         elif self.chance(message).random() < self.entry.parameters[0]:
+            self.acts(message)
             self.hold(message)
         else:
             self.onward(message)

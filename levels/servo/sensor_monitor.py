@@ -77,6 +77,7 @@ class SensorMonitor:
         self._still, self._still_way, self._claimed = np.zeros(joints, dtype=int), np.zeros(joints), np.zeros(joints)
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
+        self._sent = self._everyone  # its set point moves, or may have moved
         self._tick: int | None = None
         self._streak = 0
         self._rung: set[Alarm] = set()
@@ -126,6 +127,7 @@ class SensorMonitor:
             self._claim(q, qd, passed_s)
             stirs = stirs and bool((self._claimed <= self._room).all())
         if self.faulty or not stirs or np.count_nonzero(fits) < fits.size:
+            self._sent = self._everyone if wanted is None else wanted != 0.0
             self._doubtful(q, qd, way, fits & (np.abs(qd) <= fastest), room, passed_s)
             return
         self._take(q, qd, way, room)
@@ -188,9 +190,10 @@ class SensorMonitor:
         if begins:
             # One that showed no change may have been stuck while its joint crept: it is off by that now it shows one.
             np.maximum(self.doubt, np.where(self._unchanged, STUCK_RAD, PLAUSIBLE_RAD), out=self.doubt)
-            # One that shows none now, beside another at fault, may be stuck as well, since before that was found.
+            # One that shows none now though its joint was sent somewhere may be stuck as well, since before that was
+            # found.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
-            np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged)
+            np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
         self._still[still] = 0
         self._blame(good, q, q - self.position - way)
         self._suspect |= ~good

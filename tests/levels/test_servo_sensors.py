@@ -171,6 +171,19 @@ def test_noise_on_a_joint_that_was_in_doubt_is_not_taken_for_where_it_is() -> No
     assert rig.status.stopped == 0
 
 
+def test_a_bias_at_rest_is_no_new_place_because_another_sensor_has_lied_before() -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    for joint in (0, 4):
+        rig.inject("sensor-nan" if joint == 0 else "sensor-bias", joint=joint, **({"size": 0.03} if joint else {}))
+        rig.run(60, lambda _: (home, np.zeros(6)))
+        assert rig.status.stopped == 1
+        rig.heal()
+        rig.run(40, lambda _: (home, np.zeros(6)))
+        assert rig.status.stopped == 0
+    assert Alarm.RE_REFERENCED not in rig.alarms()
+
+
 def test_an_offset_too_small_to_matter_is_taken_over_at_rest() -> None:
     rig, slow = ServoRig(*config("puma560")), Course(move().start, GOAL, 30.0)
     rig.run(400, slow.at)
