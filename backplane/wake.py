@@ -76,6 +76,7 @@ class NextCycle:
         expected = max(self._last + 1, self._not_before)
         expected += -expected % every
         release = max(expected, newest - self._slack)
+        self._clock_is_silent = False
         self.skipped = (release - expected) // every
         self._last = release
         self._slack = every * (self._spec.within_cycles - 1)

@@ -11,6 +11,8 @@ from backplane.segment import Segment
 from backplane.words import Block
 from boards.processor import set_priority
 
+LEAST_S = 0.001
+"""Least time between two such looks."""
 LOOK_S = 0.05
 """Least often that a hog which waits for its tick looks whether it is still wanted."""
 
@@ -28,8 +30,9 @@ def run_hog(segment: Segment, entry: FaultEntry) -> None:
         raise PermissionError(f"hog: SCHED_FIFO priority {block[Block.PRIORITY] + 1} is refused")
     while entry.stage == Stage.WAITING and not clock.is_stopped:
         wait_ns = clock.time_of(max(entry[Entry.FROM], clock.tick + 1)) - time.monotonic_ns()
-        # On the clock's grid: the first tick at which the fault can begin, or the next one.
-        time.sleep(min(max(wait_ns, 0) * 1e-9, LOOK_S))
+        # On the clock's grid: the first tick at which the fault can begin, or the next one. Where that has passed
+        # already, and before the start, the clock is waited for: at this priority nobody else would get to run.
+        time.sleep(min(wait_ns * 1e-9 if wait_ns > 0 else LEAST_S, LOOK_S))
     end = clock.time_of(entry[Entry.UNTIL])
     entry.acted(clock.now(), time.monotonic_ns())
     while time.monotonic_ns() < end and not clock.is_stopped:

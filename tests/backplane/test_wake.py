@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -152,6 +153,22 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
             bus.words[System.STATE] = Run.STOPPED
             wake_semaphore(bus.rack, "level").release()
     assert [Alarm(code) for code in alarm_ring(bus, "level").drain().rows["code"]] == rung
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_a_clock_that_stops_again_is_told_of_again(bus: Segment) -> None:
+    bus.words[System.PERIOD_NS], bus.words[System.EPOCH_NS] = 2_500_000, time.monotonic_ns()
+    cycle, ring = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")), alarm_ring(bus, "level")
+    release(bus, 0)
+    cycle.wait()
+    with forked(signal.pause) as pid:
+        os.kill(pid, signal.SIGSTOP)
+        bus.words[System.CLOCK_PID] = pid
+        for tick in (4, 8):
+            with in_thread(cycle.wait):
+                wait_until(lambda: ring.waiting > 0)
+                assert Alarm(ring.drain().rows["code"][0]) is Alarm.CLOCK_STOPPED
+                release(bus, tick)
 
 
 def test_posts_that_a_polling_task_does_not_need_do_not_add_up(bus: Segment) -> None:
