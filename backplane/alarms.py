@@ -63,7 +63,7 @@ class Alarm(IntEnum):
     SENSOR_SILENT = 42  # [-1; age, ticks]  no new sample
     SENSOR_MODEL = 43  # [joint; residual]  what is sensed is not what the model's motion leads to
     ACTUATOR = 44  # [joint; residual]  the arm does not do what its torques should
-    COMMAND_INVALID = 45  # [joint; -]  a torque that is no number was not let through
+    COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is not a number
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond the limits was cut
     BRAKES_CLOSED = 47  # [-1; ticks without torque, 0: demanded]
     BRAKES_OPENED = 48  # [-1; ticks they were closed]

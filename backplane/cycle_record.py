@@ -1,6 +1,6 @@
 """What a task's trace proves about its messages: which release it has finished last, and when a cycle ended.
 
-A task traces a cycle behind its last write, so a message that is not there by then was not written, and one that
+A task traces a cycle after its last write, so a message that is not there by then was not written, and one that
 comes later was held back. Age alone proves nothing: the machine may have taken the core away.
 """
 

@@ -1,7 +1,7 @@
 """The digest of a run: a hash over everything every task wrote, ticks and values, no wall-clock time.
 
 Each message carries the running hash of its mailbox, so the digest is complete even when a recorder lost
-rows, and a restarted writer goes on with it. Messages that become visible behind the last tick do not
+rows, and a restarted writer goes on with it. Messages that become visible after the last tick do not
 count: whether they were finished is no part of the motion.
 """
 

@@ -40,7 +40,7 @@ class Entry(IntEnum):
     TASK = 2  # index among the layout's tasks; -1: the clock
     MAILBOX = 3  # index among the layout's mailboxes; -1: every one that the task writes, or none
     FROM = 4  # first tick of the fault; -1: as soon as possible, or when its condition holds
-    UNTIL = 5  # first tick behind it; known once it has begun
+    UNTIL = 5  # first tick after it; known once it has begun
     TICKS = 6  # how long it lasts; 0: until the end of the run, or only once, as the kind has it
     PHASE = 7  # when in its first tick it strikes, in 1/1000 of a tick of real time
     SEED = 8

@@ -61,7 +61,7 @@ class Writer:
     """The one writer of a mailbox; its base protocol is time-slice.
 
     Opening claims the mailbox: a second writer is refused with `MailboxError` as long as the first
-    one's process lives. A new writer goes on behind the last whole message, in a new epoch.
+    one's process lives. A new writer goes on after the last whole message, in a new epoch.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:

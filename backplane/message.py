@@ -83,7 +83,7 @@ class MessageType:
 
 
 def command(name: str, version: int, *fields: Field) -> MessageType:
-    """Return a command type: `fields` behind the command's serial."""
+    """Return a command type: `fields` after the command's serial."""
     serial = Field("id", "u4", "1", "serial of the command; 0: nothing is commanded")
     return MessageType(name, version, (serial, *fields))
 

@@ -1,7 +1,7 @@
 """Watching what comes through a mailbox: every message that has become visible since the last read, in serial order.
 
 A fault shows by evidence that no delay of the machine can make: a serial whose slot was never filled, a later serial
-of an earlier tick, two messages for one release, a message stamped behind the end of the cycle that made it. The
+of an earlier tick, two messages for one release, a message stamped after the end of the cycle that made it. The
 reader may be delayed too: a message is copied first, then its slot must still be its own (`Slots.keeps`), and only then
 is the copy judged.
 """

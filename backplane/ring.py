@@ -37,7 +37,7 @@ class Ring:
         return self._head[0] - self._taken
 
     def resume(self, taken: int) -> None:
-        """Go on behind the first `taken` records: another reader had them."""
+        """Go on after the first `taken` records: another reader had them."""
         self._taken = taken
 
     def drain(self) -> Drained:

@@ -79,7 +79,7 @@ class SilenceWatch:
             self._look_into(tick, age)
             if tick - max(newest, self._witness.since) >= self._lost_after:
                 return True
-        # From the tick behind the loss on: within that tick it depends on who is faster.
+        # From the tick after the loss on: within that tick it depends on who is faster.
         return newest != NOT_YET and 0 < self._block[_LOST] <= tick
 
     def _look_into(self, tick: int, age: int) -> None:

@@ -1,6 +1,6 @@
 """The slots of one mailbox: how a message gets into shared memory whole, and out of it.
 
-A message is built in a local record, copied into the slot behind the newest one, and published by one
+A message is built in a local record, copied into the slot after the newest one, and published by one
 store of its serial in the mailbox's head. A writer killed at any instruction leaves every published
 message as it was. A reader checks serial and CRC of its copy, so it never gives out half a message.
 """
@@ -90,7 +90,7 @@ class Slots:
         self._chain = self.record[CHAIN_AT:SLOT_HEAD_SIZE]
 
     def resume(self, signature: int) -> int:
-        """Take the writer's place behind the newest published message; return its serial."""
+        """Take the writer's place after the newest published message; return its serial."""
         head = whole = self.box[Box.HEAD]
         # A serial may have been lost: the chain goes on from the newest message that has its slot.
         while whole > max(0, head - self.depth) and not self.holds(whole):

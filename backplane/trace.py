@@ -39,7 +39,7 @@ SKIPPED_SHIFT = 16
 class Flag(IntFlag):
     """What a cycle's record says besides its times."""
 
-    MISSED = 1  # ended behind its deadline, or a message came too late
+    MISSED = 1  # missed its deadline, or a message came too late
     SKIPPED = 2  # releases were skipped just before this one
     BUS_ERROR = 4  # an access was cut off by its bound
     CORRUPT = 8  # a message failed its CRC

@@ -26,7 +26,7 @@ APART = np.array([1e-2, 1e-2])
 creeps, that need not be noticed before it has come that far."""
 SLIGHT = 0.02
 """Part of its torque limit that a motor must lack to count, beside what dry friction and a contact may hide."""
-TURNING = 5.0 * FRICTION_SPEED
+TURNS_FROM = 5.0 * FRICTION_SPEED
 """Velocity, rad/s, from which on the dry friction of a joint is known."""
 
 
@@ -148,7 +148,7 @@ class FaultyLink:
         """Return what a push may hide of what a motor lacks, N m."""
         if self._arm.leans:
             return self._pressed
-        turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNING)
+        turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNS_FROM)
         return RESTING * self._limits if self._arm.holds and turning < TURNING_JOINTS else 0.0
 
     def _corrupt(self, torque: Array) -> Array:
