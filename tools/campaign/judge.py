@@ -91,7 +91,8 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
     """Judge the faults of a run by what happened in it.
 
     One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet. A
-    fault of the arm that is over before it must be found, and is not found, has not struck.
+    fault of the arm that is over before it must be found, and is not found, has not struck; nor has one that the run
+    ends before it must be recovered from.
     """
     return _Judge(strikes, events, run).verdict()
 
@@ -118,7 +119,12 @@ class _Judge:
                 used.add(id(best.event))
             elif self._is_brief(strike):
                 strike = replace(strike, tick=-1)
-            judged.append(self._judgement(strike, best, self._horizon(place, windows[place][1])))
+            horizon = self._horizon(place, windows[place][1])
+            judgement = self._judgement(strike, best, horizon)
+            if not judgement.is_recovered and self._last < strike.tick + judgement.recovery_bound:
+                # The run ended too early to tell: to be drawn again.
+                judgement = self._judgement(replace(strike, tick=-1), None, horizon)
+            judged.append(judgement)
         stray = [event for event in self._events if self._is_stray(event, windows)]
         detections = tuple(event for event in stray if event.kind != "miss")
         return Verdict(tuple(judged), detections, tuple(event for event in stray if event.kind == "miss"))
@@ -203,8 +209,7 @@ class _Judge:
             bound_ms=best.bound_ms if best else None,
             is_within=best is not None and best.is_within,
             reactions=after.reactions,
-            # A run that ends before the bound says nothing.
-            is_recovered=is_latched or self._last < strike.tick + bound or is_undone,
+            is_recovered=is_latched or is_undone,
             recovery=after.recovery,
             recovery_bound=bound,
             lacking=() if strike.tick < 0 else after.lacking,
