@@ -121,7 +121,7 @@ class _Judge:
                 strike = replace(strike, tick=-1)
             horizon = self._horizon(place, windows[place][1])
             judgement = self._judgement(strike, best, horizon)
-            if not judgement.is_recovered and self._last < strike.tick + judgement.recovery_bound:
+            if not judgement.is_recovered and self._last < strike.tick + (judgement.recovery_bound or 0):
                 # The run ended too early to tell: to be drawn again.
                 judgement = self._judgement(replace(strike, tick=-1), None, horizon)
             judged.append(judgement)
