@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
-PACKAGES := backplane boards levels tools
+FLOORS := backplane levels boards tools configs
 CONFIG ?= nasrem
 
 .DEFAULT_GOAL := help
@@ -49,4 +49,6 @@ $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index --editable .
+	@# A type checker and an editor read no import hook: for them, `rack` as links.
+	@mkdir -p $(VENV)/src/rack && for floor in $(FLOORS); do ln -sfn ../../../$$floor $(VENV)/src/rack/$$floor; done
 	@touch $(STAMP)

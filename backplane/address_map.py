@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 
 PAGE = 4096
 LINE = 64

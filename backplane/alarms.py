@@ -11,9 +11,9 @@ from time import monotonic_ns
 
 import numpy as np
 
-from backplane.address_map import ALARM_DEPTH, ALARM_RECORD_SIZE, LINE
-from backplane.ring import Ring
-from backplane.segment import Segment
+from rack.backplane.address_map import ALARM_DEPTH, ALARM_RECORD_SIZE, LINE
+from rack.backplane.ring import Ring
+from rack.backplane.segment import Segment
 
 RECORD = np.dtype(
     [

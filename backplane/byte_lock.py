@@ -10,7 +10,7 @@ import fcntl
 import os
 import struct
 
-from backplane.segment import Segment
+from rack.backplane.segment import Segment
 
 _FLOCK = struct.Struct("hhqqi4x")
 """`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description have none)."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from time import monotonic_ns
 
-from backplane.errors import ClockError
-from backplane.segment import Segment
-from backplane.words import Run, System
+from rack.backplane.errors import ClockError
+from rack.backplane.segment import Segment
+from rack.backplane.words import Run, System
 
 # Plain integers for the hot path.
 _STATE, _TICK, _EPOCH, _PERIOD, _LOCKSTEP = (

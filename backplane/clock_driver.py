@@ -7,13 +7,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Protocol
 
-from backplane.address_map import CLOCK
-from backplane.alarms import AlarmWriter
-from backplane.process import is_alive
-from backplane.released_task import ReleasedTask, by_priority
-from backplane.segment import Segment
-from backplane.watchdog import Watchdog
-from backplane.words import Head, Run, System
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import AlarmWriter
+from rack.backplane.process import is_alive
+from rack.backplane.released_task import ReleasedTask, by_priority
+from rack.backplane.segment import Segment
+from rack.backplane.watchdog import Watchdog
+from rack.backplane.words import Head, Run, System
 
 Ended = Callable[[int], int | None]
 """Called at every tick; returns the tick at which the run stops, once that is known."""

@@ -6,10 +6,10 @@ comes later was held back. Age alone proves nothing: the machine may have taken 
 
 from __future__ import annotations
 
-from backplane.address_map import TRACE_RECORD_SIZE, oldest_kept
-from backplane.segment import Segment
-from backplane.trace import FIELDS, Flag
-from backplane.words import Block
+from rack.backplane.address_map import TRACE_RECORD_SIZE, oldest_kept
+from rack.backplane.segment import Segment
+from rack.backplane.trace import FIELDS, Flag
+from rack.backplane.words import Block
 
 # Plain integers for the hot path.
 _TICK, _END, _FLAGS = (FIELDS.index(name) for name in ("tick", "end_ns", "flags"))

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from hashlib import blake2b
 
-from backplane.segment import Segment
-from backplane.slots import Slots
-from backplane.words import Box, System
+from rack.backplane.segment import Segment
+from rack.backplane.slots import Slots
+from rack.backplane.words import Box, System
 
 
 def chains(segment: Segment, until: int) -> dict[str, tuple[int, bytes]]:

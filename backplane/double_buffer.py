@@ -5,7 +5,7 @@ Faster to react than time-slice, and no longer a function of ticks alone in real
 
 from __future__ import annotations
 
-from backplane.mailbox import Reader, Reading, Writer
+from rack.backplane.mailbox import Reader, Reading, Writer
 
 
 class DoubleBufferWriter(Writer):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.segment import Segment
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.segment import Segment
 
 CLEAN = 20
 """Accesses, and cycles of the writer, without a finding, after which the next one begins a new episode."""

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-from backplane.address_map import CLOCK, FAULT_ENTRIES, FAULT_ENTRY_SIZE
-from backplane.byte_lock import ByteLock
-from backplane.errors import FaultTableError
-from backplane.segment import Segment
-from backplane.words import System
+from rack.backplane.address_map import CLOCK, FAULT_ENTRIES, FAULT_ENTRY_SIZE
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import FaultTableError
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
 
 PARAMETERS = 8
 """Parameters of one fault, at most."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from backplane.errors import EmergencyStopError
-from backplane.segment import Segment
-from backplane.words import Block, System
+from rack.backplane.errors import EmergencyStopError
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System
 
 
 class UtilityLines:

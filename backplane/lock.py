@@ -11,13 +11,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from backplane.byte_lock import ByteLock
-from backplane.double_buffer import DoubleBufferWriter
-from backplane.mailbox import Reader, Reading
-from backplane.process import GONE, STOPPED, state_of
-from backplane.segment import Segment
-from backplane.semaphores import lock_semaphore
-from backplane.words import Box
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.double_buffer import DoubleBufferWriter
+from rack.backplane.mailbox import Reader, Reading
+from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import lock_semaphore
+from rack.backplane.words import Box
 
 WAIT_S = 0.002
 """Bound of one wait: an access is a microsecond or two, a holder that loses its core some hundred."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from backplane.alarms import AlarmWriter
-from backplane.clock_driver import ClockDriver, Ended
-from backplane.process import GONE, STOPPED, state_of
-from backplane.segment import Segment
-from backplane.semaphores import clock_semaphore
-from backplane.wake import CHECK_S
-from backplane.words import Run, System
+from rack.backplane.alarms import AlarmWriter
+from rack.backplane.clock_driver import ClockDriver, Ended
+from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.wake import CHECK_S
+from rack.backplane.words import Run, System
 
 IDLE_S = 5.0
 """Bound of the wait for a recorder that is stopped, or dead and not restarted."""

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from backplane.byte_lock import ByteLock
-from backplane.errors import MailboxError
-from backplane.message import Message
-from backplane.segment import Segment
-from backplane.slots import Slots, claim, pid_of
-from backplane.words import Box
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import MailboxError
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.slots import Slots, claim, pid_of
+from rack.backplane.words import Box
 
 NOT_YET = 1 << 62
 """Tick of the newest message before there is any: its age is below zero, so that nobody finds it too old."""

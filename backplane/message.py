@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from backplane.errors import MailboxError
+from rack.backplane.errors import MailboxError
 
 REASON_BYTES = 120
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from zlib import crc32
 
-from backplane.address_map import oldest_kept
-from backplane.alarms import Alarm
-from backplane.cycle_record import CycleRecord
-from backplane.episodes import Episodes
-from backplane.mailbox import Reader
-from backplane.segment import Segment
-from backplane.words import Slot
+from rack.backplane.address_map import oldest_kept
+from rack.backplane.alarms import Alarm
+from rack.backplane.cycle_record import CycleRecord
+from rack.backplane.episodes import Episodes
+from rack.backplane.mailbox import Reader
+from rack.backplane.segment import Segment
+from rack.backplane.words import Slot
 
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""

@@ -15,11 +15,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
-from backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
-from backplane.byte_lock import ByteLock
-from backplane.errors import OperatorTableError
-from backplane.segment import Segment
-from backplane.words import System
+from rack.backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import OperatorTableError
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
 
 _CLAIMS = 1 << 40
 """Address of the byte that the client of ticket 0 locks: beyond any segment, for a lock needs no byte there."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from backplane.double_buffer import DoubleBufferReader, DoubleBufferWriter
-from backplane.layout import Protocol
-from backplane.lock import LockReader, LockWriter
-from backplane.mailbox import Reader, Writer
-from backplane.segment import Segment
+from rack.backplane.double_buffer import DoubleBufferReader, DoubleBufferWriter
+from rack.backplane.layout import Protocol
+from rack.backplane.lock import LockReader, LockWriter
+from rack.backplane.mailbox import Reader, Writer
+from rack.backplane.segment import Segment
 
 WRITERS: dict[Protocol, type[Writer]] = {
     "time-slice": Writer,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from backplane.clock_driver import ClockDriver
-from backplane.wake import CHECK_S
-from backplane.words import Run, System
+from rack.backplane.clock_driver import ClockDriver
+from rack.backplane.wake import CHECK_S
+from rack.backplane.words import Run, System
 
 
 class RealtimeDriver(ClockDriver):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from backplane.layout import Layout, TaskSpec
-from backplane.process import STOPPED, state_of
-from backplane.segment import Segment
-from backplane.semaphores import wake_semaphore
-from backplane.words import Block, TaskState
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.process import STOPPED, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.words import Block, TaskState
 
 # Plain integers for the hot path.
 _RELEASED, _DEADLINE, _DONE, _LOST = (int(Block[name]) for name in ("RELEASED", "DEADLINE", "DONE", "LOST"))

@@ -7,11 +7,11 @@ from zlib import crc32
 
 import numpy as np
 
-from backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
-from backplane.layout import MailboxSpec
-from backplane.segment import Segment
-from backplane.slots import CRC_FROM, EPOCH_MASK, epoch_of, message_dtype
-from backplane.words import Box, Slot
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.segment import Segment
+from rack.backplane.slots import CRC_FROM, EPOCH_MASK, epoch_of, message_dtype
+from rack.backplane.words import Box, Slot
 
 
 class Drained(NamedTuple):

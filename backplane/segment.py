@@ -18,11 +18,11 @@ from typing import Any, Self
 
 import posix_ipc
 
-from backplane.address_map import HEAD_SIZE, AddressMap, pages
-from backplane.errors import SegmentError
-from backplane.layout import FieldSpec, Layout, MailboxSpec, TaskSpec
-from backplane.process import is_alive, start_time
-from backplane.words import Block, Head, System
+from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
+from rack.backplane.errors import SegmentError
+from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, TaskSpec
+from rack.backplane.process import is_alive, start_time
+from rack.backplane.words import Block, Head, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 3

@@ -16,8 +16,8 @@ from functools import partial
 
 import posix_ipc
 
-from backplane.layout import Layout
-from backplane.segment import PREFIX, SHM_FOLDER
+from rack.backplane.layout import Layout
+from rack.backplane.segment import PREFIX, SHM_FOLDER
 
 _libc = ctypes.CDLL(None)
 _sem_open, _sem_clockwait = _libc.sem_open, _libc.sem_clockwait

@@ -7,14 +7,14 @@ have finished cycles for which no message came.
 
 from __future__ import annotations
 
-from backplane.alarms import Alarm
-from backplane.cycle_record import CycleRecord
-from backplane.episodes import Episodes
-from backplane.mailbox import NOT_YET, Reader
-from backplane.process import GONE, STOPPED, state_of
-from backplane.segment import Segment
-from backplane.slots import pid_of
-from backplane.words import Block, Box
+from rack.backplane.alarms import Alarm
+from rack.backplane.cycle_record import CycleRecord
+from rack.backplane.episodes import Episodes
+from rack.backplane.mailbox import NOT_YET, Reader
+from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.slots import pid_of
+from rack.backplane.words import Block, Box
 
 MUTE_CYCLES = 3
 """Age, in cycles of the writer, of which two are lawful, from which silence is looked into."""

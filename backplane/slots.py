@@ -14,11 +14,11 @@ from zlib import crc32
 
 import numpy as np
 
-from backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
-from backplane.layout import FieldSpec, MailboxSpec
-from backplane.message import Message
-from backplane.segment import Segment
-from backplane.words import Box, Slot
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
+from rack.backplane.layout import FieldSpec, MailboxSpec
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box, Slot
 
 CRC_FROM = Slot.EPOCH * 8
 CHAIN_FROM = Slot.SERIAL * 8

@@ -11,10 +11,10 @@ from enum import IntFlag
 
 import numpy as np
 
-from backplane.address_map import TRACE_RECORD_SIZE
-from backplane.ring import Ring
-from backplane.segment import Segment
-from backplane.words import Block
+from rack.backplane.address_map import TRACE_RECORD_SIZE
+from rack.backplane.ring import Ring
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block
 
 RECORD = np.dtype(
     [

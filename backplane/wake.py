@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 from time import monotonic_ns
 
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.clock import SystemClock
-from backplane.process import GONE, STOPPED, WAITING, is_alive, state_of
-from backplane.segment import Segment
-from backplane.semaphores import wake_semaphore
-from backplane.words import Block, Head, System
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.clock import SystemClock
+from rack.backplane.process import GONE, STOPPED, WAITING, is_alive, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.words import Block, Head, System
 
 _RELEASED = int(Block.RELEASED)
 _TICK = int(System.TICK)

@@ -7,10 +7,10 @@ its release, or it has used so much processor time that it will not end. One tha
 
 from __future__ import annotations
 
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.process import STOPPED, WAITING, processor_ns, state_of
-from backplane.released_task import ReleasedTask
-from backplane.words import Block
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.process import STOPPED, WAITING, processor_ns, state_of
+from rack.backplane.released_task import ReleasedTask
+from rack.backplane.words import Block
 
 BEATS = 4
 """Releases without an answer after which a task is looked at: three gave a false trip in 24,000 at 400 Hz."""

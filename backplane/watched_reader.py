@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.episodes import Episodes
-from backplane.mailbox import Reading, Verdict
-from backplane.message import Message
-from backplane.message_watch import MessageWatch
-from backplane.protocols import open_reader
-from backplane.segment import Segment
-from backplane.silence_watch import SilenceWatch, Witness
-from backplane.slots import Slots
-from backplane.words import Block
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.episodes import Episodes
+from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.message import Message
+from rack.backplane.message_watch import MessageWatch
+from rack.backplane.protocols import open_reader
+from rack.backplane.segment import Segment
+from rack.backplane.silence_watch import SilenceWatch, Witness
+from rack.backplane.slots import Slots
+from rack.backplane.words import Block
 
 _LOST = int(Block.LOST)
 

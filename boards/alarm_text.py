@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from backplane.address_map import CLOCK
-from backplane.alarms import MISSES, Alarm
-from backplane.fault_table import Entry, FaultEntry, FaultTable
-from backplane.layout import Layout
-from backplane.words import Demand
-from boards.events import Event, EventKind
-from boards.faults.text import board_of, joint_name, subject_of, what
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import MISSES, Alarm
+from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
+from rack.backplane.layout import Layout
+from rack.backplane.words import Demand
+from rack.boards.events import Event, EventKind
+from rack.boards.faults.text import board_of, joint_name, subject_of, what
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]
 EMERGENCY_STOP = "emergency stop"
@@ -71,10 +71,10 @@ def event_of(
     joints: Sequence[str],
     geom: Callable[[int], str] = str,
 ) -> Event:
-    """Return the event that an alarm makes: a row of `backplane.alarms.RECORD` from the ring of the task `owner`.
+    """Return the event that an alarm makes: a row of `rack.backplane.alarms.RECORD` from the ring of the task `owner`.
 
     `geom` names a geom of the cell. An event's board is who found it; of a fault it is who has it, of a return it is
-    who is back. Of an operator's command the event is `boards.operating.text.command_event`'s.
+    who is back. Of an operator's command the event is `rack.boards.operating.text.command_event`'s.
     """
     alarm, number, value = Alarm(row["code"]), int(row["subject"]), float(row["value"])
     kind, code, board, fault = KIND_OF.get(alarm, "detection"), alarm.name.lower(), owner, -1

@@ -6,16 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm, alarm_ring
-from backplane.fault_table import FaultTable
-from backplane.operator_table import OperatorTable
-from backplane.segment import Segment
-from boards.alarm_text import event_of
-from boards.config.cell import geom_name
-from boards.config.schema import RackConfig
-from boards.events import Event
-from boards.operating.text import command_event
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm, alarm_ring
+from rack.backplane.fault_table import FaultTable
+from rack.backplane.operator_table import OperatorTable
+from rack.backplane.segment import Segment
+from rack.boards.alarm_text import event_of
+from rack.boards.config.cell import geom_name
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Event
+from rack.boards.operating.text import command_event
 
 
 class Heard(NamedTuple):

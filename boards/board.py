@@ -8,19 +8,19 @@ import sys
 import traceback
 from collections.abc import Callable
 
-from backplane.errors import BackplaneError
-from backplane.lines import UtilityLines
-from backplane.segment import Segment
-from backplane.words import Block, TaskState
-from boards.clock_board import run_clock
-from boards.clock_wiring import ClockWiring
-from boards.executor_task import ExecutorTask
-from boards.planner_task import PlannerTask
-from boards.processor import die_with_parent, name_process, set_priority, take_processor
-from boards.task import Task
-from boards.wiring import TaskWiring
-from levels.errors import LevelError
-from levels.level import Executor, Planner
+from rack.backplane.errors import BackplaneError
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, TaskState
+from rack.boards.clock_board import run_clock
+from rack.boards.clock_wiring import ClockWiring
+from rack.boards.executor_task import ExecutorTask
+from rack.boards.planner_task import PlannerTask
+from rack.boards.processor import die_with_parent, name_process, set_priority, take_processor
+from rack.boards.task import Task
+from rack.boards.wiring import TaskWiring
+from rack.levels.errors import LevelError
+from rack.levels.level import Executor, Planner
 
 SELF_TEST_FAILED = 3
 """Exit status of a board whose start-up test failed."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 
-from backplane import semaphores
-from backplane.byte_lock import ByteLock
-from backplane.errors import SegmentError
-from backplane.segment import Segment, racks, stranger, unlink
-from backplane.words import Head
+from rack.backplane import semaphores
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import Segment, racks, stranger, unlink
+from rack.backplane.words import Head
 
 
 def remove_dead(rack: str) -> bool:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 import time
 
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.clock import SystemClock
-from backplane.clock_driver import ClockDriver, Ended
-from backplane.lockstep_driver import LockstepDriver
-from backplane.message import State
-from backplane.protocols import open_observer
-from backplane.realtime_driver import RealtimeDriver
-from backplane.segment import Segment
-from backplane.words import Block, Run, System
-from boards.clock_wiring import ClockWiring
-from boards.system_controller import SystemController
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.clock import SystemClock
+from rack.backplane.clock_driver import ClockDriver, Ended
+from rack.backplane.lockstep_driver import LockstepDriver
+from rack.backplane.message import State
+from rack.backplane.protocols import open_observer
+from rack.backplane.realtime_driver import RealtimeDriver
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System
+from rack.boards.clock_wiring import ClockWiring
+from rack.boards.system_controller import SystemController
 
 HEAD_START_NS = 20_000_000
 """From the start of the clock board to tick 0: its own start-up is not a late tick."""

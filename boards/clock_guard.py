@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.clock import SystemClock
-from backplane.layout import TaskSpec
-from backplane.segment import Segment
-from backplane.words import System
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.clock import SystemClock
+from rack.backplane.layout import TaskSpec
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
 
 _TICK_NS, _TICK = int(System.TICK_NS), int(System.TICK)
 QUIET_TICKS = 20

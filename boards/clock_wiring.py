@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from backplane.words import Demand
+from rack.backplane.words import Demand
 
 
 @dataclass(frozen=True)

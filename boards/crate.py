@@ -19,17 +19,17 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from backplane import semaphores
-from backplane.lines import UtilityLines
-from backplane.segment import Segment
-from backplane.words import Block, Run, System, TaskState
-from boards.board import enter, run_clock_board, run_task_board
-from boards.channel import Channel
-from boards.clock_wiring import ClockWiring
-from boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
-from boards.faults.hog import hog
-from boards.processor import set_priority
-from boards.wiring import TaskWiring
+from rack.backplane import semaphores
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System, TaskState
+from rack.boards.board import enter, run_clock_board, run_task_board
+from rack.boards.channel import Channel
+from rack.boards.clock_wiring import ClockWiring
+from rack.boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
+from rack.boards.faults.hog import hog
+from rack.boards.processor import set_priority
+from rack.boards.wiring import TaskWiring
 
 LEAVE_S = 0.5
 """Time that boards get to end by themselves when the launcher is gone."""

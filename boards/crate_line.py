@@ -7,12 +7,10 @@ import socket
 import subprocess
 import sys
 from contextlib import suppress
-from pathlib import Path
 
-from boards.channel import Channel
-from boards.errors import LaunchError
+from rack.boards.channel import Channel
+from rack.boards.errors import LaunchError
 
-PROJECT = Path(__file__).resolve().parent.parent
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """The crate must not have threads when it forks, and a board's mathematics belong on its own core."""
 TUNABLES = "GLIBC_TUNABLES"
@@ -33,7 +31,7 @@ class CrateLine:
         self._read_to = 0
         self._process = subprocess.Popen(
             # Unbuffered: a board leaves by no way that would write out what it has printed.
-            [sys.executable, "-u", "-m", "boards.crate", str(theirs.fileno()), str(self.attention)],
+            [sys.executable, "-u", "-m", "rack.boards.crate", str(theirs.fileno()), str(self.attention)],
             pass_fds=(theirs.fileno(), self.attention),
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
@@ -82,5 +80,4 @@ class CrateLine:
 def environment() -> dict[str, str]:
     """Return the environment of the crate and its boards: the Rack's own, and what keeps a run repeatable."""
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
-    path = os.pathsep.join([str(PROJECT), *sys.path])
-    return {**os.environ, **SINGLE_THREADED, TUNABLES: tunables, "PYTHONPATH": path}
+    return {**os.environ, **SINGLE_THREADED, TUNABLES: tunables, "PYTHONPATH": os.pathsep.join(sys.path)}

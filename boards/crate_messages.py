@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from boards.clock_wiring import ClockWiring
-from boards.wiring import TaskWiring
+from rack.boards.clock_wiring import ClockWiring
+from rack.boards.wiring import TaskWiring
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from time import monotonic_ns
 
-from backplane.segment import Segment
-from backplane.words import Demand, System
-from boards.task import Task
-from boards.transfer import slowed
-from boards.wiring import TaskWiring
-from levels.level import Executor
+from rack.backplane.segment import Segment
+from rack.backplane.words import Demand, System
+from rack.boards.task import Task
+from rack.boards.transfer import slowed
+from rack.boards.wiring import TaskWiring
+from rack.levels.level import Executor
 
 _DEMAND, _DEMANDS = int(System.DEMAND), tuple(Demand)
 

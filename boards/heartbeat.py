@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import time
 
-from backplane.address_map import CLOCK
-from backplane.process import GONE, STOPPED, WAITING, state_of
-from backplane.segment import Segment
-from backplane.words import Block, Run, System
+from rack.backplane.address_map import CLOCK
+from rack.backplane.process import GONE, STOPPED, WAITING, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System
 
 BEATS = 4
 """Cycles without a sign of life: three gave a false trip in 24,000 at 400 Hz."""

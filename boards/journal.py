@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from backplane.segment import Segment
-from backplane.words import Run, System
-from boards.events import Event, EventKind
+from rack.backplane.segment import Segment
+from rack.backplane.words import Run, System
+from rack.boards.events import Event, EventKind
 
 
 class Journal:

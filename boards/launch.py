@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from backplane.fault_table import Injection
-from backplane.layout import Layout
-from backplane.message import State
-from backplane.protocols import open_observer
-from backplane.segment import Segment
-from backplane.words import Block, Demand, System
-from boards.clock_wiring import ClockWiring
-from boards.config import context, shared_out, wire
-from boards.config.cores import obtained_core
-from boards.config.ports import TaskPorts, all_ports
-from boards.config.schema import RackConfig
-from boards.config.timing import is_critical
-from boards.errors import LaunchError
-from boards.faults.kinds import KINDS
-from boards.faults.request import injections
-from boards.outcome import Cause
-from boards.transfer import Transfer
-from boards.wiring import TaskWiring
-from levels.messages import TASK_STATUS
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout
+from rack.backplane.message import State
+from rack.backplane.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Demand, System
+from rack.boards.clock_wiring import ClockWiring
+from rack.boards.config import context, shared_out, wire
+from rack.boards.config.cores import obtained_core
+from rack.boards.config.ports import TaskPorts, all_ports
+from rack.boards.config.schema import RackConfig
+from rack.boards.config.timing import is_critical
+from rack.boards.errors import LaunchError
+from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.request import injections
+from rack.boards.outcome import Cause
+from rack.boards.transfer import Transfer
+from rack.boards.wiring import TaskWiring
+from rack.levels.messages import TASK_STATUS
 
 LINGER_S = 0.5
 """Simulated time that a run goes on behind the task's end: the arm is seen at rest."""

@@ -11,12 +11,12 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from backplane.address_map import CLOCK
-from backplane.errors import SegmentError
-from backplane.segment import Segment, racks
-from backplane.words import Block, Run, System
-from boards.config.cores import obtained_core
-from boards.config.schema import RackConfig
+from rack.backplane.address_map import CLOCK
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import Segment, racks
+from rack.backplane.words import Block, Run, System
+from rack.boards.config.cores import obtained_core
+from rack.boards.config.schema import RackConfig
 
 
 @dataclass(frozen=True)

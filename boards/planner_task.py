@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from time import monotonic_ns, process_time_ns
 
-from backplane.segment import Segment
-from backplane.trace import Flag
-from backplane.words import Block
-from boards.processor import set_priority
-from boards.task import Task
-from boards.transfer import slowed
-from boards.wiring import TaskWiring
-from levels.level import Planner
+from rack.backplane.segment import Segment
+from rack.backplane.trace import Flag
+from rack.backplane.words import Block
+from rack.boards.processor import set_priority
+from rack.boards.task import Task
+from rack.boards.transfer import slowed
+from rack.boards.wiring import TaskWiring
+from rack.levels.level import Planner
 
 
 class PlannerTask(Task):

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.episodes import Episodes
-from backplane.fault_table import Entry, FaultEntry
-from backplane.mailbox import Writer
-from backplane.message import Message
-from backplane.protocols import open_writer
-from backplane.segment import Segment
-from backplane.silence_watch import Witness
-from backplane.watched_reader import watched
-from boards.faults.writers import FaultyWriter
-from levels.level import Ports, Reading, Verdict
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.episodes import Episodes
+from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.mailbox import Writer
+from rack.backplane.message import Message
+from rack.backplane.protocols import open_writer
+from rack.backplane.segment import Segment
+from rack.backplane.silence_watch import Witness
+from rack.backplane.watched_reader import watched
+from rack.boards.faults.writers import FaultyWriter
+from rack.levels.level import Ports, Reading, Verdict
 
 
 class InputPorts:

@@ -8,8 +8,8 @@ import os
 import signal
 from dataclasses import dataclass
 
-from backplane.layout import TaskSpec
-from backplane.process import pin
+from rack.backplane.layout import TaskSpec
+from rack.backplane.process import pin
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_NAME, _PR_SET_PDEATHSIG = 15, 1

@@ -13,33 +13,33 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from backplane import semaphores
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm
-from backplane.digest import digest
-from backplane.errors import EmergencyStopError
-from backplane.fault_table import FaultTable
-from backplane.lines import UtilityLines
-from backplane.operator_table import OperatorTable, RequestEntry
-from backplane.segment import Segment
-from backplane.words import Block, Run, System, TaskState
-from boards.alarm_watch import AlarmWatch, Heard
-from boards.clean import remove_dead, remove_own
-from boards.config import load
-from boards.config.schema import RackConfig
-from boards.crate_line import CrateLine
-from boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
-from boards.errors import ConfigError, LaunchError, Mistake
-from boards.events import Event
-from boards.faults.kinds import KINDS
-from boards.heartbeat import Heartbeat
-from boards.journal import Journal
-from boards.launch import Launch, modules
-from boards.neighbours import conflicts, holders, placed
-from boards.operating.request import asked, request, requests
-from boards.outcome import Cause, Outcome
-from boards.recovery import Recovery
-from boards.supervision import Supervision
+from rack.backplane import semaphores
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm
+from rack.backplane.digest import digest
+from rack.backplane.errors import EmergencyStopError
+from rack.backplane.fault_table import FaultTable
+from rack.backplane.lines import UtilityLines
+from rack.backplane.operator_table import OperatorTable, RequestEntry
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System, TaskState
+from rack.boards.alarm_watch import AlarmWatch, Heard
+from rack.boards.clean import remove_dead, remove_own
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate_line import CrateLine
+from rack.boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
+from rack.boards.errors import ConfigError, LaunchError, Mistake
+from rack.boards.events import Event
+from rack.boards.faults.kinds import KINDS
+from rack.boards.heartbeat import Heartbeat
+from rack.boards.journal import Journal
+from rack.boards.launch import Launch, modules
+from rack.boards.neighbours import conflicts, holders, placed
+from rack.boards.operating.request import asked, request, requests
+from rack.boards.outcome import Cause, Outcome
+from rack.boards.recovery import Recovery
+from rack.boards.supervision import Supervision
 
 LAUNCH_S = 60.0
 """Bound of the launch: a stranger's model with many meshes compiles for a while in every board."""

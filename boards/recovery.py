@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from backplane.address_map import CLOCK
-from backplane.segment import Segment
-from backplane.words import Block, TaskState
-from boards.clock_wiring import ClockWiring
-from boards.crate_line import CrateLine
-from boards.crate_messages import PowerOff, PowerOn
-from boards.supervision import Restart, Supervision
-from boards.wiring import TaskWiring
+from rack.backplane.address_map import CLOCK
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, TaskState
+from rack.boards.clock_wiring import ClockWiring
+from rack.boards.crate_line import CrateLine
+from rack.boards.crate_messages import PowerOff, PowerOn
+from rack.boards.supervision import Restart, Supervision
+from rack.boards.wiring import TaskWiring
 
 
 class Recovery:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import NamedTuple
 
-from backplane.address_map import CLOCK
-from backplane.layout import Layout
-from boards.config.schema import RackConfig
+from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout
+from rack.boards.config.schema import RackConfig
 
 
 class Restart(NamedTuple):

@@ -6,22 +6,22 @@ to stop or brake.
 
 from __future__ import annotations
 
-from backplane.alarms import Alarm
-from backplane.clock_driver import ClockDriver
-from backplane.released_task import ReleasedTask
-from backplane.segment import Segment
-from backplane.words import Demand, System
-from boards.clock_wiring import ClockWiring
-from boards.faults.stage import FaultStage
-from boards.faults.strikes import Strikes
-from boards.operating.desk import OperatorDesk
+from rack.backplane.alarms import Alarm
+from rack.backplane.clock_driver import ClockDriver
+from rack.backplane.released_task import ReleasedTask
+from rack.backplane.segment import Segment
+from rack.backplane.words import Demand, System
+from rack.boards.clock_wiring import ClockWiring
+from rack.boards.faults.stage import FaultStage
+from rack.boards.faults.strikes import Strikes
+from rack.boards.operating.desk import OperatorDesk
 
 # Plain integers for the hot path.
 _LOSSES, _EMERGENCY = int(System.LOSSES), int(System.EMERGENCY_STOP)
 
 
 class SystemController:
-    """Implements `backplane.clock_driver.Controller`."""
+    """Implements `rack.backplane.clock_driver.Controller`."""
 
     def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
         self._words, self._wiring, self._driver = segment.words, wiring, driver

@@ -5,18 +5,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from time import process_time_ns
 
-from backplane.alarms import AlarmWriter
-from backplane.clock import SystemClock
-from backplane.segment import Segment
-from backplane.semaphores import clock_semaphore
-from backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
-from backplane.wake import NextCycle
-from backplane.words import Block, System, TaskState
-from boards.clock_guard import ClockGuard
-from boards.faults.task_faults import TaskFaults
-from boards.ports import InputPorts, OutputPorts
-from boards.wiring import TaskWiring
-from levels.level import Executor, Planner
+from rack.backplane.alarms import AlarmWriter
+from rack.backplane.clock import SystemClock
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
+from rack.backplane.wake import NextCycle
+from rack.backplane.words import Block, System, TaskState
+from rack.boards.clock_guard import ClockGuard
+from rack.boards.faults.task_faults import TaskFaults
+from rack.boards.ports import InputPorts, OutputPorts
+from rack.boards.wiring import TaskWiring
+from rack.levels.level import Executor, Planner
 
 # Plain integers for the hot path.
 _DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (

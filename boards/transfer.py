@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from time import process_time_ns
 from typing import ParamSpec, TypeVar
 
-from backplane.process import compute_until
+from rack.backplane.process import compute_until
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -15,7 +15,7 @@ _R = TypeVar("_R")
 
 @dataclass(frozen=True)
 class Transfer:
-    """Processor time that each kind of access takes at least, ns; see `boards.config.schema.TransferConfig`."""
+    """Processor time that each kind of access takes at least, ns; see `rack.boards.config.schema.TransferConfig`."""
 
     read_ns: int = 0
     write_ns: int = 0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from boards.transfer import Transfer
-from levels.level import LevelContext
+from rack.boards.transfer import Transfer
+from rack.levels.level import LevelContext
 
 
 @dataclass(frozen=True)

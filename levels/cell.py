@@ -11,15 +11,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels import cell_index
-from levels.errors import RobotError
-from levels.gripper import Linkage, solve_linkage
-from levels.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
-from levels.mjcf import compile_spec, load_spec
-from levels.motors import fit_gripper, fit_motors, listed
-from levels.robot import RobotConfig
-from levels.scene import SceneConfig
-from levels.touches import below, geom_name, geoms_of, touch_matrix, unmeant
+from rack.levels import cell_index
+from rack.levels.errors import RobotError
+from rack.levels.gripper import Linkage, solve_linkage
+from rack.levels.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
+from rack.levels.mjcf import compile_spec, load_spec
+from rack.levels.motors import fit_gripper, fit_motors, listed
+from rack.levels.robot import RobotConfig
+from rack.levels.scene import SceneConfig
+from rack.levels.touches import below, geom_name, geoms_of, touch_matrix, unmeant
 
 __all__ = ["STATE", "Bounds", "Cell", "Limits", "build_cell", "sizes"]
 

@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.errors import RobotError
-from levels.mjcf import compile_spec, load_spec
-from levels.motors import listed
-from levels.robot import RobotConfig
-from levels.scene import SceneConfig
-from levels.touches import below
+from rack.levels.errors import RobotError
+from rack.levels.mjcf import compile_spec, load_spec
+from rack.levels.motors import listed
+from rack.levels.robot import RobotConfig
+from rack.levels.scene import SceneConfig
+from rack.levels.touches import below
 
 NOUNS = {
     mujoco.mjtObj.mjOBJ_SITE: "site",

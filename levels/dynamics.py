@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.algebra import each, gram, mat_vec, transposed_mat_vec
-from levels.cell import Cell
+from rack.levels.algebra import each, gram, mat_vec, transposed_mat_vec
+from rack.levels.cell import Cell
 
 Array = NDArray[np.float64]
 

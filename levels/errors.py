@@ -23,7 +23,7 @@ class ProgramError(LevelError):
 
 
 class Refused(LevelError):
-    """A command that cannot be carried out: `code` is one of `levels.messages.Error`."""
+    """A command that cannot be carried out: `code` is one of `rack.levels.messages.Error`."""
 
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)

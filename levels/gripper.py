@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.errors import RobotError
+from rack.levels.errors import RobotError
 
 Array = NDArray[np.float64]
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
-from backplane.alarms import Alarm
-from backplane.mailbox import Reading, Verdict
-from backplane.message import Message, MessageType
-from backplane.words import Demand
-from levels.operator import Commands
-from levels.robot import RobotConfig, Table
-from levels.scene import SceneConfig
+from rack.backplane.alarms import Alarm
+from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.message import Message, MessageType
+from rack.backplane.words import Demand
+from rack.levels.operator import Commands
+from rack.levels.robot import RobotConfig, Table
+from rack.levels.scene import SceneConfig
 
 __all__ = [
     "Demand",
@@ -73,7 +73,7 @@ class Fault(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """What a level has found wrong, for its board to ring: see `backplane.alarms.Alarm` for subject and value."""
+    """What a level has found wrong, for its board to ring: see `rack.backplane.alarms.Alarm` for subject and value."""
 
     alarm: Alarm
     subject: int = -1

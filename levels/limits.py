@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.errors import RobotError
-from levels.robot import RobotConfig
+from rack.levels.errors import RobotError
+from rack.levels.robot import RobotConfig
 
 VELOCITY_ROOM = 0.05
 """Part of a velocity limit that planned motion leaves free, so that tracking it does not run into the limit gate."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from backplane.message import Field, MessageType, command, status
-from levels.operator import ANSWER, RESTS_ON
+from rack.backplane.message import Field, MessageType, command, status
+from rack.levels.operator import ANSWER, RESTS_ON
 
 WINDOW = 8
 """Elemental moves that the task level hands down at once: the next level never waits for a cycle above it."""

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
-from levels.errors import RobotError
+from rack.levels.errors import RobotError
 
 GRID_CELLS = 4_000_000
 """Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x 20000 takes 10 s)."""

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.errors import RobotError
-from levels.robot import GripperConfig, RobotConfig
+from rack.levels.errors import RobotError
+from rack.levels.robot import GripperConfig, RobotConfig
 
 JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 

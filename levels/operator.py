@@ -1,8 +1,9 @@
 """What an operator may tell any level, beside or instead of the level above it: the words and the messages of it.
 
-A level that can be commanded reads "own.operator", says in `commands` what it takes, follows it with `levels.orders`,
-and has `ANSWER` among the fields of its status. `RESTS_ON` goes down with every command, so that the lowest status
-tells which command of an operator its torque rests on: the response of the system is measured, not guessed.
+A level that can be commanded reads "own.operator", says in `commands` what it takes, follows it with
+`rack.levels.orders`, and has `ANSWER` among the fields of its status. `RESTS_ON` goes down with every command, so that
+the lowest status tells which command of an operator its torque rests on: the response of the system is measured, not
+guessed.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 
-from backplane.message import REASON_BYTES, Field, command
+from rack.backplane.message import REASON_BYTES, Field, command
 
 MOST_JOINTS = 16
 """Joints of an arm, at most: an operator's mailbox is the same in every rack."""

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.mailbox import Reading
-from backplane.message import Message
-from levels.operator import Answer, Commands, Goal, What, listed, told
+from rack.backplane.mailbox import Reading
+from rack.backplane.message import Message
+from rack.levels.operator import Answer, Commands, Goal, What, listed, told
 
 DOING = {What.HOLD: "held", What.SETPOINT: "kept at a set point", What.GOTO: "diverted"}
 """What an operator does to a level, in words."""

@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from levels.errors import LevelError
-from levels.robot import Table
+from rack.levels.errors import LevelError
+from rack.levels.robot import Table
 
 Params = TypeVar("Params", bound=Table)
 

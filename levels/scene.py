@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from levels.robot import Finite, Positive, Table
+from rack.levels.robot import Finite, Positive, Table
 
 
 class MotionConfig(Table):

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from backplane.message import Message
-from levels.algebra import each
-from levels.level import Executor, Input, LevelContext, Ports
-from levels.messages import SCENE, WORLD_MODEL
-from levels.params import read_params
-from levels.robot import Positive, Table
+from rack.backplane.message import Message
+from rack.levels.algebra import each
+from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.messages import SCENE, WORLD_MODEL
+from rack.levels.params import read_params
+from rack.levels.robot import Positive, Table
 
 Array = NDArray[np.float64]
 

@@ -7,18 +7,18 @@ from contextlib import contextmanager
 from time import monotonic_ns
 from typing import NamedTuple
 
-from backplane import semaphores
-from backplane.alarms import Alarm, AlarmWriter, alarm_ring
-from backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
-from backplane.layout import Protocol
-from backplane.lock import LockReader
-from backplane.ring import mailbox_ring
-from backplane.segment import SHM_FOLDER, Segment, unlink
-from backplane.trace import FIELDS, Flag, TraceWriter
-from backplane.words import Block
-from boards.faults.kinds import KINDS, NUMBERS
-from boards.ports import InputPorts, OutputPorts
-from levels.level import Reading
+from rack.backplane import semaphores
+from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
+from rack.backplane.layout import Protocol
+from rack.backplane.lock import LockReader
+from rack.backplane.ring import mailbox_ring
+from rack.backplane.segment import SHM_FOLDER, Segment, unlink
+from rack.backplane.trace import FIELDS, Flag, TraceWriter
+from rack.backplane.words import Block
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.boards.ports import InputPorts, OutputPorts
+from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
 
 

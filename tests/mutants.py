@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
+from tests.processes import RACK
+
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("backplane", "boards", "configs", "levels", "tools")
 SECONDS = "7"
@@ -96,17 +98,17 @@ KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation coun
 def mutated(folder: Path, patches: Sequence[tuple[str, str, str]]) -> None:
     """Copy the tree and patch it. Raises `LookupError` for a patch that applies no more."""
     for name in COPIED:
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, folder / "rack" / name, ignore=shutil.ignore_patterns("__pycache__"))
     for file, old, new in patches:
-        text = (folder / file).read_text()
+        text = (folder / "rack" / file).read_text()
         if old not in text:
             raise LookupError(f"{file}: no longer holds {old.strip()!r}; mend the mutant in tests/mutants.py")
-        (folder / file).write_text(text.replace(old, new))
+        (folder / "rack" / file).write_text(text.replace(old, new))
 
 
 def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
     """Run a small campaign in a tree, on one core; return its exit status and what it has printed."""
-    command = ["taskset", "-c", str(core), sys.executable, "-m", "tools.cli", "campaign", "nasrem", "--lockstep"]
+    command = ["taskset", "-c", str(core), *RACK, "campaign", "nasrem", "--lockstep"]
     options = ["--injections", "1", "--sizes", "0", "--seed", "1", "--seconds", SECONDS, "--kinds", ",".join(kinds)]
     done = subprocess.run(
         [*command, *options, "--out", str(folder / "campaign")],

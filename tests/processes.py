@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
@@ -12,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+RACK = (sys.executable, "-m", "rack.tools.cli")
+"""The `rack` command of the environment that runs the tests."""
 BOUND_S = 20.0
 """Bound of every wait: reached only when something is broken."""
 FORKS = "ignore:.*multi-threaded, use of fork:DeprecationWarning"

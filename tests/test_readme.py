@@ -39,13 +39,12 @@ def example(tmp_path: Path) -> Path:
 def rack(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     # A rack of the same name may be at work on this machine.
     own = ["--set", f"name={OWN_NAME}", "--share"] if words[0] == "run" else []
-    return python(folder, "-m", "tools.cli", *words, *own)
+    return python(folder, "-m", "rack.tools.cli", *words, *own)
 
 
 def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(README.parent)}
     command = [sys.executable, *words]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=55, check=False, env=environment)
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=55, check=False)
 
 
 @pytest.mark.parametrize(("words", "status"), COMMANDS, ids=[" ".join(words) for words, _ in COMMANDS])

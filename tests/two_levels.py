@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from backplane.message import Field, Message, MessageType, command, status
-from levels.level import Executor, Input, Planner, Ports
+from rack.backplane.message import Field, Message, MessageType, command, status
+from rack.levels.level import Executor, Input, Planner, Ports
 
 COUNT_COMMAND = command("count_command", 1, Field("goal", "i8", "1", "count to reach"))
 COUNT_STATUS = status("count_status", 1, Field("count", "i8", "1", "count reached"))

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Json, print_json
-from tools.report import RunFolder
+from rack.tools.answer import Json, print_json
+from rack.tools.report import RunFolder
 
 Percentile = Annotated[
     float,
@@ -43,16 +43,16 @@ def analyze(
     Tells which cycle broke which equation, and who had its core meanwhile. Writes analysis.json, residuals.png and
     residuals.svg. The exit status is 0 when every equation held, 1 when one did not.
     """
-    from tools.analysis.analysis import Analysis
-    from tools.analysis.document import document
-    from tools.analysis.plot import plot
-    from tools.analysis.text import text
-    from tools.charting.progress import part_for
-    from tools.live_table import print_wrapped, terminal_width
-    from tools.recording import Recording
+    from rack.tools.analysis.analysis import Analysis
+    from rack.tools.analysis.document import document
+    from rack.tools.analysis.plot import plot
+    from rack.tools.analysis.text import text
+    from rack.tools.charting.progress import part_for
+    from rack.tools.live_table import print_wrapped, terminal_width
+    from rack.tools.recording import Recording
 
     if response:
-        from tools.responding.shown import show
+        from rack.tools.responding.shown import show
 
         sys.exit(0 if show(Recording(run), run if out is None else out, as_json) else 1)
     with part_for(silent=as_json) as told:

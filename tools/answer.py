@@ -8,7 +8,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from boards.errors import one_line
+from rack.boards.errors import one_line
 
 LONGEST_LINE = 1300
 """Characters of one line of a refusal, at most."""
@@ -16,14 +16,14 @@ LONGEST_LINE = 1300
 
 def configs(start: str) -> list[str]:
     """Return the project's configs that begin so, for a shell to complete."""
-    from boards.config import names
+    from rack.boards.config import names
 
     return [name for name in names() if name.startswith(start)]
 
 
 def running(start: str) -> list[str]:
     """Return the racks in shared memory that begin so, for a shell to complete."""
-    from backplane.segment import racks
+    from rack.backplane.segment import racks
 
     return [name for name in racks() if name.startswith(start)]
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
+from rack.tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
 
 if TYPE_CHECKING:
-    from boards.config import RackConfig
-    from tools.timing.repair import Repair
+    from rack.boards.config import RackConfig
+    from rack.tools.timing.repair import Repair
 
 From = Annotated[
     Path | None,
@@ -60,12 +60,12 @@ def check(
 
     Examples: rack check fig3; rack check fig3 --fix > fits.toml; rack check nasrem --from runs/nasrem-20250101-120000
     """
-    from boards.config import budgets, load, shared_out
-    from tools.inventory import Inventory
-    from tools.live_table import print_wrapped, terminal_width
-    from tools.timing.forecast import Forecast
-    from tools.timing.repair import repair
-    from tools.timing.trial import Trial
+    from rack.boards.config import budgets, load, shared_out
+    from rack.tools.inventory import Inventory
+    from rack.tools.live_table import print_wrapped, terminal_width
+    from rack.tools.timing.forecast import Forecast
+    from rack.tools.timing.repair import repair
+    from rack.tools.timing.trial import Trial
 
     found = load(config, settings, faults)
     if run is not None:
@@ -88,9 +88,9 @@ def check(
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     """Return a config with the budgets that a run has measured. Raises `Failure` for a run of another rack."""
-    from boards.config.timing import with_budgets
-    from tools.recording import Recording
-    from tools.timing.measured import measured_budgets
+    from rack.boards.config.timing import with_budgets
+    from rack.tools.recording import Recording
+    from rack.tools.timing.measured import measured_budgets
 
     recording = Recording(run)
     ran, asked = sorted({task.board for task in recording.layout.tasks}), sorted(config.board)

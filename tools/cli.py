@@ -6,7 +6,7 @@ import errno
 import sys
 from typing import TYPE_CHECKING
 
-from tools.interrupt import INTERRUPT, Interrupted
+from rack.tools.interrupt import INTERRUPT, Interrupted
 
 if TYPE_CHECKING:
     import typer
@@ -21,25 +21,25 @@ def commands() -> typer.Typer:
     """Return the command line."""
     import typer
 
-    from tools.analyze import analyze
-    from tools.bench.command import bench
-    from tools.campaign.command import campaign
-    from tools.check import check
-    from tools.clean import clean
-    from tools.command import EXAMPLES as COMMANDING
-    from tools.command import command
-    from tools.estop import estop
-    from tools.gantt import gantt
-    from tools.inject import EXAMPLES as INJECTING
-    from tools.inject import inject
-    from tools.injecting.kinds import KindsCommand
-    from tools.list import list_racks
-    from tools.record import record
-    from tools.replay import replay
-    from tools.report import report
-    from tools.run import run
-    from tools.status import status
-    from tools.stop import stop
+    from rack.tools.analyze import analyze
+    from rack.tools.bench.command import bench
+    from rack.tools.campaign.command import campaign
+    from rack.tools.check import check
+    from rack.tools.clean import clean
+    from rack.tools.command import EXAMPLES as COMMANDING
+    from rack.tools.command import command
+    from rack.tools.estop import estop
+    from rack.tools.gantt import gantt
+    from rack.tools.inject import EXAMPLES as INJECTING
+    from rack.tools.inject import inject
+    from rack.tools.injecting.kinds import KindsCommand
+    from rack.tools.list import list_racks
+    from rack.tools.record import record
+    from rack.tools.replay import replay
+    from rack.tools.report import report
+    from rack.tools.run import run
+    from rack.tools.status import status
+    from rack.tools.stop import stop
 
     app = typer.Typer(
         no_args_is_help=True,
@@ -83,8 +83,8 @@ def main() -> None:
 
 def run_commands() -> None:
     """Run the command line in this process, its signals left alone."""
-    from boards.errors import shown
-    from tools.answer import Failure, fail
+    from rack.boards.errors import shown
+    from rack.tools.answer import Failure, fail
 
     try:
         _look_over(sys.argv[1:])
@@ -104,8 +104,8 @@ def run_commands() -> None:
 
 def _look_over(arguments: list[str]) -> None:
     """Refuse what no command can use, before any sees it. Raises `Failure`."""
-    from boards.errors import shown
-    from tools.answer import Failure
+    from rack.boards.errors import shown
+    from rack.tools.answer import Failure
 
     for at, argument in enumerate(arguments, 1):
         if len(argument) > LONGEST_ARGUMENT:
@@ -118,9 +118,9 @@ def _look_over(arguments: list[str]) -> None:
 
 def _status(error: Exception) -> int | None:
     """Return the exit status of an error that the project raises on purpose; None for any other."""
-    from backplane.errors import BackplaneError
-    from boards.errors import BoardError, ConfigError
-    from levels.errors import LevelError
+    from rack.backplane.errors import BackplaneError
+    from rack.boards.errors import BoardError, ConfigError
+    from rack.levels.errors import LevelError
 
     if isinstance(error, ConfigError):
         return 2

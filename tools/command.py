@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Failure, Json, RackName, print_json
-from tools.interrupt import INTERRUPT
+from rack.tools.answer import Failure, Json, RackName, print_json
+from rack.tools.interrupt import INTERRUPT
 
 Level = Annotated[
     str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or your own")
@@ -66,10 +66,10 @@ def command(
     Exit status: 0 the level took the command up, with --wait: it is done; 1 it refused, or did not answer in time; 2
     usage.
     """
-    from tools.commanding.goals import goal_of
-    from tools.commanding.live import LiveDesk
-    from tools.holds import resume_command
-    from tools.live_table import terminal_width
+    from rack.tools.commanding.goals import goal_of
+    from rack.tools.commanding.live import LiveDesk
+    from rack.tools.holds import resume_command
+    from rack.tools.live_table import terminal_width
 
     desk = LiveDesk(rack)
     if is_list:

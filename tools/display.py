@@ -9,9 +9,9 @@ from typing import Protocol
 
 from rich.live import Live
 
-from boards.events import Event
-from tools.live_table import console, line_of, table_of
-from tools.snapshot import Snapshot
+from rack.boards.events import Event
+from rack.tools.live_table import console, line_of, table_of
+from rack.tools.snapshot import Snapshot
 
 QUIET = ("launch", "start", "end", "miss")
 """Events that the view itself shows: the table counts the misses."""

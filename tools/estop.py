@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Failure, Json, RackName, print_json
+from rack.tools.answer import Failure, Json, RackName, print_json
 
 Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, provided every input is good")]
 
@@ -28,9 +28,9 @@ def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
     """
     import time
 
-    from backplane.lines import UtilityLines
-    from backplane.segment import Segment
-    from backplane.words import Demand, Run, System
+    from rack.backplane.lines import UtilityLines
+    from rack.backplane.segment import Segment
+    from rack.backplane.words import Demand, Run, System
 
     segment = Segment.attach(rack)
     words, lines = segment.words, UtilityLines(segment)

@@ -9,8 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
 
-from boards.events import Event
-from tools.display import Display
+from rack.boards.events import Event
+from rack.tools.display import Display
 
 
 class EventLog:

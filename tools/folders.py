@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from tools.answer import Failure
+from rack.tools.answer import Failure
 
 RUNS = Path("runs")
 

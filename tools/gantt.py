@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tools.answer import Failure, Json, Settings, print_json
+from rack.tools.answer import Failure, Json, Settings, print_json
 
 if TYPE_CHECKING:
-    from tools.charting.subject import Subject
+    from rack.tools.charting.subject import Subject
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000
@@ -61,10 +61,10 @@ def gantt(
 
     Figures 2 to 4 of the paper are racks: rack gantt fig2, fig3, fig4, fig4-overload.
     """
-    from tools.charting.gantt import gantt_of
-    from tools.charting.progress import part_for
-    from tools.charting.subject import subject_of
-    from tools.charting.window import times_of, wanted
+    from rack.tools.charting.gantt import gantt_of
+    from rack.tools.charting.progress import part_for
+    from rack.tools.charting.subject import subject_of
+    from rack.tools.charting.window import times_of, wanted
 
     found = subject_of(subject, settings, out)
     if figure is not None:
@@ -79,7 +79,7 @@ def gantt(
 
 
 def _figure_5(found: Subject, figure: int, as_json: bool) -> None:
-    from tools.charting import regions, regions_picture
+    from rack.tools.charting import regions, regions_picture
 
     if figure != 5:
         raise Failure(f"--figure {figure}: permitted: 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2)

@@ -7,17 +7,17 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from backplane.layout import MailboxSpec
-from backplane.lines import UtilityLines
-from backplane.message import Message, State
-from backplane.protocols import open_observer
-from backplane.ring import mailbox_ring
-from backplane.segment import Segment
-from backplane.words import Block, Run, System
-from boards.events import Event
-from boards.operating.text import describe
-from levels.operator import Answer, What
-from tools.campaign.ending import arm_of
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.lines import UtilityLines
+from rack.backplane.message import Message, State
+from rack.backplane.protocols import open_observer
+from rack.backplane.ring import mailbox_ring
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System
+from rack.boards.events import Event
+from rack.boards.operating.text import describe
+from rack.levels.operator import Answer, What
+from rack.tools.campaign.ending import arm_of
 
 STILL_S = 5.0
 """Simulated time without motion after which a rack that is held says so as an event."""

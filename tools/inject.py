@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tools.answer import Failure, Json, named, print_json
+from rack.tools.answer import Failure, Json, named, print_json
 
 Rack = Annotated[
     str | None,
@@ -83,9 +83,9 @@ def inject(
     Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or --timeout has passed;
     2 usage.
     """
-    from tools.injecting.kinds import kinds_document, kinds_text
-    from tools.injecting.live import LiveRack
-    from tools.live_table import terminal_width
+    from rack.tools.injecting.kinds import kinds_document, kinds_text
+    from rack.tools.injecting.live import LiveRack
+    from rack.tools.live_table import terminal_width
 
     if is_list and rack is None:
         print_json(kinds_document()) if as_json else print("\n".join(kinds_text(terminal_width())))

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from backplane.address_map import AddressMap
-from backplane.layout import Layout, MailboxSpec
-from boards.config.schema import CLOCK_SLOT, RackConfig
-from tools.text_table import table
+from rack.backplane.address_map import AddressMap
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.boards.config.schema import CLOCK_SLOT, RackConfig
+from rack.tools.text_table import table
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from tools.answer import Json, print_json
+from rack.tools.answer import Json, print_json
 
 
 def list_racks(as_json: Json = False) -> None:
     """List the racks on this machine: those that run, and those that a killed launcher left behind."""
-    from backplane.segment import racks
-    from tools.survey import describe
+    from rack.backplane.segment import racks
+    from rack.tools.survey import describe
 
     found = [describe(name) for name in racks()]
     if as_json:

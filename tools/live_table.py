@@ -10,9 +10,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from tools.holds import is_news
-from tools.snapshot import DEAD, LOST, Progress, Snapshot, TaskRow
-from tools.text_table import fitting
+from rack.tools.holds import is_news
+from rack.tools.snapshot import DEAD, LOST, Progress, Snapshot, TaskRow
+from rack.tools.text_table import fitting
 
 COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "slot": lambda row: str(row.slot),

@@ -9,7 +9,7 @@ from typing import Protocol
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
-from tools.live_table import console
+from rack.tools.live_table import console
 
 
 class Progress(Protocol):

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Json, RackName, print_json
-from tools.interrupt import INTERRUPT
+from rack.tools.answer import Json, RackName, print_json
+from rack.tools.interrupt import INTERRUPT
 
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
@@ -20,12 +20,12 @@ def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = 
 
     Trace, signals and run.rrd, until its run is over or Ctrl-C.
     """
-    from backplane.segment import Segment
-    from tools.folders import folder_of
-    from tools.recorder.recorder import Recorder
-    from tools.recorder.side_sink import SideSink
-    from tools.viewer.sink import ViewSink
-    from tools.viewer.window import Window, free_port, url
+    from rack.backplane.segment import Segment
+    from rack.tools.folders import folder_of
+    from rack.tools.recorder.recorder import Recorder
+    from rack.tools.recorder.side_sink import SideSink
+    from rack.tools.viewer.sink import ViewSink
+    from rack.tools.viewer.window import Window, free_port, url
 
     segment = Segment.attach(rack)
     folder = folder_of(out, rack)

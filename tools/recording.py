@@ -14,15 +14,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from backplane.layout import Layout, MailboxSpec, TaskSpec
-from backplane.trace import RECORD
-from boards.config import RackConfig, loads
-from boards.errors import ConfigError
-from boards.events import Event
-from tools.answer import Failure
-from tools.recorder.files import mend
-from tools.recorder.signals import HEAD
-from tools.recorder.steal import Stolen
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.trace import RECORD
+from rack.boards.config import RackConfig, loads
+from rack.boards.errors import ConfigError
+from rack.boards.events import Event
+from rack.tools.answer import Failure
+from rack.tools.recorder.files import mend
+from rack.tools.recorder.signals import HEAD
+from rack.tools.recorder.steal import Stolen
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """What damaged files, and files of something else, make of their reading."""
@@ -90,7 +90,7 @@ class Recording:
 
     @cached_property
     def ended(self) -> dict[str, Any]:
-        """What was counted at the end of the run, as `tools.running.RunResult`; empty where that is not recorded."""
+        """Counts at the end of the run, as `rack.tools.running.RunResult`; empty where they are not recorded."""
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
     @cached_property
@@ -118,12 +118,12 @@ class Recording:
 
     @property
     def columns(self) -> list[str]:
-        """The columns of the trace: an earlier rack's has fewer than `backplane.trace.RECORD`."""
+        """The columns of the trace: an earlier rack's has fewer than `rack.backplane.trace.RECORD`."""
         return list(self._cycles.schema_arrow.names)
 
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
-        """The trace by task: structured rows, oldest first, with the fields of `backplane.trace.RECORD`."""
+        """The trace by task: structured rows, oldest first, with the fields of `rack.backplane.trace.RECORD`."""
         with _naming(self.folder / "cycles.parquet"):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()

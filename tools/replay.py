@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from tools.answer import Failure
-from tools.report import RunFolder
+from rack.tools.answer import Failure
+from rack.tools.report import RunFolder
 
 
 def replay(run: RunFolder) -> None:
     """Open a run in the viewer: the arm, curves, a Gantt lane a task, what happened. Returns when it is closed."""
-    from tools.viewer.window import Window
+    from rack.tools.viewer.window import Window
 
     # A run's folder, or a file in it: both are what a user may point at. A restarted recorder has left several files.
     recordings = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tools.answer import ConfigName, Failure, Faults, Json, Settings
-from tools.interrupt import INTERRUPT
+from rack.tools.answer import ConfigName, Failure, Faults, Json, Settings
+from rack.tools.interrupt import INTERRUPT
 
 if TYPE_CHECKING:
-    from boards.config.schema import RackConfig
-    from tools.running import RunResult
+    from rack.boards.config.schema import RackConfig
+    from rack.tools.running import RunResult
 
 Lockstep = Annotated[
     bool, typer.Option("--lockstep", help="begin a tick when every task due has finished: exact and repeatable")
@@ -59,12 +59,12 @@ def run(
       rack run nasrem
       rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
     """
-    import tools.reporting.report  # noqa: F401  now, and not when somebody waits for the end
-    from boards.config import load
-    from tools.display import display_for
-    from tools.folders import folder_of
-    from tools.report import print_report
-    from tools.running import NO_TIME, run_rack
+    import rack.tools.reporting.report  # noqa: F401  now, and not when somebody waits for the end
+    from rack.boards.config import load
+    from rack.tools.display import display_for
+    from rack.tools.folders import folder_of
+    from rack.tools.report import print_report
+    from rack.tools.running import NO_TIME, run_rack
 
     if view and no_record:
         raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
@@ -86,7 +86,7 @@ def run(
 
 def _report(config: RackConfig, folder: Path | None, result: RunResult) -> tuple[dict[str, Any], str]:
     """Make the report; a recording that cannot be read spoils no run."""
-    from tools.reporting.report import unrecorded, write_report
+    from rack.tools.reporting.report import unrecorded, write_report
 
     try:
         if folder is not None:

@@ -9,21 +9,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from backplane.segment import Segment
-from backplane.words import Block, System
-from boards.config.schema import RackConfig
-from boards.events import Event
-from boards.outcome import Outcome
-from boards.rack import Rack
-from tools.answer import Failure
-from tools.campaign.ending import Strike, strikes
-from tools.display import Display
-from tools.event_log import EventLog
-from tools.holds import Standstill
-from tools.interrupt import INTERRUPT
-from tools.recorder.process import RecorderProcess
-from tools.snapshot import Viewer
-from tools.viewer.window import Window, free_port, url
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Event
+from rack.boards.outcome import Outcome
+from rack.boards.rack import Rack
+from rack.tools.answer import Failure
+from rack.tools.campaign.ending import Strike, strikes
+from rack.tools.display import Display
+from rack.tools.event_log import EventLog
+from rack.tools.holds import Standstill
+from rack.tools.interrupt import INTERRUPT
+from rack.tools.recorder.process import RecorderProcess
+from rack.tools.snapshot import Viewer
+from rack.tools.viewer.window import Window, free_port, url
 
 COUNTED = (
     *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),

@@ -5,16 +5,16 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 
-from backplane.fault_table import FaultTable, Stage
-from backplane.layout import TaskSpec
-from backplane.lines import UtilityLines
-from backplane.message import State
-from backplane.protocols import open_observer
-from backplane.segment import Segment
-from backplane.trace import trace_ring
-from backplane.words import Block, Box, Demand, Run, System, TaskState
-from boards.faults.text import describe
-from tools.holds import Hold, Holds
+from rack.backplane.fault_table import FaultTable, Stage
+from rack.backplane.layout import TaskSpec
+from rack.backplane.lines import UtilityLines
+from rack.backplane.message import State
+from rack.backplane.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.trace import trace_ring
+from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
+from rack.boards.faults.text import describe
+from rack.tools.holds import Hold, Holds
 
 LOST = "lost"
 """State of a task that is dead or hangs, until its new process has rejoined."""

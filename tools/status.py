@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Failure, Json, named, print_json
+from rack.tools.answer import Failure, Json, named, print_json
 
 
 def status(
@@ -29,9 +29,9 @@ def status(
     """
     from dataclasses import asdict
 
-    from backplane.segment import Segment, racks
-    from tools.live_table import console, table_of
-    from tools.snapshot import Viewer
+    from rack.backplane.segment import Segment, racks
+    from rack.tools.live_table import console, table_of
+    from rack.tools.snapshot import Viewer
 
     running = racks()
     if rack is None and len(running) != 1:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tools.answer import Failure, Json, RackName, print_json
+from rack.tools.answer import Failure, Json, RackName, print_json
 
 
 def stop(
@@ -26,7 +26,7 @@ def stop(
     Examples:
       rack stop nasrem --wait 30
     """
-    from tools.stopping import stop_rack
+    from rack.tools.stopping import stop_rack
 
     if not stop_rack(rack, wait):
         raise Failure(f"rack '{rack}' has not ended within {wait:g} s; its launcher still runs")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 
-from backplane.process import is_alive, readable
-from backplane.segment import Segment
-from backplane.words import Head, System
+from rack.backplane.process import is_alive, readable
+from rack.backplane.segment import Segment
+from rack.backplane.words import Head, System
 
 
 def stop_rack(rack: str, timeout_s: float) -> bool:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-from backplane.errors import SegmentError
-from backplane.segment import Segment
-from backplane.words import Head, Run, System
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import Segment
+from rack.backplane.words import Head, Run, System
 
 
 def describe(name: str) -> dict[str, str | int | float]:

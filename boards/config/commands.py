@@ -8,16 +8,16 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.address_map import OPERATOR_ENTRIES
-from boards.config.classes import find_class
-from boards.config.schema import RackConfig
-from boards.errors import Mistake
-from boards.operating.config import CommandConfig
-from levels.errors import RobotError
-from levels.level import Executor
-from levels.operator import Commands, Goal, goal_names, listed
-from levels.robot import RobotConfig
-from levels.scene import SceneConfig
+from rack.backplane.address_map import OPERATOR_ENTRIES
+from rack.boards.config.classes import find_class
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import Mistake
+from rack.boards.operating.config import CommandConfig
+from rack.levels.errors import RobotError
+from rack.levels.level import Executor
+from rack.levels.operator import Commands, Goal, goal_names, listed
+from rack.levels.robot import RobotConfig
+from rack.levels.scene import SceneConfig
 
 OWN_OPERATOR = "own.operator"
 
@@ -66,7 +66,7 @@ def joint_ranges(config: RackConfig) -> NDArray[np.float64] | None:
 
 @lru_cache(maxsize=4)
 def _ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
-    from levels.cell import build_cell  # MuJoCo takes half a second to import: only who sends joints pays
+    from rack.levels.cell import build_cell  # MuJoCo takes half a second to import: only who sends joints pays
 
     return build_cell(robot, scene, clock_ns).limits.position
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import cast
 
-from boards.config.cell import cell_sizes
-from boards.config.schema import RackConfig
-from boards.errors import ConfigError, Mistake
-from levels.level import LevelContext, Pace
-from levels.robot import RobotConfig
+from rack.boards.config.cell import cell_sizes
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError, Mistake
+from rack.levels.level import LevelContext, Pace
+from rack.levels.robot import RobotConfig
 
 
 def context(config: RackConfig, board: str) -> LevelContext:

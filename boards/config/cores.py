@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from boards.config.schema import RackConfig
+from rack.boards.config.schema import RackConfig
 
 
 def obtained_core(core: int) -> int:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from backplane.address_map import CLOCK, FAULT_ENTRIES
-from backplane.layout import Layout, Role
-from boards.config.classes import find_class
-from boards.config.schema import RackConfig
-from boards.errors import Mistake
-from boards.faults.condition import condition
-from boards.faults.config import FaultConfig
-from boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
-from levels.level import Executor
+from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
+from rack.backplane.layout import Layout, Role
+from rack.boards.config.classes import find_class
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import Mistake
+from rack.boards.faults.condition import condition
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
+from rack.levels.level import Executor
 
 FOR_THE_CLOCK = tuple(kind.name for kind in KINDS if kind.where == "clock" or kind.name == "kill")
 """Kinds that the system controller can have."""

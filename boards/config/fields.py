@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import FieldSpec
-from backplane.message import MessageType
+from rack.backplane.layout import FieldSpec
+from rack.backplane.message import MessageType
 
 
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from boards.errors import ConfigError, Mistake
+from rack.boards.errors import ConfigError, Mistake
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 """The project's own configs, beside this package in a checkout and in an installation."""

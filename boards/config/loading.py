@@ -9,17 +9,17 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from boards.config.classes import extend_path
-from boards.config.files import CONFIGS, Tables, anchor, parse, read, with_faults
-from boards.config.overrides import override
-from boards.config.rules import mistakes_in
-from boards.config.schema import LAST_SLOT, RackConfig
-from boards.config.schema_mistakes import mistakes_of
-from boards.config.wiring import judged
-from boards.errors import ConfigError, Mistake
-from boards.faults.config import FaultConfig
-from boards.operating.config import CommandConfig
-from levels.robot import Table
+from rack.boards.config.classes import extend_path
+from rack.boards.config.files import CONFIGS, Tables, anchor, parse, read, with_faults
+from rack.boards.config.overrides import override
+from rack.boards.config.rules import mistakes_in
+from rack.boards.config.schema import LAST_SLOT, RackConfig
+from rack.boards.config.schema_mistakes import mistakes_of
+from rack.boards.config.wiring import judged
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.config import FaultConfig
+from rack.boards.operating.config import CommandConfig
+from rack.levels.robot import Table
 
 T = TypeVar("T", bound=Table)
 

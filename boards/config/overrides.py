@@ -7,8 +7,8 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
-from boards.config.files import DEEPEST, Tables, merge, parse
-from boards.errors import ConfigError, Mistake, shown
+from rack.boards.config.files import DEEPEST, Tables, merge, parse
+from rack.boards.errors import ConfigError, Mistake, shown
 
 PART = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[^."'=\s]+)"""
 SETTING = re.compile(rf"\s*({PART}(?:\s*\.\s*{PART})*)\s*=(.*)", re.DOTALL)

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from backplane.layout import Role
-from backplane.message import MessageType
-from boards.config.classes import find_class
-from boards.config.schema import RackConfig
-from boards.errors import ConfigError, Mistake
-from levels.level import Executor, Input, Planner
+from rack.backplane.layout import Role
+from rack.backplane.message import MessageType
+from rack.boards.config.classes import find_class
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError, Mistake
+from rack.levels.level import Executor, Input, Planner
 
 
 @dataclass(frozen=True)

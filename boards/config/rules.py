@@ -10,10 +10,10 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 
-from backplane.errors import ClockError
-from boards.config.files import file_at
-from boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, RackConfig
-from boards.errors import Mistake
+from rack.backplane.errors import ClockError
+from rack.boards.config.files import file_at
+from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, RackConfig
+from rack.boards.errors import Mistake
 
 RESERVED = ("clock", "above", "below", "own")
 """No board can be called so: they mean something in the wiring of ports."""

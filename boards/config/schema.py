@@ -1,6 +1,6 @@
 """The tables of a rack's config: every field with its unit, range and meaning.
 
-`[robot]` and `[scene]` are of `levels.robot` and `levels.scene`; `[task]` is the task level's.
+`[robot]` and `[scene]` are of `rack.levels.robot` and `rack.levels.scene`; `[task]` is the task level's.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from backplane.clock import ticks_of
-from backplane.layout import Protocol
-from boards.config.text import portable, to_toml
-from boards.faults.config import FaultConfig
-from boards.operating.config import CommandConfig
-from levels.robot import Positive, RobotConfig, Table
-from levels.scene import SceneConfig
+from rack.backplane.clock import ticks_of
+from rack.backplane.layout import Protocol
+from rack.boards.config.text import portable, to_toml
+from rack.boards.faults.config import FaultConfig
+from rack.boards.operating.config import CommandConfig
+from rack.levels.robot import Positive, RobotConfig, Table
+from rack.levels.scene import SceneConfig
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from boards.errors import Mistake
+from rack.boards.errors import Mistake
 
 ALONE = {"robot": "; a [robot] that names its model is another arm, and takes nothing from a file that it extends"}
 """What to know of a table that misses something, by its key."""

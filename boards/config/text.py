@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from boards.config.files import CONFIGS
+from rack.boards.config.files import CONFIGS
 
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 

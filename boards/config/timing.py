@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 
-from backplane.address_map import CLOCK
-from backplane.layout import Layout, Role, TaskSpec
-from boards.config.rules import PLANNER_BUDGET
-from boards.config.schema import BoardConfig, BudgetConfig, RackConfig
-from levels.timing.budget import Budget
-from levels.timing.tasks import Part, TimedTask, Unit
+from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout, Role, TaskSpec
+from rack.boards.config.rules import PLANNER_BUDGET
+from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
+from rack.levels.timing.budget import Budget
+from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 NS_PER_MS = 1e6
 PARTS = tuple(field.name for field in fields(Budget))

@@ -6,24 +6,24 @@ from collections.abc import Iterable, Mapping
 
 from pydantic import ValidationError
 
-from backplane.address_map import CLOCK, AddressMap
-from backplane.errors import MailboxError
-from backplane.layout import Layout, MailboxSpec, Protocol, TaskSpec, depth_for
-from backplane.message import MessageType
-from boards.config.cell import cell_sizes
-from boards.config.commands import command_mistakes, command_places, commandable
-from boards.config.cores import obtained_core
-from boards.config.faults import fault_mistakes, places
-from boards.config.fields import field_specs
-from boards.config.ports import TaskPorts, all_ports
-from boards.config.rules import mistakes_in
-from boards.config.schema import BoardConfig, RackConfig
-from boards.config.schema_mistakes import mistakes_of
-from boards.errors import ConfigError, Mistake
-from boards.faults.config import FaultConfig
-from boards.operating.config import CommandConfig
-from levels.errors import ProgramError
-from levels.operator import OPERATOR_COMMAND
+from rack.backplane.address_map import CLOCK, AddressMap
+from rack.backplane.errors import MailboxError
+from rack.backplane.layout import Layout, MailboxSpec, Protocol, TaskSpec, depth_for
+from rack.backplane.message import MessageType
+from rack.boards.config.cell import cell_sizes
+from rack.boards.config.commands import command_mistakes, command_places, commandable
+from rack.boards.config.cores import obtained_core
+from rack.boards.config.faults import fault_mistakes, places
+from rack.boards.config.fields import field_specs
+from rack.boards.config.ports import TaskPorts, all_ports
+from rack.boards.config.rules import mistakes_in
+from rack.boards.config.schema import BoardConfig, RackConfig
+from rack.boards.config.schema_mistakes import mistakes_of
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.config import FaultConfig
+from rack.boards.operating.config import CommandConfig
+from rack.levels.errors import ProgramError
+from rack.levels.operator import OPERATOR_COMMAND
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox: commands come now and then."""
@@ -154,9 +154,9 @@ class Wiring:
     def _check_program(self) -> None:
         """Check the program of the project's own task level; a user's own reads its `[task]` itself."""
         robot = self.config.robot
-        if robot is None or not any(ports.kind.__module__.startswith("levels.task") for ports in self._tasks):
+        if robot is None or not any(ports.kind.__module__.startswith("rack.levels.task") for ports in self._tasks):
             return
-        from levels.task import read_program  # imported by its board's class already
+        from rack.levels.task import read_program  # imported by its board's class already
 
         try:
             read_program(self.config.task, robot, self.config.scene)

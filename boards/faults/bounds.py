@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import ceil
 
-from backplane.address_map import CLOCK
-from backplane.fault_table import Injection
-from backplane.layout import Layout, MailboxSpec
-from backplane.lock import WAIT_S
-from boards.faults.kinds import Kind
+from rack.backplane.address_map import CLOCK
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.lock import WAIT_S
+from rack.boards.faults.kinds import Kind
 
 RACK_NS = 5_000_000
 """Within this time the Rack knows of a death: the kernel tells it by a pidfd."""

@@ -7,10 +7,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from backplane.layout import FieldSpec, Layout, MailboxSpec
-from backplane.message import State
-from levels.messages import Error, SegmentKind, Verb
-from levels.operator import Answer, What
+from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
+from rack.backplane.message import State
+from rack.levels.messages import Error, SegmentKind, Verb
+from rack.levels.operator import Answer, What
 
 FORM = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
 ENUMS: dict[str, type[IntEnum]] = {kind.__name__: kind for kind in (State, Verb, SegmentKind, Error, What, Answer)}

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from math import ceil
 from typing import NamedTuple
 
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm
-from backplane.layout import Layout
-from boards.faults.bounds import cycle_ticks
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm
+from rack.backplane.layout import Layout
+from rack.boards.faults.bounds import cycle_ticks
 
 SENSOR_ALARMS = (Alarm.SENSOR_RANGE, Alarm.SENSOR_STUCK, Alarm.SENSOR_SILENT, Alarm.SENSOR_MODEL)
 UNDONE_S = 0.25

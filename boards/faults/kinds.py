@@ -1,7 +1,7 @@
 """The kinds of faults: what each one does, where it strikes, what it takes, who sees it and how soon.
 
 The order is the number of a kind in the fault table. A bound is in cycles of the task concerned unless it says
-otherwise; `boards.faults.bounds` works it out in ticks.
+otherwise; `rack.boards.faults.bounds` works it out in ticks.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from backplane.alarms import Alarm
+from rack.backplane.alarms import Alarm
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
 """Who does it: `process`, `clock`, `bus`: the clock's board, at the beginning of a tick; `load`, `writer`, `lock`: the
@@ -20,7 +20,7 @@ task itself; `core`: a process beside it; `arm`: the level that drives the arm; 
 class Parameter:
     """A number that a kind takes: its unit, range and meaning. `default` None: it must be given.
 
-    No parameter is called as a key of every fault is: see `boards.faults.config.FaultConfig`.
+    No parameter is called as a key of every fault is: see `rack.boards.faults.config.FaultConfig`.
     """
 
     name: str

@@ -5,9 +5,9 @@ from __future__ import annotations
 import random
 from time import monotonic_ns
 
-from backplane.clock import SystemClock
-from backplane.fault_table import Entry, FaultEntry
-from backplane.layout import TaskSpec
+from rack.backplane.clock import SystemClock
+from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.layout import TaskSpec
 
 
 class Load:

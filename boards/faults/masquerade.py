@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 
-from backplane.segment import Segment
-from backplane.slots import Slots, claim
-from backplane.words import Box
+from rack.backplane.segment import Segment
+from rack.backplane.slots import Slots, claim
+from rack.backplane.words import Box
 
 
 def masquerade(segment: Segment, mailbox: str, tick: int) -> None:

@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from time import monotonic_ns
 from typing import NamedTuple
 
-from backplane.fault_table import Entry, FaultEntry
-from backplane.lock import LockWriter
-from backplane.mailbox import Writer
+from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.lock import LockWriter
+from rack.backplane.mailbox import Writer
 
 
 class Outgoing(NamedTuple):
@@ -172,4 +172,4 @@ STEPS: Mapping[str, type[Step]] = {
     "babble": Babble,
     "lock-held": HoldLock,
 }
-"""By kind: see `boards.faults.kinds`."""
+"""By kind: see `rack.boards.faults.kinds`."""

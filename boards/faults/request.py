@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from zlib import crc32
 
-from backplane.address_map import CLOCK
-from backplane.fault_table import Injection
-from backplane.layout import Layout
-from boards.config.faults import fault_mistakes, places
-from boards.config.schema import RackConfig
-from boards.errors import ConfigError
-from boards.faults.bounds import cycle_ticks
-from boards.faults.condition import condition
-from boards.faults.config import FaultConfig
-from boards.faults.kinds import KINDS, NUMBERS, Kind
+from rack.backplane.address_map import CLOCK
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout
+from rack.boards.config.faults import fault_mistakes, places
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError
+from rack.boards.faults.bounds import cycle_ticks
+from rack.boards.faults.condition import condition
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kinds import KINDS, NUMBERS, Kind
 
 __all__ = ["cycle_ticks", "injection", "injections"]
 

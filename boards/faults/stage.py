@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.clock import SystemClock
-from backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
-from backplane.mailbox import Reader
-from backplane.protocols import open_observer
-from backplane.segment import Segment
-from backplane.words import System
-from boards.faults.kinds import KINDS
-from boards.faults.strikes import Strikes
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.clock import SystemClock
+from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.mailbox import Reader
+from rack.backplane.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.strikes import Strikes
 
 OPEN = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000

@@ -9,14 +9,14 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from backplane.clock import SystemClock
-from backplane.clock_driver import ClockDriver
-from backplane.fault_table import Entry, FaultEntry
-from backplane.released_task import ReleasedTask
-from backplane.segment import Segment
-from backplane.words import Block
-from boards.faults.kinds import KINDS
-from boards.faults.masquerade import masquerade
+from rack.backplane.clock import SystemClock
+from rack.backplane.clock_driver import ClockDriver
+from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.released_task import ReleasedTask
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block
+from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.masquerade import masquerade
 
 LEAST_LATE = 0.6
 """Least lateness of a tick that is moved, in ticks: a board calls a tick late from half a tick on."""

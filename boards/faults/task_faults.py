@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from time import monotonic_ns
 
-from backplane.clock import SystemClock
-from backplane.fault_table import Entry, FaultEntry, FaultTable
-from backplane.layout import TaskSpec
-from backplane.segment import Segment
-from boards.faults.kinds import KINDS
-from boards.faults.load import Load
-from boards.ports import OutputPorts
-from levels.level import Executor, Fault, Planner
+from rack.backplane.clock import SystemClock
+from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
+from rack.backplane.layout import TaskSpec
+from rack.backplane.segment import Segment
+from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.load import Load
+from rack.boards.ports import OutputPorts
+from rack.levels.level import Executor, Fault, Planner
 
 
 class TaskFaults:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from backplane.address_map import CLOCK
-from backplane.fault_table import NEVER, Entry, FaultEntry, Stage
-from backplane.layout import Layout
-from boards.faults.kinds import KINDS
+from rack.backplane.address_map import CLOCK
+from rack.backplane.fault_table import NEVER, Entry, FaultEntry, Stage
+from rack.backplane.layout import Layout
+from rack.boards.faults.kinds import KINDS
 
 ALL_JOINTS = "all joints"
 

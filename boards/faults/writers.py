@@ -1,16 +1,16 @@
 """A writer with faults: what a task writes passes through one step a fault, and then into its mailbox, or not.
 
-The steps are in `boards.faults.message_steps`. Faults compose: each step hands on to the next as many messages as it
-likes, at once or in a later cycle.
+The steps are in `rack.boards.faults.message_steps`. Faults compose: each step hands on to the next as many messages
+as it likes, at once or in a later cycle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from backplane.fault_table import FaultEntry
-from backplane.mailbox import Writer
-from boards.faults.message_steps import STEPS, Held, Outgoing, Step
+from rack.backplane.fault_table import FaultEntry
+from rack.backplane.mailbox import Writer
+from rack.boards.faults.message_steps import STEPS, Held, Outgoing, Step
 
 
 class FaultyWriter:

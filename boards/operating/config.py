@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from levels.operator import Goal, What
-from levels.robot import LAST_TICK, Finite, Table
+from rack.levels.operator import Goal, What
+from rack.levels.robot import LAST_TICK, Finite, Table
 
 Vector = tuple[Finite, Finite, Finite]
 Said = Literal["hold", "resume", "setpoint", "goto"]

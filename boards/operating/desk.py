@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm, AlarmWriter
-from backplane.clock import SystemClock
-from backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
-from backplane.protocols import open_writer
-from backplane.segment import Segment
-from backplane.words import System
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm, AlarmWriter
+from rack.backplane.clock import SystemClock
+from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
+from rack.backplane.protocols import open_writer
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
 
 # Plain integers for the hot path.
 _REQUESTED, _COMMANDED = int(System.REQUESTED), int(System.COMMANDED)

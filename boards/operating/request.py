@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from backplane.layout import Layout
-from backplane.message import Message
-from backplane.operator_table import Request
-from backplane.slots import message_dtype
-from boards.config.commands import command_mistakes, command_places
-from boards.config.schema import RackConfig
-from boards.config.schema_mistakes import mistakes_of
-from boards.errors import ConfigError
-from boards.operating.config import CommandConfig
-from levels.algebra import norm
-from levels.operator import Goal
+from rack.backplane.layout import Layout
+from rack.backplane.message import Message
+from rack.backplane.operator_table import Request
+from rack.backplane.slots import message_dtype
+from rack.boards.config.commands import command_mistakes, command_places
+from rack.boards.config.schema import RackConfig
+from rack.boards.config.schema_mistakes import mistakes_of
+from rack.boards.errors import ConfigError
+from rack.boards.operating.config import CommandConfig
+from rack.levels.algebra import norm
+from rack.levels.operator import Goal
 
 DOWN = (0.0, 0.0, -1.0)
 

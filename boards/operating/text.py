@@ -6,12 +6,12 @@ import time
 
 import numpy as np
 
-from backplane.layout import Layout
-from backplane.message import Message
-from backplane.operator_table import RequestEntry, RequestWord
-from backplane.slots import message_dtype
-from boards.events import Event
-from levels.operator import Goal, What
+from rack.backplane.layout import Layout
+from rack.backplane.message import Message
+from rack.backplane.operator_table import RequestEntry, RequestWord
+from rack.backplane.slots import message_dtype
+from rack.boards.events import Event
+from rack.levels.operator import Goal, What
 
 
 def level_of(entry: RequestEntry, layout: Layout) -> str:
@@ -40,7 +40,7 @@ def describe(message: Message) -> str:
 
 
 def command_event(row: np.void, entry: RequestEntry, layout: Layout) -> Event:
-    """Return the event that the giving of a command makes; `row` is of `backplane.alarms.RECORD`."""
+    """Return the event that the giving of a command makes; `row` is of `rack.backplane.alarms.RECORD`."""
     level, message, serial = level_of(entry, layout), message_of(entry, layout), int(row["value"])
     text = f"{describe(message)} (command {serial})"
     realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()

@@ -7,8 +7,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.level import Finding
+from rack.backplane.message import Message
+from rack.levels.level import Finding
 
 Array = NDArray[np.float64]
 
@@ -104,10 +104,10 @@ class Arm(Link, Protocol):
         """Let `ticks` ticks pass."""
 
     def look(self, scene: Message) -> None:
-        """Fill a `levels.messages.SCENE` with the poses of bodies and tool as sensed."""
+        """Fill a `rack.levels.messages.SCENE` with the poses of bodies and tool as sensed."""
 
     def save(self, state: Message) -> None:
-        """Fill in a `levels.messages.ARM_STATE` all that the arm's future depends on."""
+        """Fill in a `rack.levels.messages.ARM_STATE` all that the arm's future depends on."""
 
     def restore(self, state: Message) -> None:
-        """Go on from a `levels.messages.ARM_STATE`."""
+        """Go on from a `rack.levels.messages.ARM_STATE`."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.algebra import mat_vec
-from levels.dynamics import Dynamics
+from rack.levels.algebra import mat_vec
+from rack.levels.dynamics import Dynamics
 
 Array = NDArray[np.float64]
 

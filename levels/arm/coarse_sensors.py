@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.limits import EDGE_TIMING_S, Encoders
+from rack.levels.limits import EDGE_TIMING_S, Encoders
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.cell import Cell
-from levels.touches import geom_name, unmeant
+from rack.levels.cell import Cell
+from rack.levels.touches import geom_name, unmeant
 
 
 class ContactMonitor:

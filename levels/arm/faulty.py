@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.arm.arm import Arm, Sensed
-from levels.cell import Cell
-from levels.dynamics import FRICTION_SPEED
-from levels.level import Fault, Finding
-from levels.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.levels.arm.arm import Arm, Sensed
+from rack.levels.cell import Cell
+from rack.levels.dynamics import FRICTION_SPEED
+from rack.levels.level import Fault, Finding
+from rack.levels.limits import PRESSING, RESTING, TURNING_JOINTS
 
 Array = NDArray[np.float64]
 

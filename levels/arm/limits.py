@@ -6,9 +6,9 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.algebra import mat_vec, solve
-from levels.cell import Bounds
-from levels.dynamics import Dynamics
+from rack.levels.algebra import mat_vec, solve
+from rack.levels.cell import Bounds
+from rack.levels.dynamics import Dynamics
 
 Array = NDArray[np.float64]
 

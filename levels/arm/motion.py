@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.algebra import norm
-from levels.scene import MotionConfig
+from rack.levels.algebra import norm
+from rack.levels.scene import MotionConfig
 
 Array = NDArray[np.float64]
 

@@ -8,19 +8,19 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
-from backplane.message import Message
-from levels.arm.arm import Sensed
-from levels.arm.brake import Brake
-from levels.arm.coarse_sensors import CoarseSensors
-from levels.arm.contact_monitor import ContactMonitor
-from levels.arm.limit_monitor import LimitMonitor
-from levels.arm.limits import LimitGate
-from levels.arm.motion import ObstacleMotion
-from levels.cell import STATE, Cell
-from levels.dynamics import Dynamics
-from levels.level import Finding
-from levels.scene import SceneConfig
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.levels.arm.arm import Sensed
+from rack.levels.arm.brake import Brake
+from rack.levels.arm.coarse_sensors import CoarseSensors
+from rack.levels.arm.contact_monitor import ContactMonitor
+from rack.levels.arm.limit_monitor import LimitMonitor
+from rack.levels.arm.limits import LimitGate
+from rack.levels.arm.motion import ObstacleMotion
+from rack.levels.cell import STATE, Cell
+from rack.levels.dynamics import Dynamics
+from rack.levels.level import Finding
+from rack.levels.scene import SceneConfig
 
 Array = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from backplane.message import Message, MessageType, State
-from levels.elemental_move.params import ElementalMoveParams
-from levels.elemental_move.plans import PlansAtHand, joins
-from levels.elemental_move.segments import SegmentWindow
-from levels.level import Executor, Input, LevelContext, Ports, Reading
-from levels.messages import (
+from rack.backplane.message import Message, MessageType, State
+from rack.levels.elemental_move.params import ElementalMoveParams
+from rack.levels.elemental_move.plans import PlansAtHand, joins
+from rack.levels.elemental_move.segments import SegmentWindow
+from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
+from rack.levels.messages import (
     MOVE_COMMAND,
     MOVE_PLAN,
     MOVE_STATUS,
@@ -22,9 +22,9 @@ from levels.messages import (
     SegmentKind,
     Verb,
 )
-from levels.operator import OPERATOR_COMMAND, Commands, What
-from levels.orders import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, Orders
-from levels.params import read_params
+from rack.levels.operator import OPERATOR_COMMAND, Commands, What
+from rack.levels.orders import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, Orders
+from rack.levels.params import read_params
 
 
 class ElementalMoveExecutor(Executor):

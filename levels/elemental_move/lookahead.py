@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.messages import SegmentKind, Verb
-from levels.planning.move import Move
-from levels.planning.path import Path
-from levels.planning.pose import Pose
-from levels.planning.situation import Situation
+from rack.backplane.message import Message
+from rack.levels.messages import SegmentKind, Verb
+from rack.levels.planning.move import Move
+from rack.levels.planning.path import Path
+from rack.levels.planning.pose import Pose
+from rack.levels.planning.situation import Situation
 
 Array = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message, MessageType
-from levels.cell import build_cell
-from levels.elemental_move.lookahead import Job, Published, Refusal, end_handed_down, next_move, situation_before
-from levels.elemental_move.params import ElementalMoveParams
-from levels.errors import Refused
-from levels.level import Input, LevelContext, Planner, Ports
-from levels.messages import (
+from rack.backplane.message import Message, MessageType
+from rack.levels.cell import build_cell
+from rack.levels.elemental_move.lookahead import Job, Published, Refusal, end_handed_down, next_move, situation_before
+from rack.levels.elemental_move.params import ElementalMoveParams
+from rack.levels.errors import Refused
+from rack.levels.level import Input, LevelContext, Planner, Ports
+from rack.levels.messages import (
     MOVE_COMMAND,
     MOVE_PLAN,
     MOVE_STATUS,
@@ -26,11 +26,11 @@ from levels.messages import (
     SegmentKind,
     Verb,
 )
-from levels.params import read_params
-from levels.planning.move import Move, read_window
-from levels.planning.path import Path
-from levels.planning.pose import Pose, pose
-from levels.planning.situation import Situation
+from rack.levels.params import read_params
+from rack.levels.planning.move import Move, read_window
+from rack.levels.planning.path import Path
+from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.situation import Situation
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class ElementalMovePlanner(Planner):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         # OMPL takes time and memory to import: the process of a planner pays, no other.
-        from levels.planning.motion import MotionPlanner
+        from rack.levels.planning.motion import MotionPlanner
 
         self._params = read_params(ElementalMoveParams, context.params)
         cell = build_cell(context.robot, context.scene, context.clock_ns)

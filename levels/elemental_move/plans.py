@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.mailbox import Reading
-from backplane.message import Message
-from levels.messages import WINDOW, Error, Verb
+from rack.backplane.mailbox import Reading
+from rack.backplane.message import Message
+from rack.levels.messages import WINDOW, Error, Verb
 
 SAME_PLACE_RAD = 0.005
 """Paths join where the end of one and the beginning of the next are not farther apart than this in any joint."""

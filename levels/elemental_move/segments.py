@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.messages import SEGMENTS, SegmentKind, Verb
+from rack.backplane.message import Message
+from rack.levels.messages import SEGMENTS, SegmentKind, Verb
 
 
 class SegmentWindow:

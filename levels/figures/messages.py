@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from backplane.message import Field, MessageType, status
+from rack.backplane.message import Field, MessageType, status
 
 FIGURE_PLAN = MessageType(
     "figure_plan",

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from levels.robot import Table
+from rack.levels.robot import Table
 
 NS_PER_MS = 1e6
 Milliseconds = Annotated[float, Field(ge=0, le=10_000, allow_inf_nan=False)]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from time import process_time_ns
 
-from backplane.message import Message
-from backplane.process import compute_until
-from levels.figures.messages import FIGURE_PLAN, FIGURE_STATUS
-from levels.figures.params import FigureParams
-from levels.level import Input, LevelContext, Planner, Ports
-from levels.params import read_params
+from rack.backplane.message import Message
+from rack.backplane.process import compute_until
+from rack.levels.figures.messages import FIGURE_PLAN, FIGURE_STATUS
+from rack.levels.figures.params import FigureParams
+from rack.levels.level import Input, LevelContext, Planner, Ports
+from rack.levels.params import read_params
 
 
 class FigurePlanner(Planner):

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from levels.algebra import mat_vec
-from levels.cell import Cell
-from levels.scene import SceneConfig
-from levels.touches import geom_name
+from rack.levels.algebra import mat_vec
+from rack.levels.cell import Cell
+from rack.levels.scene import SceneConfig
+from rack.levels.touches import geom_name
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.algebra import gram, norm, transposed_mat_vec
-from levels.cell import Cell
-from levels.planning.pose import Pose, pose
-from levels.planning.reach import sampling_range
+from rack.levels.algebra import gram, norm, transposed_mat_vec
+from rack.levels.cell import Cell
+from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.reach import sampling_range
 
 Array = NDArray[np.float64]
 

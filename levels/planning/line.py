@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.algebra import mat_vec, norm
-from levels.planning.ik import InverseKinematics
-from levels.planning.path import Path
-from levels.planning.pose import Pose
-from levels.primitive.path import BlendedPath
+from rack.levels.algebra import mat_vec, norm
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.path import Path
+from rack.levels.planning.pose import Pose
+from rack.levels.primitive.path import BlendedPath
 
 Array = NDArray[np.float64]
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.cell import Cell
-from levels.errors import Refused
-from levels.messages import Error, Verb
-from levels.planning.collision import CollisionChecker
-from levels.planning.ik import SAME_RAD, InverseKinematics
-from levels.planning.line import straight_line
-from levels.planning.move import NAMES, Move
-from levels.planning.path import Path
-from levels.planning.path_planner import SEARCHES, PathPlanner
-from levels.planning.payload import Payloads
-from levels.planning.pose import Pose
-from levels.planning.situation import Situation
-from levels.primitive.path import BlendedPath
-from levels.scene import SceneConfig
+from rack.levels.cell import Cell
+from rack.levels.errors import Refused
+from rack.levels.messages import Error, Verb
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.ik import SAME_RAD, InverseKinematics
+from rack.levels.planning.line import straight_line
+from rack.levels.planning.move import NAMES, Move
+from rack.levels.planning.path import Path
+from rack.levels.planning.path_planner import SEARCHES, PathPlanner
+from rack.levels.planning.payload import Payloads
+from rack.levels.planning.pose import Pose
+from rack.levels.planning.situation import Situation
+from rack.levels.primitive.path import BlendedPath
+from rack.levels.scene import SceneConfig
 
 Array = NDArray[np.float64]
 

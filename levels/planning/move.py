@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.messages import Verb
-from levels.planning.pose import Pose, pose
+from rack.levels.messages import Verb
+from rack.levels.planning.pose import Pose, pose
 
 Array = NDArray[np.float64]
 

@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.algebra import norm
-from levels.cell import Cell
-from levels.messages import WAYPOINTS
-from levels.planning.path import Path
-from levels.planning.reach import lever_arms
-from levels.planning.sampling import SampledSearch
-from levels.primitive.path import BlendedPath
-from levels.primitive.trajectory import duration
+from rack.levels.algebra import norm
+from rack.levels.cell import Cell
+from rack.levels.messages import WAYPOINTS
+from rack.levels.planning.path import Path
+from rack.levels.planning.reach import lever_arms
+from rack.levels.planning.sampling import SampledSearch
+from rack.levels.primitive.path import BlendedPath
+from rack.levels.primitive.trajectory import duration
 
 Array = NDArray[np.float64]
 Free = Callable[[Array], bool]

@@ -13,11 +13,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.cell import Cell
-from levels.dynamics import Dynamics, Payload
-from levels.errors import Refused
-from levels.messages import Error
-from levels.planning.pose import Pose, pose
+from rack.levels.cell import Cell
+from rack.levels.dynamics import Dynamics, Payload
+from rack.levels.errors import Refused
+from rack.levels.messages import Error
+from rack.levels.planning.pose import Pose, pose
 
 Array = NDArray[np.float64]
 

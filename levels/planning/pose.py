@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from levels.algebra import norm
+from rack.levels.algebra import norm
 
 Array = NDArray[np.float64]
 

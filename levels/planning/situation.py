@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.messages import Verb
-from levels.planning.collision import CollisionChecker
-from levels.planning.move import Move
-from levels.planning.pose import Pose
+from rack.levels.messages import Verb
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.move import Move
+from rack.levels.planning.pose import Pose
 
 Array = NDArray[np.float64]
 

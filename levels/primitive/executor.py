@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from backplane.message import Message, State
-from levels.cell import build_cell
-from levels.level import Executor, Input, LevelContext, Ports
-from levels.messages import (
+from rack.backplane.message import Message, State
+from rack.levels.cell import build_cell
+from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.messages import (
     JOINT_SET_POINT,
     MOVE_COMMAND,
     PRIMITIVE_STATUS,
@@ -17,20 +17,20 @@ from levels.messages import (
     Error,
     SegmentKind,
 )
-from levels.operator import OPERATOR_COMMAND, What
-from levels.orders import ABOVE_LOST, HELD_FROM_ABOVE, Orders
-from levels.params import read_params
-from levels.primitive.fault import Fault
-from levels.primitive.gripper_work import GripperWork
-from levels.primitive.guard import Guard
-from levels.primitive.memory import Memory, recall
-from levels.primitive.params import PrimitiveParams
-from levels.primitive.path_motion import SetPoint
-from levels.primitive.path_work import PathWork, WorkRules
-from levels.primitive.plans import Plans
-from levels.primitive.segment import Segment, read_segment, window
-from levels.primitive.sight import Sight
-from levels.primitive.tracking import Straying, Tracking, awaited
+from rack.levels.operator import OPERATOR_COMMAND, What
+from rack.levels.orders import ABOVE_LOST, HELD_FROM_ABOVE, Orders
+from rack.levels.params import read_params
+from rack.levels.primitive.fault import Fault
+from rack.levels.primitive.gripper_work import GripperWork
+from rack.levels.primitive.guard import Guard
+from rack.levels.primitive.memory import Memory, recall
+from rack.levels.primitive.params import PrimitiveParams
+from rack.levels.primitive.path_motion import SetPoint
+from rack.levels.primitive.path_work import PathWork, WorkRules
+from rack.levels.primitive.plans import Plans
+from rack.levels.primitive.segment import Segment, read_segment, window
+from rack.levels.primitive.sight import Sight
+from rack.levels.primitive.tracking import Straying, Tracking, awaited
 
 Work = PathWork | GripperWork
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from levels.messages import Error
+from rack.levels.messages import Error
 
 
 class Fault(NamedTuple):

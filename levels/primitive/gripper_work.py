@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from backplane.message import Message
-from levels.messages import Error
-from levels.primitive.fault import Fault
-from levels.primitive.path_work import WorkRules
-from levels.primitive.segment import Segment
-from levels.primitive.tracking import HANDOVER_CYCLES
-from levels.robot import GripperConfig
+from rack.backplane.message import Message
+from rack.levels.messages import Error
+from rack.levels.primitive.fault import Fault
+from rack.levels.primitive.path_work import WorkRules
+from rack.levels.primitive.segment import Segment
+from rack.levels.primitive.tracking import HANDOVER_CYCLES
+from rack.levels.robot import GripperConfig
 
 
 class GripperWork:

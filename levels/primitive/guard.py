@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.cell import Cell
-from levels.planning.collision import CollisionChecker
-from levels.primitive.grasp import GraspFrame
-from levels.primitive.path import BlendedPath
-from levels.primitive.segment import Segment
-from levels.primitive.trajectory import Trajectory
-from levels.scene import SceneConfig
+from rack.backplane.message import Message
+from rack.levels.cell import Cell
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.primitive.grasp import GraspFrame
+from rack.levels.primitive.path import BlendedPath
+from rack.levels.primitive.segment import Segment
+from rack.levels.primitive.trajectory import Trajectory
+from rack.levels.scene import SceneConfig
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from levels.level import Ports
+from rack.levels.level import Ports
 
 
 @dataclass

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from levels.algebra import norm
+from rack.levels.algebra import norm
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.primitive.path import COINCIDENT_RAD, BlendedPath
-from levels.primitive.speed import BrakingLimits
-from levels.primitive.stop import make_stop
-from levels.primitive.trajectory import Trajectory
+from rack.levels.primitive.path import COINCIDENT_RAD, BlendedPath
+from rack.levels.primitive.speed import BrakingLimits
+from rack.levels.primitive.stop import make_stop
+from rack.levels.primitive.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

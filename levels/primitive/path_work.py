@@ -8,17 +8,17 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.messages import Error
-from levels.primitive.fault import Fault
-from levels.primitive.guard import Guard
-from levels.primitive.params import PrimitiveParams
-from levels.primitive.path import BlendedPath
-from levels.primitive.path_motion import PathMotion
-from levels.primitive.segment import Segment
-from levels.primitive.speed import BrakingLimits, JointLimits, braking_limits
-from levels.primitive.tracking import Quiet
-from levels.primitive.trajectory import Trajectory
+from rack.backplane.message import Message
+from rack.levels.messages import Error
+from rack.levels.primitive.fault import Fault
+from rack.levels.primitive.guard import Guard
+from rack.levels.primitive.params import PrimitiveParams
+from rack.levels.primitive.path import BlendedPath
+from rack.levels.primitive.path_motion import PathMotion
+from rack.levels.primitive.segment import Segment
+from rack.levels.primitive.speed import BrakingLimits, JointLimits, braking_limits
+from rack.levels.primitive.tracking import Quiet
+from rack.levels.primitive.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from levels.level import Reading
-from levels.messages import Error
-from levels.primitive.fault import Fault
-from levels.primitive.trajectory import Trajectory
+from rack.levels.level import Reading
+from rack.levels.messages import Error
+from rack.levels.primitive.fault import Fault
+from rack.levels.primitive.trajectory import Trajectory
 
 
 class Plans:

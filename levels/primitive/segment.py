@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.messages import SegmentKind
-from levels.primitive.path import BlendedPath
+from rack.backplane.message import Message
+from rack.levels.messages import SegmentKind
+from rack.levels.primitive.path import BlendedPath
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.level import Reading
-from levels.primitive.guard import Guard
+from rack.levels.level import Reading
+from rack.levels.primitive.guard import Guard
 
 Array = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ import numpy as np
 import ruckig
 from numpy.typing import NDArray
 
-from levels.primitive.path import COINCIDENT_RAD, BlendedPath
-from levels.primitive.speed import JointLimits, acceleration_room
-from levels.primitive.trajectory import Motion, Trajectory, calculated, joined
+from rack.levels.primitive.path import COINCIDENT_RAD, BlendedPath
+from rack.levels.primitive.speed import JointLimits, acceleration_room
+from rack.levels.primitive.trajectory import Motion, Trajectory, calculated, joined
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from backplane.message import Message, State
-from levels.level import Reading
-from levels.messages import Error
-from levels.primitive.fault import Fault
+from rack.backplane.message import Message, State
+from rack.levels.level import Reading
+from rack.levels.messages import Error
+from rack.levels.primitive.fault import Fault
 
 MISSED_STATUSES = 3
 """Cycles in a row without a new status after which the servo is silent."""

@@ -12,9 +12,9 @@ import numpy as np
 import ruckig
 from numpy.typing import NDArray
 
-from levels.messages import SECTIONS_A_LINE
-from levels.primitive.path import COINCIDENT_RAD, BlendedPath, PathBounds
-from levels.primitive.speed import JointLimits, SpeedLimits, boundary_speeds, speed_limits
+from rack.levels.messages import SECTIONS_A_LINE
+from rack.levels.primitive.path import COINCIDENT_RAD, BlendedPath, PathBounds
+from rack.levels.primitive.speed import JointLimits, SpeedLimits, boundary_speeds, speed_limits
 
 Array = NDArray[np.float64]
 

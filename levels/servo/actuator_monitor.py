@@ -7,12 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
-from levels.algebra import each, mat_vec
-from levels.cell import Cell
-from levels.dynamics import FRICTION_SPEED, Terms
-from levels.level import Finding
-from levels.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.backplane.alarms import Alarm
+from rack.levels.algebra import each, mat_vec
+from rack.levels.cell import Cell
+from rack.levels.dynamics import FRICTION_SPEED, Terms
+from rack.levels.level import Finding
+from rack.levels.limits import PRESSING, RESTING, TURNING_JOINTS
 
 Array = NDArray[np.float64]
 

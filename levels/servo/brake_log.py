@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from backplane.alarms import Alarm
-from levels.arm import Arm
-from levels.level import Finding
+from rack.backplane.alarms import Alarm
+from rack.levels.arm import Arm
+from rack.levels.level import Finding
 
 
 class BrakeLog:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.algebra import mat_vec
-from levels.cell import Cell
-from levels.dynamics import Dynamics, Payload, Terms
-from levels.servo.curves import Motion
-from levels.servo.params import ServoParams
+from rack.backplane.message import Message
+from rack.levels.algebra import mat_vec
+from rack.levels.cell import Cell
+from rack.levels.dynamics import Dynamics, Payload, Terms
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.params import ServoParams
 
 Array = NDArray[np.float64]
 

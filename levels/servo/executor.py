@@ -7,24 +7,24 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message, State
-from levels.arm import Arm, FaultyLink, Link, Sensed, SimulatedArm
-from levels.arm.faulty import KINDS
-from levels.cell import build_cell
-from levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
-from levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
-from levels.operator import OPERATOR_COMMAND, Goal, What
-from levels.params import read_params
-from levels.servo.actuator_monitor import ActuatorMonitor
-from levels.servo.brake_log import BrakeLog
-from levels.servo.computed_torque import ComputedTorque
-from levels.servo.curves import Motion
-from levels.servo.grip import Grip
-from levels.servo.params import ServoParams
-from levels.servo.reference import Reference
-from levels.servo.sensor_monitor import SensorMonitor
-from levels.servo.standing import Standing
-from levels.servo.stopping import Reaction, Stopping
+from rack.backplane.message import Message, State
+from rack.levels.arm import Arm, FaultyLink, Link, Sensed, SimulatedArm
+from rack.levels.arm.faulty import KINDS
+from rack.levels.cell import build_cell
+from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
+from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
+from rack.levels.operator import OPERATOR_COMMAND, Goal, What
+from rack.levels.params import read_params
+from rack.levels.servo.actuator_monitor import ActuatorMonitor
+from rack.levels.servo.brake_log import BrakeLog
+from rack.levels.servo.computed_torque import ComputedTorque
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.grip import Grip
+from rack.levels.servo.params import ServoParams
+from rack.levels.servo.reference import Reference
+from rack.levels.servo.sensor_monitor import SensorMonitor
+from rack.levels.servo.standing import Standing
+from rack.levels.servo.stopping import Reaction, Stopping
 
 Array = NDArray[np.float64]
 

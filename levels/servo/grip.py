@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from backplane.message import Message
-from levels.robot import GripperConfig
+from rack.backplane.message import Message
+from rack.levels.robot import GripperConfig
 
 
 class Grip:

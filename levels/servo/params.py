@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from levels.robot import Positive, Table
+from rack.levels.robot import Positive, Table
 
 Reacting = Literal["hold", "stop", "brake"]
 

@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.algebra import mat_vec, transposed_mat_vec
-from levels.cell import build_cell
-from levels.dynamics import Dynamics, Payload
-from levels.level import Input, LevelContext, Planner, Ports
-from levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.backplane.message import Message
+from rack.levels.algebra import mat_vec, transposed_mat_vec
+from rack.levels.cell import build_cell
+from rack.levels.dynamics import Dynamics, Payload
+from rack.levels.level import Input, LevelContext, Planner, Ports
+from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.cell import Bounds, Limits
-from levels.servo.curves import Curve, Decay, Hermite, Motion, Passage, Ramp
+from rack.backplane.message import Message
+from rack.levels.cell import Bounds, Limits
+from rack.levels.servo.curves import Curve, Decay, Hermite, Motion, Passage, Ramp
 
 Array = NDArray[np.float64]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
-from backplane.message import Message
-from levels.arm import Sensed
-from levels.cell import Bounds
-from levels.level import Finding
-from levels.limits import Encoders
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.levels.arm import Sensed
+from rack.levels.cell import Bounds
+from rack.levels.level import Finding
+from rack.levels.limits import Encoders
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.mailbox import Reading
-from backplane.message import Message
-from levels.operator import Commands, What
-from levels.orders import Orders, joints_of
-from levels.servo.curves import Motion
-from levels.servo.reference import Reference
+from rack.backplane.mailbox import Reading
+from rack.backplane.message import Message
+from rack.levels.operator import Commands, What
+from rack.levels.orders import Orders, joints_of
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.reference import Reference
 
 Array = NDArray[np.float64]
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from backplane.alarms import Alarm
-from backplane.message import Message
-from backplane.words import Demand
-from levels.level import Finding
-from levels.messages import Error
-from levels.servo.params import ServoParams
-from levels.servo.sensor_monitor import SensorMonitor
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.backplane.words import Demand
+from rack.levels.level import Finding
+from rack.levels.messages import Error
+from rack.levels.servo.params import ServoParams
+from rack.levels.servo.sensor_monitor import SensorMonitor
 
 
 class Reaction(IntEnum):

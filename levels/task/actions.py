@@ -9,15 +9,15 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.errors import Refused
-from levels.messages import Error, Verb
-from levels.planning.motion import MotionPlanner, at
-from levels.planning.pose import Pose, pointing, pose
-from levels.planning.situation import Situation
-from levels.scene import SceneConfig
-from levels.task.grasps import DOWN, goals, grasps, standing
-from levels.task.program import Goto, Home, TaskConfig, Transfer
-from levels.task.rehearsal import Rehearsal
+from rack.levels.errors import Refused
+from rack.levels.messages import Error, Verb
+from rack.levels.planning.motion import MotionPlanner, at
+from rack.levels.planning.pose import Pose, pointing, pose
+from rack.levels.planning.situation import Situation
+from rack.levels.scene import SceneConfig
+from rack.levels.task.grasps import DOWN, goals, grasps, standing
+from rack.levels.task.program import Goto, Home, TaskConfig, Transfer
+from rack.levels.task.rehearsal import Rehearsal
 
 Array = NDArray[np.float64]
 Option = TypeVar("Option")

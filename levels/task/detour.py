@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.message import Message, State
-from levels.messages import Verb
-from levels.operator import Answer, Goal, What, told
-from levels.orders import Orders, joints_of
-from levels.planning.move import Move
-from levels.planning.pose import pointing, pose
-from levels.robot import RobotConfig
-from levels.task.window import ShownWindow, is_free, next_free
+from rack.backplane.message import Message, State
+from rack.levels.messages import Verb
+from rack.levels.operator import Answer, Goal, What, told
+from rack.levels.orders import Orders, joints_of
+from rack.levels.planning.move import Move
+from rack.levels.planning.pose import pointing, pose
+from rack.levels.robot import RobotConfig
+from rack.levels.task.window import ShownWindow, is_free, next_free
 
 FARTHEST_RAD = 1e3
 """No joint is sent farther; what it can reach the level below knows."""

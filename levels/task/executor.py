@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from backplane.message import Message, MessageType, State
-from levels.level import Executor, Input, LevelContext, Ports, Reading
-from levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
-from levels.operator import OPERATOR_COMMAND, Commands, Goal, What
-from levels.orders import BELOW_LOST, HELD_FROM_ABOVE, Orders
-from levels.params import read_params
-from levels.task.detour import Detour
-from levels.task.params import TaskParams
-from levels.task.program import read_program
-from levels.task.window import ShownWindow
+from rack.backplane.message import Message, MessageType, State
+from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
+from rack.levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
+from rack.levels.operator import OPERATOR_COMMAND, Commands, Goal, What
+from rack.levels.orders import BELOW_LOST, HELD_FROM_ABOVE, Orders
+from rack.levels.params import read_params
+from rack.levels.task.detour import Detour
+from rack.levels.task.params import TaskParams
+from rack.levels.task.program import read_program
+from rack.levels.task.window import ShownWindow
 
 ROUNDING_S = 1e-9
 """Ticks times the clock's period are not exact: a time just reached is not late."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from levels.errors import LevelError
-from levels.level import LevelContext
-from levels.messages import SEGMENTS, WINDOW
-from levels.planning.move import Move
-from levels.task.params import TaskParams
+from rack.levels.errors import LevelError
+from rack.levels.level import LevelContext
+from rack.levels.messages import SEGMENTS, WINDOW
+from rack.levels.planning.move import Move
+from rack.levels.task.params import TaskParams
 
 
 class Rehearsed(NamedTuple):

@@ -7,16 +7,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from backplane.message import Message, MessageType
-from levels.cell import build_cell
-from levels.errors import Refused
-from levels.level import Input, LevelContext, Planner, Ports
-from levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
-from levels.params import read_params
-from levels.planning.situation import Situation
-from levels.task.finish import Rehearsed, cycles_of, finish_times
-from levels.task.params import TaskParams
-from levels.task.program import read_program
+from rack.backplane.message import Message, MessageType
+from rack.levels.cell import build_cell
+from rack.levels.errors import Refused
+from rack.levels.level import Input, LevelContext, Planner, Ports
+from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
+from rack.levels.params import read_params
+from rack.levels.planning.situation import Situation
+from rack.levels.task.finish import Rehearsed, cycles_of, finish_times
+from rack.levels.task.params import TaskParams
+from rack.levels.task.program import read_program
 
 AT_REST_M_S = 0.01
 """An object slower than this lies still: its place can be planned with."""
@@ -40,7 +40,7 @@ class TaskPlanner(Planner):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         # OMPL takes time and memory to import: the process of a planner pays, no other.
-        from levels.planning.motion import MotionPlanner
+        from rack.levels.planning.motion import MotionPlanner
 
         self._program = read_program(context.task, context.robot, context.scene)
         self._needs = read_params(TaskParams, context.params)
@@ -93,8 +93,8 @@ class TaskPlanner(Planner):
         return read.made.is_there or 0 < since <= tick < since + self._slice
 
     def _decompose(self, read: Ports, write: Message, tick: int) -> None:
-        from levels.task.actions import rehearse
-        from levels.task.rehearsal import Rehearsal
+        from rack.levels.task.actions import rehearse
+        from rack.levels.task.rehearsal import Rehearsal
 
         world = read.world.value
         situation = Situation(np.array(world.position), np.array(world.quaternion))

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from levels.errors import ProgramError
-from levels.robot import Finite, Positive, RobotConfig, Table
-from levels.scene import SceneConfig
+from rack.levels.errors import ProgramError
+from rack.levels.robot import Finite, Positive, RobotConfig, Table
+from rack.levels.scene import SceneConfig
 
 Vector = tuple[Finite, Finite, Finite]
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.messages import Verb
-from levels.planning.motion import MotionPlanner
-from levels.planning.move import Move
-from levels.planning.pose import Pose
-from levels.planning.situation import Situation
-from levels.task.finish import Rehearsed
+from rack.levels.messages import Verb
+from rack.levels.planning.motion import MotionPlanner
+from rack.levels.planning.move import Move
+from rack.levels.planning.pose import Pose
+from rack.levels.planning.situation import Situation
+from rack.levels.task.finish import Rehearsed
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from backplane.message import Message
-from levels.messages import WINDOW, Verb
-from levels.planning.move import Move
+from rack.backplane.message import Message
+from rack.levels.messages import WINDOW, Verb
+from rack.levels.planning.move import Move
 
 JUMP = 2
 """From the newest id shown to the next, where the level below must start anew: behind its own by more than one."""

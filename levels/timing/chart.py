@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from levels.timing.tasks import Unit
+from rack.levels.timing.tasks import Unit
 
 
 @dataclass(frozen=True)

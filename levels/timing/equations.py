@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from math import floor
 from statistics import pstdev
 
-from levels.timing.relation import Relation
+from rack.levels.timing.relation import Relation
 
 SMALL_SHARE = 0.1
 """Part of a cycle that counts as much smaller than the cycle (eq. 3.10)."""

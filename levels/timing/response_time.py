@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from math import lcm
 
-from levels.timing.tasks import TimedTask
+from rack.levels.timing.tasks import TimedTask
 
 Load = tuple[int, int, int]
 """What a task asks of its core: cost C of a job, period T, release jitter J."""

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from levels.timing.chart import Chart, Job, Span
-from levels.timing.tasks import Part, TimedTask, Unit
+from rack.levels.timing.chart import Chart, Job, Span
+from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
 """Parts of a task that are not the same in every cycle, by task: those of its cycles in turn."""

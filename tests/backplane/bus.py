@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
-from backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec
-from backplane.message import Field, MessageType
-from backplane.segment import Segment
-from boards.config.fields import field_specs
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from rack.backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec
+from rack.backplane.message import Field, MessageType
+from rack.backplane.segment import Segment
+from rack.boards.config.fields import field_specs
 
 CLOCK_NS = 2_500_000
 NAME = "writer.point"

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from backplane import semaphores
-from backplane.layout import MailboxSpec, TaskSpec
-from backplane.segment import SHM_FOLDER, Segment, unlink
+from rack.backplane import semaphores
+from rack.backplane.layout import MailboxSpec, TaskSpec
+from rack.backplane.segment import SHM_FOLDER, Segment, unlink
 from tests.backplane.bus import layout
 
 MakeBus = Callable[..., Segment]

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from backplane.address_map import (
+from rack.backplane.address_map import (
     ALARM_SIZE,
     BLOCK_SIZE,
     FAULT_ENTRIES,
@@ -20,8 +20,8 @@ from backplane.address_map import (
     operator_entry_size,
     trace_size,
 )
-from backplane.layout import Layout, TaskSpec, depth_for
-from backplane.words import Block, Head, System
+from rack.backplane.layout import Layout, TaskSpec, depth_for
+from rack.backplane.words import Block, Head, System
 from tests.backplane.bus import layout, mailbox, task
 
 PLANNER = TaskSpec("writer.planner", "writer", "planner", 2, 0, 0, 8, 4, 64)

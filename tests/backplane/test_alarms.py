@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from backplane.address_map import ALARM_DEPTH
-from backplane.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
+from rack.backplane.address_map import ALARM_DEPTH
+from rack.backplane.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
 from tests.backplane.conftest import MakeBus
 
 

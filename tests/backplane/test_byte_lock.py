@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from backplane.byte_lock import ByteLock
+from rack.backplane.byte_lock import ByteLock
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, descriptors, forked, wait_until
 

@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from backplane.clock import SystemClock, ticks_of
-from backplane.errors import ClockError
-from backplane.words import Run, System
+from rack.backplane.clock import SystemClock, ticks_of
+from rack.backplane.errors import ClockError
+from rack.backplane.words import Run, System
 from tests.backplane.conftest import MakeBus
 
 CLOCK_NS = 2_500_000

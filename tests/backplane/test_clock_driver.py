@@ -8,13 +8,13 @@ from itertools import pairwise
 
 import pytest
 
-from backplane.clock_driver import ClockDriver, Ended
-from backplane.lockstep_driver import LockstepDriver
-from backplane.realtime_driver import RealtimeDriver
-from backplane.released_task import by_priority
-from backplane.segment import Segment
-from backplane.semaphores import wake_semaphore
-from backplane.words import Block, Head, Run, System
+from rack.backplane.clock_driver import ClockDriver, Ended
+from rack.backplane.lockstep_driver import LockstepDriver
+from rack.backplane.realtime_driver import RealtimeDriver
+from rack.backplane.released_task import by_priority
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.words import Block, Head, Run, System
 from tests.backplane.bus import layout, task
 from tests.backplane.conftest import MakeBus
 from tests.processes import in_thread

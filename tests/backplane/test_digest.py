@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from backplane.digest import chains, digest
-from backplane.protocols import open_writer
-from backplane.segment import Segment, unlink
-from backplane.words import System
-from boards.faults.masquerade import masquerade
+from rack.backplane.digest import chains, digest
+from rack.backplane.protocols import open_writer
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import System
+from rack.boards.faults.masquerade import masquerade
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork

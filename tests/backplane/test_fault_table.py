@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from backplane.address_map import FAULT_ENTRIES
-from backplane.errors import FaultTableError
-from backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
-from backplane.words import System
+from rack.backplane.address_map import FAULT_ENTRIES
+from rack.backplane.errors import FaultTableError
+from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
+from rack.backplane.words import System
 from tests.backplane.bus import mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from backplane.errors import EmergencyStopError
-from backplane.lines import UtilityLines
-from backplane.segment import Segment
-from backplane.words import Block, System
+from rack.backplane.errors import EmergencyStopError
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 

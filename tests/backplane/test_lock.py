@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import pytest
 
-from backplane.lock import MailboxLock
-from backplane.mailbox import Verdict
-from backplane.protocols import open_reader, open_writer
-from backplane.segment import Segment
-from backplane.semaphores import lock_semaphore
+from rack.backplane.lock import MailboxLock
+from rack.backplane.mailbox import Verdict
+from rack.backplane.protocols import open_reader, open_writer
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import lock_semaphore
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, descriptors, fork, forked, kill, wait_until

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from backplane.errors import MailboxError
-from backplane.mailbox import Reader, Verdict, Writer
-from backplane.protocols import open_reader, open_writer
-from backplane.segment import Segment
-from backplane.slots import Slots
+from rack.backplane.errors import MailboxError
+from rack.backplane.mailbox import Reader, Verdict, Writer
+from rack.backplane.protocols import open_reader, open_writer
+from rack.backplane.segment import Segment
+from rack.backplane.slots import Slots
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.errors import MailboxError
-from backplane.message import REASON_BYTES, Field, Message, MessageType, State, command, status
+from rack.backplane.errors import MailboxError
+from rack.backplane.message import REASON_BYTES, Field, Message, MessageType, State, command, status
 
 POSE = MessageType("pose", 1, (Field("position", "f8", "m", "", (3,)), Field("valid", "u1", "1", "")))
 TRACK = MessageType(

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from backplane.alarms import Alarm
-from backplane.episodes import CLEAN
-from backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.alarms import Alarm
+from rack.backplane.episodes import CLEAN
+from rack.backplane.layout import PROTOCOLS, Protocol
 from tests.backplane.bus import NAME, message_address
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
 

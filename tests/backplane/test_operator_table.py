@@ -8,10 +8,10 @@ from contextlib import ExitStack
 
 import pytest
 
-from backplane.address_map import OPERATOR_ENTRIES
-from backplane.errors import OperatorTableError
-from backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
-from backplane.segment import Segment
+from rack.backplane.address_map import OPERATOR_ENTRIES
+from rack.backplane.errors import OperatorTableError
+from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
+from rack.backplane.segment import Segment
 from tests.backplane.bus import mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork

@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-import backplane
-from backplane.alarms import Alarm
-from backplane.layout import Protocol
-from backplane.slots import Slots
+import rack.backplane
+from rack.backplane.alarms import Alarm
+from rack.backplane.layout import Protocol
+from rack.backplane.slots import Slots
 from tests.backplane.bus import NAME
 from tests.link import Link, MakeLink, links
 
@@ -25,7 +25,7 @@ DEPTH = 8
 READ_EVERY = 3
 LEAST = 300
 """Instructions at which a reader is overtaken, at least: one that finds nothing new has fewer."""
-CODE = next(iter(backplane.__path__))
+CODE = next(iter(rack.backplane.__path__))
 FAULTS = {
     "": set(),
     "drop": {Alarm.GAP},

@@ -9,13 +9,13 @@ from hashlib import blake2b
 import numpy as np
 import pytest
 
-from backplane.address_map import SLOT_HEAD_SIZE
-from backplane.layout import PROTOCOLS, Protocol
-from backplane.mailbox import Reader, Verdict
-from backplane.protocols import open_observer, open_reader, open_writer
-from backplane.segment import Segment
-from backplane.semaphores import lock_semaphore
-from backplane.slots import CHAIN_AT, CHAIN_FROM, Slots
+from rack.backplane.address_map import SLOT_HEAD_SIZE
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.mailbox import Reader, Verdict
+from rack.backplane.protocols import open_observer, open_reader, open_writer
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import lock_semaphore
+from rack.backplane.slots import CHAIN_AT, CHAIN_FROM, Slots
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until

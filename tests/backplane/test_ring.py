@@ -7,12 +7,12 @@ import os
 import numpy as np
 import pytest
 
-from backplane.mailbox import Writer
-from backplane.protocols import open_writer
-from backplane.ring import Ring, mailbox_ring
-from backplane.segment import Segment
-from backplane.slots import claim
-from boards.faults.masquerade import masquerade
+from rack.backplane.mailbox import Writer
+from rack.backplane.protocols import open_writer
+from rack.backplane.ring import Ring, mailbox_ring
+from rack.backplane.segment import Segment
+from rack.backplane.slots import claim
+from rack.boards.faults.masquerade import masquerade
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork, kill, wait_until

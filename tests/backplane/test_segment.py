@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 import pytest
 
-from backplane.errors import SegmentError
-from backplane.layout import Layout
-from backplane.segment import VERSION, Segment, racks, shm_path, unlink
-from backplane.words import Block, Head, System
+from rack.backplane.errors import SegmentError
+from rack.backplane.layout import Layout
+from rack.backplane.segment import VERSION, Segment, racks, shm_path, unlink
+from rack.backplane.words import Block, Head, System
 from tests.backplane.bus import layout, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, descriptors, exit_status, fork, forked, kill

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from backplane import semaphores
-from backplane.lock import MailboxLock
-from backplane.lockstep_driver import LockstepDriver
-from backplane.segment import SHM_FOLDER, Segment
-from backplane.wake import NextCycle
-from backplane.words import Block
+from rack.backplane import semaphores
+from rack.backplane.lock import MailboxLock
+from rack.backplane.lockstep_driver import LockstepDriver
+from rack.backplane.segment import SHM_FOLDER, Segment
+from rack.backplane.wake import NextCycle
+from rack.backplane.words import Block
 from tests.backplane.bus import NAME, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, forked, wait_until

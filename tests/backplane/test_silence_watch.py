@@ -8,12 +8,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from backplane.alarms import Alarm
-from backplane.layout import PROTOCOLS, Protocol
-from backplane.lock import MailboxLock
-from backplane.process import state_of
-from backplane.trace import Flag
-from backplane.words import Block
+from rack.backplane.alarms import Alarm
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.lock import MailboxLock
+from rack.backplane.process import state_of
+from rack.backplane.trace import Flag
+from rack.backplane.words import Block
 from tests.backplane.bus import NAME
 from tests.link import MakeLink, ReadingTask, WritingTask, links
 from tests.processes import FORKS, forked, kill, wait_until

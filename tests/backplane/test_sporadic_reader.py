@@ -7,13 +7,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from backplane.alarms import Alarm, AlarmWriter, alarm_ring
-from backplane.mailbox import Writer
-from backplane.segment import Segment
-from backplane.silence_watch import Witness
-from backplane.slots import claim
-from backplane.watched_reader import SporadicReader, WatchedReader, watched
-from backplane.words import Slot
+from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.mailbox import Writer
+from rack.backplane.segment import Segment
+from rack.backplane.silence_watch import Witness
+from rack.backplane.slots import claim
+from rack.backplane.watched_reader import SporadicReader, WatchedReader, watched
+from rack.backplane.words import Slot
 from tests.backplane.bus import mailbox, message_address
 from tests.backplane.conftest import MakeBus
 

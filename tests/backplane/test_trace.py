@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from backplane.trace import FIELDS, TraceWriter, trace_ring
+from rack.backplane.trace import FIELDS, TraceWriter, trace_ring
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 

@@ -8,12 +8,12 @@ import time
 
 import pytest
 
-from backplane.alarms import Alarm, AlarmWriter, alarm_ring
-from backplane.process import state_of
-from backplane.released_task import ReleasedTask
-from backplane.segment import Segment
-from backplane.watchdog import BEATS, LEAST_NS, Watchdog
-from backplane.words import Block, TaskState
+from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.process import state_of
+from rack.backplane.released_task import ReleasedTask
+from rack.backplane.segment import Segment
+from rack.backplane.watchdog import BEATS, LEAST_NS, Watchdog
+from rack.backplane.words import Block, TaskState
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, forked, wait_until
 
@@ -100,7 +100,7 @@ def test_a_process_that_gets_no_processor_time_is_never_lost(make_bus: MakeBus) 
 def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("backplane.watchdog.LEAST_NS", 4 * BEATS * PERIOD_NS)
+    monkeypatch.setattr("rack.backplane.watchdog.LEAST_NS", 4 * BEATS * PERIOD_NS)
     watched = Watched(make_bus(), os.getpid())
     watched.release(True)
     rung = [watched.release(False) for _ in range(5 * BEATS)]

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from backplane.segment import SHM_FOLDER
-from boards.config import load
-from boards.config.schema import RackConfig
+from rack.backplane.segment import SHM_FOLDER
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
 from tests.processes import named, wait_until
 
 CLOCK = f"""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from wave_levels import Watch
 
-from backplane.message import Field, State, status
-from boards.faults.kinds import KINDS
-from levels.level import Executor, LevelContext, Ports
+from rack.backplane.message import Field, State, status
+from rack.boards.faults.kinds import KINDS
+from rack.levels.level import Executor, LevelContext, Ports
 
 PLACE = status("place", 1, Field("position", "f8", "rad", "where it is"), Field("mode", "i2", "1", "how it moves"))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from boards.config.schema import RackConfig
+from rack.boards.config.schema import RackConfig
 from tests.boards.conftest import PLANNED, MakeConfig
 
 DRIVEN = f"""{PLANNED}

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 
-from boards.rack import Rack
+from rack.boards.rack import Rack
 
 
 def main(config: str, *settings: str) -> None:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backplane.ring import mailbox_ring
-from backplane.segment import Segment
-from backplane.trace import Flag, trace_ring
+from rack.backplane.ring import mailbox_ring
+from rack.backplane.segment import Segment
+from rack.backplane.trace import Flag, trace_ring
 
 WHAT = ("serial", "tick", "visible_at", "basis", "chain")
 

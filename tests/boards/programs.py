@@ -22,7 +22,7 @@ class Program:
     def __init__(self, config: Path, *settings: str) -> None:
         self._process = subprocess.Popen(
             [sys.executable, str(HERE / "launcher.py"), str(config), *settings],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

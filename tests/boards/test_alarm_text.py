@@ -8,17 +8,17 @@ from functools import partial
 
 import pytest
 
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm, AlarmWriter, alarm_ring
-from backplane.fault_table import FaultTable
-from backplane.segment import Segment, unlink
-from backplane.words import Demand
-from boards.alarm_text import MISSES, event_of
-from boards.config import load, wire
-from boards.config.cell import geom_name
-from boards.events import Event
-from boards.faults.request import injections
-from levels.cell import build_cell
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.fault_table import FaultTable
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Demand
+from rack.boards.alarm_text import MISSES, event_of
+from rack.boards.config import load, wire
+from rack.boards.config.cell import geom_name
+from rack.boards.events import Event
+from rack.boards.faults.request import injections
+from rack.levels.cell import build_cell
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 

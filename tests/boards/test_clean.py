@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from backplane import semaphores
-from backplane.byte_lock import ByteLock
-from backplane.errors import SegmentError
-from backplane.layout import Layout
-from backplane.segment import SHM_FOLDER, VERSION, Segment, racks, shm_path, unlink
-from backplane.words import Head, System
-from boards.clean import clean, remove_dead, remove_own
+from rack.backplane import semaphores
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import SegmentError
+from rack.backplane.layout import Layout
+from rack.backplane.segment import SHM_FOLDER, VERSION, Segment, racks, shm_path, unlink
+from rack.backplane.words import Head, System
+from rack.boards.clean import clean, remove_dead, remove_own
 from tests.backplane.bus import layout, mailbox
 from tests.processes import FORKS, descriptors, exit_status, fork, kill, wait_until
 

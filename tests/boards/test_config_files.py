@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from boards.config import CONFIGS, load, loads, names
-from boards.errors import ConfigError
+from rack.boards.config import CONFIGS, load, loads, names
+from rack.boards.errors import ConfigError
 
 Write = Callable[[str, str], Path]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from boards.config import load, wire
-from boards.errors import ConfigError
+from rack.boards.config import load, wire
+from rack.boards.errors import ConfigError
 
 Write = Callable[[str, str], Path]
 

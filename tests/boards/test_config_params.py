@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from boards.config import load, names, wire
-from boards.errors import ConfigError
+from rack.boards.config import load, names, wire
+from rack.boards.errors import ConfigError
 
 MISTAKES = {
     "unknown": ("fig2", "level.params.proces_ms=1", "= 1: unknown key; did you mean 'process_ms'?"),

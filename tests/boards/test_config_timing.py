@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from boards.config import budgets, load, loads, timed_tasks, wire
-from boards.config.timing import with_budgets
-from boards.errors import ConfigError
-from levels.timing.budget import Budget
-from levels.timing.tasks import Unit
+from rack.boards.config import budgets, load, loads, timed_tasks, wire
+from rack.boards.config.timing import with_budgets
+from rack.boards.errors import ConfigError
+from rack.levels.timing.budget import Budget
+from rack.levels.timing.tasks import Unit
 
 MEASURED = Budget(read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11)
 WITHIN = "board.lower.budget={ process_ms = 1.5, plan_ms = 3, plan_within_ms = 20 }"

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from backplane.layout import depth_for
-from backplane.slots import message_dtype
-from boards.config import context, load, shared_out, task_ports, wire
-from boards.config.cores import obtained_core
-from boards.config.fields import field_specs
-from levels.messages import TASK_COMMAND, TASK_PLAN
+from rack.backplane.layout import depth_for
+from rack.backplane.slots import message_dtype
+from rack.boards.config import context, load, shared_out, task_ports, wire
+from rack.boards.config.cores import obtained_core
+from rack.boards.config.fields import field_specs
+from rack.levels.messages import TASK_COMMAND, TASK_PLAN
 
 SIZES = {"joints": 6, "bodies": 3, "state": 120}
 

@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from backplane.words import Block
-from boards.rack import Rack
+from rack.backplane.words import Block
+from rack.boards.rack import Rack
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
 from tests.machine import needs_fifo

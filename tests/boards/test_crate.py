@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from boards.channel import Channel
-from boards.crate_line import CrateLine
-from boards.crate_messages import Preload
-from boards.errors import LaunchError
+from rack.boards.channel import Channel
+from rack.boards.crate_line import CrateLine
+from rack.boards.crate_messages import Preload
+from rack.boards.errors import LaunchError
 from tests.processes import descriptors, runs, wait_until
 
 PATH = (*sys.path, str(Path(__file__).parent))

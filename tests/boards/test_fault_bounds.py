@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from backplane.layout import Layout
-from boards.config import wire
-from boards.faults.bounds import BOUNDS, READ, bound_ticks, cycle_ticks
-from boards.faults.kinds import KINDS, NUMBERS
-from boards.faults.request import injections
+from rack.backplane.layout import Layout
+from rack.boards.config import wire
+from rack.boards.faults.bounds import BOUNDS, READ, bound_ticks, cycle_ticks
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.boards.faults.request import injections
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from backplane.address_map import FAULT_ENTRIES
-from boards.config import load, wire
-from boards.errors import ConfigError, Mistake
-from boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
-from boards.faults.request import injections
+from rack.backplane.address_map import FAULT_ENTRIES
+from rack.boards.config import load, wire
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
+from rack.boards.faults.request import injections
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import LOCKED, TARGETS, inline, rack
 

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
-from backplane.message import State
-from backplane.segment import Segment, unlink
-from boards.config import wire
-from boards.errors import ConfigError
-from boards.faults.config import FaultConfig
-from boards.faults.kinds import NUMBERS
-from boards.faults.request import injection, injections
-from boards.faults.text import describe, document
+from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
+from rack.backplane.message import State
+from rack.backplane.segment import Segment, unlink
+from rack.boards.config import wire
+from rack.boards.errors import ConfigError
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kinds import NUMBERS
+from rack.boards.faults.request import injection, injections
+from rack.boards.faults.text import describe, document
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
@@ -83,7 +83,7 @@ def test_a_condition_is_a_number_or_the_name_of_one(config: MakeConfig, value: s
 
 
 def test_verbs_of_elemental_moves_have_names() -> None:
-    from boards.config import load
+    from rack.boards.config import load
 
     setting = 'fault=[{ kind = "kill", board = "servo", when = "elemental_move.status.verb == grasp" }]'
     config = load("nasrem", [setting])

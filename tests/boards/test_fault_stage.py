@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 import time
 
-from backplane.fault_table import Entry, FaultTable, Injection, Stage
-from backplane.lockstep_driver import LockstepDriver
-from backplane.semaphores import clock_semaphore
-from backplane.wake import NextCycle
-from backplane.words import Block, System
-from boards.faults.kinds import NUMBERS
-from boards.faults.stage import FaultStage
-from boards.faults.strikes import Strikes
+from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.lockstep_driver import LockstepDriver
+from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.wake import NextCycle
+from rack.backplane.words import Block, System
+from rack.boards.faults.kinds import NUMBERS
+from rack.boards.faults.stage import FaultStage
+from rack.boards.faults.strikes import Strikes
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.processes import BOUND_S

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from backplane.address_map import CLOCK
-from backplane.process import state_of
-from backplane.segment import Segment, unlink
-from backplane.words import Block, Run, System
-from boards import heartbeat
-from boards.heartbeat import LOCKSTEP_S, Heartbeat
+from rack.backplane.address_map import CLOCK
+from rack.backplane.process import state_of
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block, Run, System
+from rack.boards import heartbeat
+from rack.boards.heartbeat import LOCKSTEP_S, Heartbeat
 from tests.backplane.bus import layout, task
 from tests.processes import FORKS, forked, wait_until
 

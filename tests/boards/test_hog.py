@@ -6,11 +6,11 @@ import time
 
 import pytest
 
-from backplane.fault_table import FaultTable, Injection
-from backplane.process import processor_ns
-from backplane.words import Block, Run, System
-from boards.faults.hog import run_hog
-from boards.faults.kinds import NUMBERS
+from rack.backplane.fault_table import FaultTable, Injection
+from rack.backplane.process import processor_ns
+from rack.backplane.words import Block, Run, System
+from rack.boards.faults.hog import run_hog
+from rack.boards.faults.kinds import NUMBERS
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.machine import needs_fifo

@@ -7,12 +7,12 @@ import signal
 
 import pytest
 
-from backplane.lines import UtilityLines
-from backplane.segment import racks
-from backplane.words import Block, TaskState
-from boards.errors import ConfigError, LaunchError
-from boards.events import Event
-from boards.rack import Rack
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import racks
+from rack.backplane.words import Block, TaskState
+from rack.boards.errors import ConfigError, LaunchError
+from rack.boards.events import Event
+from rack.boards.rack import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import children_of, descriptors, wait_until
 
@@ -49,7 +49,7 @@ def test_a_board_that_leaves_without_a_word_is_no_ready_board(config: MakeConfig
 
 
 def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("boards.rack.LAUNCH_S", 1.0)
+    monkeypatch.setattr("rack.boards.rack.LAUNCH_S", 1.0)
     settings = ("board.watch.executor=wave_levels:Endless",)
     assert refusal(Rack(config(*settings))) == "boards watch: not ready within 1 s"
 
@@ -57,7 +57,7 @@ def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: p
 def test_a_crate_killed_during_the_launch_is_told(config: MakeConfig) -> None:
     def kill_crate(event: Event) -> None:
         if event.kind == "launch":
-            crates = [pid for pid in children_of(os.getpid()) if b"boards.crate" in command_of(pid)]
+            crates = [pid for pid in children_of(os.getpid()) if b"rack.boards.crate" in command_of(pid)]
             for pid in crates:
                 os.kill(pid, signal.SIGKILL)
 

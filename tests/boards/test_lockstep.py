@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.layout import PROTOCOLS, Protocol
-from backplane.trace import Flag
-from backplane.words import Block, System
-from boards.rack import Rack
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.trace import Flag
+from rack.backplane.words import Block, System
+from rack.boards.rack import Rack
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from backplane.layout import PROTOCOLS
-from backplane.words import Block
-from boards.config.schema import RackConfig
-from boards.events import Event
-from boards.faults.config import FaultConfig
-from boards.faults.kinds import KINDS, NUMBERS
-from boards.outcome import Outcome
-from boards.rack import Rack
+from rack.backplane.layout import PROTOCOLS
+from rack.backplane.words import Block
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Event
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.boards.outcome import Outcome
+from rack.boards.rack import Rack
 from tests.boards.conftest import LOOSE, MakeConfig
 
 KINDS_OF_WRITERS = ("mute", "drop", "delay", "reorder", "corrupt", "babble", "masquerade")

@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from boards.config.schema import RackConfig
-from boards.errors import ConfigError
-from boards.rack import Rack
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError
+from rack.boards.rack import Rack
 from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
 from tests.machine import needs_fifo, needs_two_cores
+from tests.processes import RACK
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 60
@@ -33,7 +33,7 @@ executor = "wave_levels:Wave"
 @pytest.fixture
 def first(config: MakeConfig, rack_name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rack]:
     """A rack whose wave holds core 0; no other test's racks are seen."""
-    monkeypatch.setattr("boards.neighbours.racks", lambda: [rack_name])
+    monkeypatch.setattr("rack.boards.neighbours.racks", lambda: [rack_name])
     with Rack(config(*FIFO, "board.wave.core=0", text=PLAIN)) as rack:
         yield rack
 
@@ -80,7 +80,14 @@ def test_a_board_that_names_no_core_gets_another(config: MakeConfig, first: Rack
 def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_path: Path, policy: str) -> None:
     path = tmp_path / "config.toml"
     path.write_text(config(*FIFO, f"clock.on_no_realtime={policy}", text=PLAIN).text())
-    command = ["setpriv", "--bounding-set", "-sys_nice", "--inh-caps", "-sys_nice", sys.executable, "-m", "tools.cli"]
+    command = [
+        "setpriv",
+        "--bounding-set",
+        "-sys_nice",
+        "--inh-caps",
+        "-sys_nice",
+        *RACK,
+    ]
     words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
     done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
     told = done.stderr if policy == "refuse" else done.stdout

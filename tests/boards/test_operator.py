@@ -8,20 +8,20 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from backplane.mailbox import Reading
-from backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
-from backplane.protocols import open_observer
-from backplane.ring import mailbox_ring
-from backplane.words import Run, System
-from boards.config import load, wire
-from boards.config.schema import RackConfig
-from boards.errors import ConfigError
-from boards.events import Event
-from boards.faults.config import FaultConfig
-from boards.operating.text import message_of
-from boards.outcome import Outcome
-from boards.rack import Rack
-from levels.operator import Answer, Goal, What
+from rack.backplane.mailbox import Reading
+from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
+from rack.backplane.protocols import open_observer
+from rack.backplane.ring import mailbox_ring
+from rack.backplane.words import Run, System
+from rack.boards.config import load, wire
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError
+from rack.boards.events import Event
+from rack.boards.faults.config import FaultConfig
+from rack.boards.operating.text import message_of
+from rack.boards.outcome import Outcome
+from rack.boards.rack import Rack
+from rack.levels.operator import Answer, Goal, What
 from tests.boards.conftest import MakeConfig
 from tests.boards.told_racks import TOLD, commands
 from tests.processes import FORKS, forked, kill, wait_until

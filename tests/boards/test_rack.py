@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from backplane.errors import SegmentError
-from backplane.lines import UtilityLines
-from backplane.segment import Segment, racks, shm_path
-from backplane.words import Block, Run, System, TaskState
-from boards.events import Event
-from boards.outcome import Outcome
-from boards.rack import Rack
+from rack.backplane.errors import SegmentError
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment, racks, shm_path
+from rack.backplane.words import Block, Run, System, TaskState
+from rack.boards.events import Event
+from rack.boards.outcome import Outcome
+from rack.boards.rack import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import descriptors
 

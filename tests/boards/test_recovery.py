@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from backplane.alarms import Alarm, AlarmWriter, alarm_ring
-from backplane.words import Block, System
-from boards.config.schema import RackConfig
-from boards.events import Event
-from boards.faults.config import FaultConfig
-from boards.outcome import Outcome
-from boards.rack import Rack
+from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.words import Block, System
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Event
+from rack.boards.faults.config import FaultConfig
+from rack.boards.outcome import Outcome
+from rack.boards.rack import Rack
 from tests.boards.conftest import LOOSE, NEVER, MakeConfig
 from tests.boards.messages import Written
 

@@ -10,20 +10,20 @@ from dataclasses import replace
 
 import pytest
 
-from backplane import semaphores
-from backplane.errors import MailboxError
-from backplane.lock import MailboxLock
-from backplane.protocols import open_writer
-from backplane.segment import Segment, unlink
-from backplane.slots import Slots
-from backplane.trace import Flag, trace_ring
-from backplane.words import Block, System
-from boards.config.classes import find_class
-from boards.executor_task import ExecutorTask
-from boards.launch import Launch
-from boards.planner_task import PlannerTask
-from boards.processor import die_with_parent, set_priority, take_processor
-from levels.level import Executor, Planner
+from rack.backplane import semaphores
+from rack.backplane.errors import MailboxError
+from rack.backplane.lock import MailboxLock
+from rack.backplane.protocols import open_writer
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.slots import Slots
+from rack.backplane.trace import Flag, trace_ring
+from rack.backplane.words import Block, System
+from rack.boards.config.classes import find_class
+from rack.boards.executor_task import ExecutorTask
+from rack.boards.launch import Launch
+from rack.boards.planner_task import PlannerTask
+from rack.boards.processor import die_with_parent, set_priority, take_processor
+from rack.levels.level import Executor, Planner
 from tests.backplane.bus import task as task_spec
 from tests.boards.conftest import MakeConfig
 from tests.processes import FORKS, exit_status, fork, runs, wait_until

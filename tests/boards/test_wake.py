@@ -6,9 +6,9 @@ import os
 
 import pytest
 
-from backplane.layout import PROTOCOLS, Protocol
-from backplane.words import Block
-from boards.rack import Rack
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.words import Block
+from rack.boards.rack import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.boards.messages import Written
 

@@ -8,14 +8,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from backplane.alarms import Alarm
-from backplane.fault_table import Entry, FaultTable, Injection
-from backplane.layout import PROTOCOLS, Protocol
-from backplane.mailbox import Verdict
-from backplane.process import state_of
-from boards.faults.bounds import bound_ticks
-from boards.faults.kinds import KINDS, NUMBERS
-from boards.faults.masquerade import masquerade
+from rack.backplane.alarms import Alarm
+from rack.backplane.fault_table import Entry, FaultTable, Injection
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.mailbox import Verdict
+from rack.backplane.process import state_of
+from rack.boards.faults.bounds import bound_ticks
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.boards.faults.masquerade import masquerade
 from tests.backplane.bus import NAME
 from tests.link import Link, MakeLink, WritingTask, links, struck
 from tests.processes import FORKS, exit_status, fork, forked, wait_until

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from backplane.message import Field, Message, State, command, status
-from levels.level import Executor, Input, Ports
-from levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, What
-from levels.orders import Orders
+from rack.backplane.message import Field, Message, State, command, status
+from rack.levels.level import Executor, Input, Ports
+from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, What
+from rack.levels.orders import Orders
 
 STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: do not go on"))
 COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that were not held"))

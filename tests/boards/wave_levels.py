@@ -10,10 +10,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from backplane.message import Field, Message, MessageType, State, status
-from levels.errors import LevelError
-from levels.level import Executor, Input, LevelContext, Planner, Ports
-from levels.messages import TASK_STATUS
+from rack.backplane.message import Field, Message, MessageType, State, status
+from rack.levels.errors import LevelError
+from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
+from rack.levels.messages import TASK_STATUS
 
 WAVE = status("wave", 1, Field("value", "f8", "1", "height of the wave"))
 GAIN = MessageType("gain", 1, (Field("gain", "f8", "1", "factor"), Field("made_at", "i8", "tick", "release")))

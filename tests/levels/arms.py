@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from levels.cell import Cell, build_cell
-from levels.robot import GripperConfig, RobotConfig
-from levels.scene import SceneConfig
+from rack.levels.cell import Cell, build_cell
+from rack.levels.robot import GripperConfig, RobotConfig
+from rack.levels.scene import SceneConfig
 
 CLOCK_NS = 2_500_000
 ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"

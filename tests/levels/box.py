@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
 
-from backplane.message import Message, MessageType
+from rack.backplane.message import Message, MessageType
 
 SILENT_CYCLES = 4
 """Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the one it waits."""

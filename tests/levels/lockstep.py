@@ -11,13 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from backplane.mailbox import Reading, Verdict
-from backplane.message import Message, MessageType
-from levels.cell import build_cell, sizes
-from levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
-from levels.operator import OPERATOR_COMMAND
-from levels.robot import RobotConfig
-from levels.scene import SceneConfig
+from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.message import Message, MessageType
+from rack.levels.cell import build_cell, sizes
+from rack.levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
+from rack.levels.operator import OPERATOR_COMMAND
+from rack.levels.robot import RobotConfig
+from rack.levels.scene import SceneConfig
 from tests.levels.box import Box, Disturbance
 
 CLOCK_NS = 2_500_000

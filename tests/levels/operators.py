@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from backplane.message import Message
-from levels.operator import Goal, What
+from rack.backplane.message import Message
+from rack.levels.operator import Goal, What
 from tests.levels.lockstep import Lockstep
 
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from levels.messages import MOVE_COMMAND, SegmentKind
-from levels.primitive import PrimitiveExecutor, PrimitivePlanner
-from levels.scene import MotionConfig
-from levels.servo import ServoExecutor, ServoPlanner
-from levels.world import WorldModel
+from rack.levels.messages import MOVE_COMMAND, SegmentKind
+from rack.levels.primitive import PrimitiveExecutor, PrimitivePlanner
+from rack.levels.scene import MotionConfig
+from rack.levels.servo import ServoExecutor, ServoPlanner
+from rack.levels.world import WorldModel
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
 

@@ -8,13 +8,13 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
-from backplane.message import Message
-from levels.level import Fault, Finding
-from levels.messages import JOINT_SET_POINT
-from levels.robot import RobotConfig
-from levels.scene import SceneConfig
-from levels.servo import ServoExecutor, ServoPlanner
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.levels.level import Fault, Finding
+from rack.levels.messages import JOINT_SET_POINT
+from rack.levels.robot import RobotConfig
+from rack.levels.scene import SceneConfig
+from rack.levels.servo import ServoExecutor, ServoPlanner
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from levels.dynamics import Dynamics
-from levels.level import Finding
-from levels.limits import PRESSING
-from levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
+from rack.levels.dynamics import Dynamics
+from rack.levels.level import Finding
+from rack.levels.limits import PRESSING
+from rack.levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
 from tests.levels.arms import cell
 from tests.levels.servo_rig import TICK_S
 

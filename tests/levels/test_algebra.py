@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from levels import algebra
+from rack.levels import algebra
 
 LEVELS = Path(algebra.__file__).parent
 RNG = np.random.default_rng(3)

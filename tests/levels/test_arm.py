@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.arm import SimulatedArm
-from levels.arm.motion import ObstacleMotion
-from levels.arm.simulated import PATIENCE_CYCLES
-from levels.cell import Cell, sizes
-from levels.dynamics import Dynamics
-from levels.messages import ARM_STATE, SCENE
-from levels.scene import MotionConfig, SceneConfig
+from rack.backplane.message import Message
+from rack.levels.arm import SimulatedArm
+from rack.levels.arm.motion import ObstacleMotion
+from rack.levels.arm.simulated import PATIENCE_CYCLES
+from rack.levels.cell import Cell, sizes
+from rack.levels.dynamics import Dynamics
+from rack.levels.messages import ARM_STATE, SCENE
+from rack.levels.scene import MotionConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
 
 Array = NDArray[np.float64]

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
-from backplane.message import Message
-from levels.arm import SimulatedArm
-from levels.cell import Cell, sizes
-from levels.dynamics import Dynamics
-from levels.messages import ARM_STATE
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.levels.arm import SimulatedArm
+from rack.levels.cell import Cell, sizes
+from rack.levels.dynamics import Dynamics
+from rack.levels.messages import ARM_STATE
 from tests.levels.arms import CLOCK_NS, cell, config
 
 Array = NDArray[np.float64]

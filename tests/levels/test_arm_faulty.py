@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from backplane.alarms import Alarm
-from levels.arm import FaultyLink, SimulatedArm
-from levels.cell import Cell
-from levels.dynamics import Dynamics
-from levels.level import Fault
+from rack.backplane.alarms import Alarm
+from rack.levels.arm import FaultyLink, SimulatedArm
+from rack.levels.cell import Cell
+from rack.levels.dynamics import Dynamics
+from rack.levels.level import Fault
 from tests.levels.arms import CLOCK_NS, cell, config
 
 

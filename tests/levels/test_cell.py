@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from levels.cell import Cell, build_cell, sizes
-from levels.errors import RobotError
-from levels.robot import GripperConfig, RobotConfig
-from levels.scene import SceneConfig
+from rack.levels.cell import Cell, build_cell, sizes
+from rack.levels.errors import RobotError
+from rack.levels.robot import GripperConfig, RobotConfig
+from rack.levels.scene import SceneConfig
 from tests.levels.arms import BLOCK, CLOCK_NS, MOTORS, cell, config, pendulum
 
 EMPTY = SceneConfig()

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from levels.cell import Cell, build_cell
-from levels.dynamics import Dynamics, Payload
-from levels.scene import SceneConfig
+from rack.levels.cell import Cell, build_cell
+from rack.levels.dynamics import Dynamics, Payload
+from rack.levels.scene import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
 
 DATA = Path(__file__).parent / "data"

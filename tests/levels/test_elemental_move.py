@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.message import State
-from levels.messages import Error
-from levels.scene import MotionConfig
+from rack.backplane.message import State
+from rack.levels.messages import Error
+from rack.levels.scene import MotionConfig
 from tests.levels.whole_rack import WholeRack
 
 TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.message import Message, State
-from levels.elemental_move import ElementalMoveExecutor
-from levels.messages import MOVE_PLAN, PRIMITIVE_STATUS, TASK_COMMAND, Error, SegmentKind, Verb
-from levels.orders import ABOVE_LOST, BELOW_LOST
+from rack.backplane.message import Message, State
+from rack.levels.elemental_move import ElementalMoveExecutor
+from rack.levels.messages import MOVE_PLAN, PRIMITIVE_STATUS, TASK_COMMAND, Error, SegmentKind, Verb
+from rack.levels.orders import ABOVE_LOST, BELOW_LOST
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
 

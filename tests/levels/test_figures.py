@@ -8,12 +8,12 @@ from typing import Any, cast
 
 import pytest
 
-from backplane.mailbox import Reading, Verdict
-from backplane.message import Message, State
-from levels.errors import LevelError
-from levels.figures import FigureExecutor, FigurePlanner
-from levels.figures.messages import FIGURE_PLAN, FIGURE_STATUS
-from levels.level import LevelContext, Ports
+from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.message import Message, State
+from rack.levels.errors import LevelError
+from rack.levels.figures import FigureExecutor, FigurePlanner
+from rack.levels.figures.messages import FIGURE_PLAN, FIGURE_STATUS
+from rack.levels.level import LevelContext, Ports
 
 MS = 1_000_000
 

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from backplane.message import State
-from levels.cell import Cell, build_cell
-from levels.errors import RobotError
+from rack.backplane.message import State
+from rack.levels.cell import Cell, build_cell
+from rack.levels.errors import RobotError
 from tests.levels.arms import CLOCK_NS, cell, four_bar
 from tests.levels.whole_rack import WholeRack
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from levels.planning.ik import LIMIT_MARGIN_RAD, InverseKinematics
-from levels.planning.line import STRAY_M, straight_line
-from levels.planning.pose import Pose, pointing, pose
-from levels.planning.reach import lever_arms, sampling_range
-from levels.primitive.path import BlendedPath
+from rack.levels.planning.ik import LIMIT_MARGIN_RAD, InverseKinematics
+from rack.levels.planning.line import STRAY_M, straight_line
+from rack.levels.planning.pose import Pose, pointing, pose
+from rack.levels.planning.reach import lever_arms, sampling_range
+from rack.levels.primitive.path import BlendedPath
 from tests.levels.arms import cell
 
 SEED = 7

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from backplane.message import State
-from levels.messages import Verb
-from levels.operator import Answer, Goal, What
+from rack.backplane.message import State
+from rack.levels.messages import Verb
+from rack.levels.operator import Answer, Goal, What
 from tests.levels.operators import Operator
 from tests.levels.whole_rack import WholeRack
 

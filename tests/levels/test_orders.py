@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.mailbox import Reading, Verdict
-from backplane.message import Message, status
-from levels.operator import ANSWER, OPERATOR_COMMAND, Answer, Goal, What
-from levels.orders import Orders, joints_of
+from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.message import Message, status
+from rack.levels.operator import ANSWER, OPERATOR_COMMAND, Answer, Goal, What
+from rack.levels.orders import Orders, joints_of
 
 TAKES = {What.HOLD: (), What.RESUME: (), What.GOTO: (Goal.JOINTS, Goal.HOME)}
 STATUS = status("told", 1, *ANSWER)

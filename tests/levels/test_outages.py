@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.message import State
-from levels.messages import Verb
+from rack.backplane.message import State
+from rack.levels.messages import Verb
 from tests.levels.box import Disturbance
 from tests.levels.disturbances import SwapPairs, hold_back, lose_some, mute
 from tests.levels.lockstep import CLOCK_NS

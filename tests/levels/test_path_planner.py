@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from levels.cell import Cell
-from levels.messages import WAYPOINTS
-from levels.planning.collision import CollisionChecker
-from levels.planning.ik import InverseKinematics
-from levels.planning.path import Path
-from levels.planning.path_planner import PathPlanner
-from levels.planning.pose import pointing, pose
-from levels.primitive.path import BlendedPath
+from rack.levels.cell import Cell
+from rack.levels.messages import WAYPOINTS
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.path import Path
+from rack.levels.planning.path_planner import PathPlanner
+from rack.levels.planning.pose import pointing, pose
+from rack.levels.primitive.path import BlendedPath
 from tests.levels.arms import cell, config
 
 SEED = 3

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from levels.cell import Cell, build_cell
-from levels.errors import Refused
-from levels.messages import Error, Verb
-from levels.planning.motion import MotionPlanner
-from levels.planning.move import Move
-from levels.planning.payload import Payloads
-from levels.planning.pose import Pose, pose
-from levels.planning.situation import Situation
-from levels.task import read_program
-from levels.task.actions import rehearse
-from levels.task.grasps import grasps
-from levels.task.rehearsal import Rehearsal
+from rack.levels.cell import Cell, build_cell
+from rack.levels.errors import Refused
+from rack.levels.messages import Error, Verb
+from rack.levels.planning.motion import MotionPlanner
+from rack.levels.planning.move import Move
+from rack.levels.planning.payload import Payloads
+from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.situation import Situation
+from rack.levels.task import read_program
+from rack.levels.task.actions import rehearse
+from rack.levels.task.grasps import grasps
+from rack.levels.task.rehearsal import Rehearsal
 from tests.levels.arms import CLOCK_NS, cell, config, four_bar
 
 ROBOT, SCENE = config("puma560")

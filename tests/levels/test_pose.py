@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
+from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 
 
 def random_pose(rng: np.random.Generator) -> Pose:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.message import State
-from levels.messages import Error
+from rack.backplane.message import State
+from rack.levels.messages import Error
 from tests.levels.arms import cell
 from tests.levels.primitive_rack import PrimitiveRack, gripper, path
 

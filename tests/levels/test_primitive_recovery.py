@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.message import State
-from levels.level import Demand
-from levels.messages import Error
-from levels.primitive.path import BlendedPath
-from levels.primitive.path_motion import PathMotion
-from levels.primitive.speed import BrakingLimits
+from rack.backplane.message import State
+from rack.levels.level import Demand
+from rack.levels.messages import Error
+from rack.levels.primitive.path import BlendedPath
+from rack.levels.primitive.path_motion import PathMotion
+from rack.levels.primitive.speed import BrakingLimits
 from tests.levels.disturbances import Shown, mute
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive_rack import PrimitiveRack, gripper, path

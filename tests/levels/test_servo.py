@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.message import State
-from levels.dynamics import Dynamics
-from levels.errors import LevelError
-from levels.messages import Error
-from levels.scene import SceneConfig
+from rack.backplane.message import State
+from rack.levels.dynamics import Dynamics
+from rack.levels.errors import LevelError
+from rack.levels.messages import Error
+from rack.levels.scene import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config, pendulum
 from tests.levels.servo_rig import PERIOD, TICK_S, Course, ServoRig
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
-from backplane.message import State
-from levels.messages import Error
-from levels.scene import MotionConfig
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import State
+from rack.levels.messages import Error
+from rack.levels.scene import MotionConfig
 from tests.levels.arms import config
 from tests.levels.servo_rig import ServoRig
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.alarms import Alarm
-from levels.level import Demand
+from rack.backplane.alarms import Alarm
+from rack.levels.level import Demand
 from tests.levels.arms import config
 from tests.levels.servo_rig import TICK_S, Course, ServoRig
 

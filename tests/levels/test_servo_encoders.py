@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backplane.alarms import Alarm
-from backplane.message import State
-from levels.arm import SimulatedArm
-from levels.cell import build_cell
-from levels.errors import RobotError
-from levels.messages import Error
-from levels.robot import RobotConfig, SensorConfig
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import State
+from rack.levels.arm import SimulatedArm
+from rack.levels.cell import build_cell
+from rack.levels.errors import RobotError
+from rack.levels.messages import Error
+from rack.levels.robot import RobotConfig, SensorConfig
 from tests.levels.arms import CLOCK_NS, config, pendulum
 from tests.levels.servo_rig import Course, ServoRig
 from tests.levels.whole_rack import WholeRack

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.alarms import Alarm
-from backplane.message import State
-from boards.config import load
-from levels.level import Finding
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import State
+from rack.boards.config import load
+from rack.levels.level import Finding
 from tests.levels.whole_rack import WholeRack
 
 BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.words import Demand
-from levels.operator import Answer, What
+from rack.backplane.words import Demand
+from rack.levels.operator import Answer, What
 from tests.levels.arms import cell, config
 from tests.levels.operators import Operator
 from tests.levels.servo_rig import TICK_S, Course, ServoRig

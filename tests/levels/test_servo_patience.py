@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.alarms import Alarm
-from backplane.message import State
-from backplane.words import Demand
-from levels.level import Fault
-from levels.messages import Error
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import State
+from rack.backplane.words import Demand
+from rack.levels.level import Fault
+from rack.levels.messages import Error
 from tests.levels.arms import config
 from tests.levels.servo_rig import ServoRig
 from tests.levels.whole_rack import WholeRack

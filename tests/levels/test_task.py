@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from backplane.message import REASON_BYTES, Message, State
-from levels.errors import Refused
-from levels.messages import MOVE_STATUS, TASK_PLAN, WINDOW, Error, Verb
-from levels.planning.motion import MotionPlanner
-from levels.planning.pose import Pose
-from levels.planning.situation import Situation
-from levels.task import TaskExecutor, read_program
-from levels.task.actions import rehearse
-from levels.task.finish import Cycles, Rehearsed, finish_times
-from levels.task.params import TaskParams
-from levels.task.rehearsal import Rehearsal
+from rack.backplane.message import REASON_BYTES, Message, State
+from rack.levels.errors import Refused
+from rack.levels.messages import MOVE_STATUS, TASK_PLAN, WINDOW, Error, Verb
+from rack.levels.planning.motion import MotionPlanner
+from rack.levels.planning.pose import Pose
+from rack.levels.planning.situation import Situation
+from rack.levels.task import TaskExecutor, read_program
+from rack.levels.task.actions import rehearse
+from rack.levels.task.finish import Cycles, Rehearsed, finish_times
+from rack.levels.task.params import TaskParams
+from rack.levels.task.rehearsal import Rehearsal
 from tests.levels.arms import cell, config
 from tests.levels.disturbances import lose_some
 from tests.levels.lockstep import BoardSpec, Lockstep

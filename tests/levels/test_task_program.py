@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from levels.errors import ProgramError
-from levels.task.program import Goto, Home, TaskConfig, Transfer, read_program
+from rack.levels.errors import ProgramError
+from rack.levels.task.program import Goto, Home, TaskConfig, Transfer, read_program
 from tests.levels.arms import ROBOTS, config
 
 PUMA, SCENE = config("puma560")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from levels.messages import SECTIONS, WAYPOINTS
-from levels.primitive.path import BlendedPath
-from levels.primitive.speed import SpeedLimits, boundary_speeds, braking_limits, reachable_speed, speed_limits
-from levels.primitive.stop import make_stop
-from levels.primitive.trajectory import Motion, Trajectory, duration, make_trajectory
+from rack.levels.messages import SECTIONS, WAYPOINTS
+from rack.levels.primitive.path import BlendedPath
+from rack.levels.primitive.speed import SpeedLimits, boundary_speeds, braking_limits, reachable_speed, speed_limits
+from rack.levels.primitive.stop import make_stop
+from rack.levels.primitive.trajectory import Motion, Trajectory, duration, make_trajectory
 from tests.levels.arms import cell
 
 EXACT = 1e-6

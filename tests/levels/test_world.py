@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backplane.message import Message
-from levels.messages import SCENE
-from levels.world import WorldModel
+from rack.backplane.message import Message
+from rack.levels.messages import SCENE
+from rack.levels.world import WorldModel
 from tests.levels.arms import config
 from tests.levels.disturbances import lose_some
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
-from backplane.message import Message, State
-from boards.config import RackConfig, load
-from levels.robot import RobotConfig
-from levels.scene import MotionConfig, SceneConfig
+from rack.backplane.message import Message, State
+from rack.boards.config import RackConfig, load
+from rack.levels.robot import RobotConfig
+from rack.levels.scene import MotionConfig, SceneConfig
 from tests.levels.arms import config as arm_config
 from tests.levels.lockstep import BoardSpec, Lockstep
 

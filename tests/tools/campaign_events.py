@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from backplane.fault_table import Injection
-from backplane.layout import Layout, MailboxSpec, TaskSpec
-from boards.events import Event, EventKind
-from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.ending import Strike
-from tools.campaign.plan import EXTERNAL
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.boards.events import Event, EventKind
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.tools.campaign.ending import Strike
+from rack.tools.campaign.plan import EXTERNAL
 
 TICK_NS = 2_500_000
 TASKS = (

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from boards.config import load
-from tools.charting.measured import Run
-from tools.charting.panel import Panel
-from tools.display import SilentDisplay
-from tools.recording import Recording
-from tools.running import run_rack
+from rack.boards.config import load
+from rack.tools.charting.measured import Run
+from rack.tools.charting.panel import Panel
+from rack.tools.display import SilentDisplay
+from rack.tools.recording import Recording
+from rack.tools.running import run_rack
 
 SLOWER = 4
 """Times of these runs as multiples of the figures': what boards take for themselves, on a slow machine too, is little

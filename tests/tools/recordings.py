@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from backplane.trace import RECORD
-from boards.config import RackConfig, wire
-from boards.config.timing import tick_ns
-from tools.recorder.cycles import CyclesFile
-from tools.recorder.signals import SignalsFile
-from tools.recording import Recording
+from rack.backplane.trace import RECORD
+from rack.boards.config import RackConfig, wire
+from rack.boards.config.timing import tick_ns
+from rack.tools.recorder.cycles import CyclesFile
+from rack.tools.recorder.signals import SignalsFile
+from rack.tools.recording import Recording
 
 MS = 1_000_000
 

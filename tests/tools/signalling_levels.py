@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
-from levels.level import Ports
+from rack.levels.level import Ports
 from tests.processes import parent_of
 from tests.two_levels import Upper
 
@@ -21,7 +21,7 @@ def send(moment: str) -> None:
             os.kill(here(), int(number))
 
 
-send("crate" if "boards.crate" in sys.argv[0] or sys.argv[0].endswith("crate.py") else "config")
+send("crate" if "rack.boards.crate" in sys.argv[0] or sys.argv[0].endswith("crate.py") else "config")
 
 
 class Signalling(Upper):

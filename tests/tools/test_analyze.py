@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from boards.config import load
+from rack.boards.config import load
+from rack.tools.analysis.analysis import Analysis
+from rack.tools.analysis.document import document
+from rack.tools.analysis.text import text
+from rack.tools.display import SilentDisplay
+from rack.tools.running import run_rack
+from tests.processes import RACK
 from tests.tools.recordings import MS, Cycle, recorded
-from tools.analysis.analysis import Analysis
-from tools.analysis.document import document
-from tools.analysis.text import text
-from tools.display import SilentDisplay
-from tools.running import run_rack
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 30
@@ -28,7 +28,7 @@ USUAL = ["--percentile", "50"]
 
 
 def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", *map(str, arguments)]
+    command = [*RACK, *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 

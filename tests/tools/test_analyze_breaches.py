@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from backplane.trace import SKIPPED_SHIFT, Flag
-from boards.config import RackConfig, load
+from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.boards.config import RackConfig, load
+from rack.tools.analysis.breaches import Breach, breaches
+from rack.tools.analysis.company import BEFORE
+from rack.tools.analysis.cycles import cycles_of
+from rack.tools.analysis.model import Model
 from tests.tools.recordings import MS, Cycle, recorded
-from tools.analysis.breaches import Breach, breaches
-from tools.analysis.company import BEFORE
-from tools.analysis.cycles import cycles_of
-from tools.analysis.model import Model
 
 PLANNED, MISSED, SKIPPED = int(Flag.PLANNED), int(Flag.MISSED), int(Flag.SKIPPED)
 SETTLED = 40

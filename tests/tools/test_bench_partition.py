@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from boards.config import load, loads
-from boards.errors import ConfigError
+from rack.boards.config import load, loads
+from rack.boards.errors import ConfigError
+from rack.tools.answer import Failure
+from rack.tools.bench.partition import compare, lines_of
+from rack.tools.bench.partitions import PARTITIONS, Partition
+from rack.tools.progress import Silent
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores
-from tools.answer import Failure
-from tools.bench.partition import compare, lines_of
-from tools.bench.partitions import PARTITIONS, Partition
-from tools.progress import Silent
 
 
 def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backplane.segment import SHM_FOLDER
+from rack.backplane.segment import SHM_FOLDER
+from rack.tools.answer import Failure
+from rack.tools.bench.switch import PAPER_US, WAKES, cost_of, measure
 from tests.machine import needs_fifo, needs_two_cores
-from tools.answer import Failure
-from tools.bench.switch import PAPER_US, WAKES, cost_of, measure
 
 
 def test_what_a_gap_is_longer_than_the_executor_was_awake_are_two_switches() -> None:

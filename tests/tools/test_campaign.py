@@ -7,22 +7,21 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from backplane.segment import SHM_FOLDER
-from boards.processor import name_process
-from tests.processes import FORKS, forked, runs, wait_until
-from tools.campaign.leftovers import children, left_behind
-from tools.campaign.load import load
+from rack.backplane.segment import SHM_FOLDER
+from rack.boards.processor import name_process
+from rack.tools.campaign.leftovers import children, left_behind
+from rack.tools.campaign.load import load
+from tests.processes import FORKS, RACK, forked, runs, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 50
-COMMAND = [sys.executable, "-m", "tools.cli", "campaign"]
+COMMAND = [*RACK, "campaign"]
 
 
 def campaign(config: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -150,7 +149,7 @@ def test_a_file_left_in_shared_memory_is_noticed(rack_name: str) -> None:
 
 @pytest.mark.filterwarnings(FORKS)
 def test_a_process_left_behind_is_noticed_whoever_its_parent_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tools.campaign.leftovers.BOUND_S", 0.05)
+    monkeypatch.setattr("rack.tools.campaign.leftovers.BOUND_S", 0.05)
     rack = f"p{os.getpid()}x"
 
     def board() -> None:

@@ -11,17 +11,17 @@ from typing import Any
 
 import pytest
 
-from boards.config import load, wire
-from boards.config.schema import RackConfig
-from boards.faults.config import FaultConfig
-from boards.faults.consequences import recovery_ticks
-from boards.faults.kinds import KINDS, NUMBERS
-from boards.faults.request import cycle_ticks, injections
-from tools.answer import Failure
-from tools.campaign.draw import EPISODE, MOST, Course, fault_plans, kill_plans, needs_real_time, size_plans
-from tools.campaign.plan import EXTERNAL, Kill, Plan
-from tools.campaign.shape import SIZED, swept_sizes
-from tools.campaign.targets import Targets, kinds_for
+from rack.boards.config import load, wire
+from rack.boards.config.schema import RackConfig
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.consequences import recovery_ticks
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.boards.faults.request import cycle_ticks, injections
+from rack.tools.answer import Failure
+from rack.tools.campaign.draw import EPISODE, MOST, Course, fault_plans, kill_plans, needs_real_time, size_plans
+from rack.tools.campaign.plan import EXTERNAL, Kill, Plan
+from rack.tools.campaign.shape import SIZED, swept_sizes
+from rack.tools.campaign.targets import Targets, kinds_for
 
 BOTH = (True, False)
 COUNT = 10

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from boards.config import load
-from levels.arm.limit_monitor import LimitMonitor
-from tools.answer import Failure
-from tools.campaign.instruments import examine
+from rack.boards.config import load
+from rack.levels.arm.limit_monitor import LimitMonitor
+from rack.tools.answer import Failure
+from rack.tools.campaign.instruments import examine
 
 
 def test_a_counter_of_violations_that_counts_passes() -> None:

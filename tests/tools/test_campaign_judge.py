@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from boards.events import Event
+from rack.boards.events import Event
+from rack.tools.campaign.ending import Strike
+from rack.tools.campaign.judge import Circumstances, Judgement, Verdict, judge
+from rack.tools.campaign.plan import EXTERNAL
 from tests.tools.campaign_events import LAYOUT, TICK_NS, event, found, strike
-from tools.campaign.ending import Strike
-from tools.campaign.judge import Circumstances, Judgement, Verdict, judge
-from tools.campaign.plan import EXTERNAL
 
 END = event(10_000, "end", "")
 

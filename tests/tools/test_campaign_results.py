@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from boards.events import Event
-from boards.outcome import Cause, Outcome
+from rack.boards.events import Event
+from rack.boards.outcome import Cause, Outcome
+from rack.tools.campaign.ending import Arm, Strike
+from rack.tools.campaign.plan import Plan
+from rack.tools.campaign.results import Faultless, Judged, Results, keep, kept, misses_of
+from rack.tools.campaign.trial import Trial
 from tests.tools.campaign_events import LAYOUT, event, found, strike
-from tools.campaign.ending import Arm, Strike
-from tools.campaign.plan import Plan
-from tools.campaign.results import Faultless, Judged, Results, keep, kept, misses_of
-from tools.campaign.trial import Trial
 
 FAULT = strike("mute", "lower", 100, 150)
 SEEN = found(105, "mute", "upper", "lower.status")

@@ -20,10 +20,10 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from boards.config import CONFIGS, load, names
-from boards.config.text import to_toml
-from tools.answer import LONGEST_LINE
-from tools.cli import run_commands
+from rack.boards.config import CONFIGS, load, names
+from rack.boards.config.text import to_toml
+from rack.tools.answer import LONGEST_LINE
+from rack.tools.cli import run_commands
 
 EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "300"))
 BOUND_S = 20

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 
 import pytest
 
+from tests.processes import RACK
 from tests.tools.test_commands import BOUND_S, ROOT, rack
 
 LONG = "a" * 5000
@@ -64,7 +64,7 @@ def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
 
 
 def test_bytes_that_are_no_text_are_refused() -> None:
-    command = [sys.executable, "-m", "tools.cli", "check", b"\xff"]
+    command = [*RACK, "check", b"\xff"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
     assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": is no UTF-8\n')
 
@@ -74,7 +74,7 @@ def test_bytes_that_are_no_text_are_refused() -> None:
 )
 def test_the_shell_completes_commands_and_configs(words: str, found: str) -> None:
     asked = {"_RACK_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
-    command = [sys.executable, "-m", "tools.cli"]
+    command = list(RACK)
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | asked, capture_output=True, text=True, timeout=BOUND_S, check=False
     )

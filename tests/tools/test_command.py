@@ -6,31 +6,30 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from backplane.operator_table import OperatorTable
-from backplane.segment import Segment
-from boards.config import load
-from boards.rack import Rack
+from rack.backplane.operator_table import OperatorTable
+from rack.backplane.segment import Segment
+from rack.boards.config import load
+from rack.boards.rack import Rack
+from rack.tools.answer import Failure
+from rack.tools.commanding import patience
+from rack.tools.commanding.answers import Answers
+from rack.tools.commanding.goals import goal_of
+from rack.tools.commanding.live import LiveDesk
 from tests.boards.told_racks import TOLD
-from tests.processes import wait_until
-from tools.answer import Failure
-from tools.commanding import patience
-from tools.commanding.answers import Answers
-from tools.commanding.goals import goal_of
-from tools.commanding.live import LiveDesk
+from tests.processes import RACK, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 50
 
 
 def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", *map(str, arguments)]
+    command = [*RACK, *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 
@@ -38,7 +37,7 @@ def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
     """Start a rack that runs until it is stopped; return when it does."""
     path.write_text(TOLD)
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
-    command = [sys.executable, "-m", "tools.cli", "run", str(path), "--no-record", *given]
+    command = [*RACK, "run", str(path), "--no-record", *given]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     for line in process.stdout:
@@ -147,7 +146,7 @@ def test_a_rack_that_is_not_there_is_one_line() -> None:
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(running: str, end: signal.Signals) -> None:
     table = OperatorTable(Segment.attach(running))
-    command = [sys.executable, "-m", "tools.cli", "command", running, "upper", "hold", "--tick", str(10**9)]
+    command = [*RACK, "command", running, "upper", "hold", "--tick", str(10**9)]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     wait_until(table.waiting)
     process.send_signal(end)
@@ -161,7 +160,7 @@ def test_a_rack_that_ends_meanwhile_is_told(tmp_path: Path) -> None:
     process = start(tmp_path / "told.toml", name, "clock.mode=realtime")
     try:
         table = OperatorTable(Segment.attach(name))
-        command = [sys.executable, "-m", "tools.cli", "command", name, "upper", "hold", "--tick", str(10**9)]
+        command = [*RACK, "command", name, "upper", "hold", "--tick", str(10**9)]
         waiting = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
         wait_until(table.waiting)
         rack("stop", name)

@@ -13,21 +13,22 @@ from pathlib import Path
 
 import pytest
 
-from backplane.segment import racks
+from rack.backplane.segment import racks
+from tests.processes import RACK
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 30
 
 
 def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", *map(str, arguments)]
+    command = [*RACK, *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 
 @contextmanager
 def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A rack in real time without an end, past its first cycles."""
-    command = [sys.executable, "-m", "tools.cli", "run", str(small), "--set", "clock.mode=realtime"]
+    command = [*RACK, "run", str(small), "--set", "clock.mode=realtime"]
     process = subprocess.Popen(
         [*command, "--set", f"name={name}", *arguments],
         cwd=ROOT,
@@ -135,9 +136,7 @@ def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], 
 
 
 def test_a_recorder_can_join_a_run(running: subprocess.Popen[str], rack_name: str, tmp_path: Path) -> None:
-    recorder = subprocess.Popen(
-        [sys.executable, "-m", "tools.cli", "record", rack_name, "--out", str(tmp_path / "joined")], cwd=ROOT
-    )
+    recorder = subprocess.Popen([*RACK, "record", rack_name, "--out", str(tmp_path / "joined")], cwd=ROOT)
     deadline = time.monotonic() + BOUND_S
     while not (tmp_path / "joined" / "signals.parquet").exists() and time.monotonic() < deadline:
         time.sleep(0.02)

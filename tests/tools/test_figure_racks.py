@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from backplane.trace import Flag
-from boards.config import budgets, load, wire
-from levels.timing.tasks import Unit
+from rack.backplane.trace import Flag
+from rack.boards.config import budgets, load, wire
+from rack.levels.timing.tasks import Unit
+from rack.tools.charting.measured import Run
+from rack.tools.charting.panel import Panel
+from rack.tools.charting.scheduled import Schedule
+from rack.tools.timing.verdicts import verdicts
 from tests.machine import needs_fifo, needs_two_cores
 from tests.tools.figure_runs import SLOWER, run, slowed, undisturbed, usual, whole
-from tools.charting.measured import Run
-from tools.charting.panel import Panel
-from tools.charting.scheduled import Schedule
-from tools.timing.verdicts import verdicts
 
 pytestmark = [needs_fifo, needs_two_cores, pytest.mark.alone, pytest.mark.timeout(300)]
 FIGURES = ("fig2", "fig3", "fig4", "fig4-overload")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 
-from boards.config import load
+from rack.boards.config import load
+from tests.processes import RACK
 from tests.tools.traces import cycle, recorded
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,7 +18,7 @@ BOUND_S = 50
 
 
 def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", "gantt", *map(str, arguments)]
+    command = [*RACK, "gantt", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from boards.config import load
-from levels.timing.chart import Chart
+from rack.boards.config import load
+from rack.levels.timing.chart import Chart
+from rack.tools.answer import Failure
+from rack.tools.charting.measured import Run
 from tests.tools.traces import EPOCH_NS, cycle, recorded
-from tools.answer import Failure
-from tools.charting.measured import Run
 
 TICK_US = 2000
 """A tick of the figures' clock; a cycle of fig2 has four."""
@@ -114,7 +114,7 @@ def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
     run = fig2(folder, rows, plans)
     at_once = run.panel(0, 1, lambda part: None)
     parts: list[float] = []
-    monkeypatch.setattr("tools.charting.measured.BLOCK_NS", 1)
+    monkeypatch.setattr("rack.tools.charting.measured.BLOCK_NS", 1)
     in_blocks = run.panel(0, 1, parts.append)
     assert len(parts) > 10
     assert parts[-1] == 1.0
@@ -126,7 +126,7 @@ def test_a_trace_without_the_newer_columns_is_refused(folder: Path) -> None:
     fig2(folder, [executor(0, 0, 0, 0, 0, 100)], [])
     table = pq.read_table(folder / "cycles.parquet").drop_columns(["plan_ns"])
     pq.write_table(table.replace_schema_metadata({"lost": "{}"}), folder / "cycles.parquet")
-    from tools.recording import Recording
+    from rack.tools.recording import Recording
 
     with pytest.raises(Failure, match="earlier rack, its trace has no plan_ns"):
         Run(Recording(folder))

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from levels.timing.chart import Chart, Job, Span
-from levels.timing.schedule import simulate
-from levels.timing.tasks import Part, TimedTask, Unit
-from tools.charting.lanes import Lane, lanes_of
-from tools.charting.patterns import Detail, Patterns, patterns
+from rack.levels.timing.chart import Chart, Job, Span
+from rack.levels.timing.schedule import simulate
+from rack.levels.timing.tasks import Part, TimedTask, Unit
+from rack.tools.charting.lanes import Lane, lanes_of
+from rack.tools.charting.patterns import Detail, Patterns, patterns
 
 
 def task(name: str, text: str, every: int, cycles: int = 1, core: int = 1, priority: int = 80) -> TimedTask:

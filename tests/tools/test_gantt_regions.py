@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from boards.config import load
-from tools.charting.regions import document, lines, placed, region_of
+from rack.boards.config import load
+from rack.tools.charting.regions import document, lines, placed, region_of
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from tools.charting.stretches import union, without
+from rack.tools.charting.stretches import union, without
 
 
 def test_a_union_is_in_order_and_has_no_overlaps() -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from levels.timing.tasks import TimedTask
-from tools.answer import Failure
-from tools.charting.window import Wanted, times_of, wanted
+from rack.levels.timing.tasks import TimedTask
+from rack.tools.answer import Failure
+from rack.tools.charting.window import Wanted, times_of, wanted
 
 MS = 1_000_000
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from backplane.lines import UtilityLines
-from backplane.message import State
-from backplane.protocols import open_writer
-from backplane.segment import Segment, unlink
-from backplane.words import Block, Run, System
-from boards.config import load, wire
-from levels.operator import Answer, Goal, What
+from rack.backplane.lines import UtilityLines
+from rack.backplane.message import State
+from rack.backplane.protocols import open_writer
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block, Run, System
+from rack.boards.config import load, wire
+from rack.levels.operator import Answer, Goal, What
+from rack.tools.holds import STILL_S, Holds, Standstill
 from tests.boards.told_racks import TOLD
-from tools.holds import STILL_S, Holds, Standstill
 
 TICK_S = 0.0025
 

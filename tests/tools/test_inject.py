@@ -5,25 +5,24 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from backplane.fault_table import Entry, FaultTable, Stage
-from backplane.lines import UtilityLines
-from backplane.segment import Segment
-from backplane.words import Demand, System
-from boards.config import load
-from boards.errors import ConfigError
-from boards.faults.kinds import KINDS
-from boards.rack import Rack
+from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment
+from rack.backplane.words import Demand, System
+from rack.boards.config import load
+from rack.boards.errors import ConfigError
+from rack.boards.faults.kinds import KINDS
+from rack.boards.rack import Rack
+from rack.tools.answer import Failure
+from rack.tools.injecting import live
+from rack.tools.injecting.live import LiveRack
 from tests.boards.fault_racks import DRIVEN
-from tests.processes import wait_until
-from tools.answer import Failure
-from tools.injecting import live
-from tools.injecting.live import LiveRack
+from tests.processes import RACK, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 50
@@ -31,7 +30,7 @@ TASKS = "wave, wave.planner, watch, driven, clock"
 
 
 def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", *map(str, arguments)]
+    command = [*RACK, *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 
@@ -40,7 +39,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The name of a rack in real time that runs until it is stopped."""
     path, name = tmp_path_factory.mktemp("rack") / "waves.toml", f"test-inject-{os.getpid()}"
     path.write_text(DRIVEN)
-    command = [sys.executable, "-m", "tools.cli", "run", str(path), "--no-record", "--set", "clock.mode=realtime"]
+    command = [*RACK, "run", str(path), "--no-record", "--set", "clock.mode=realtime"]
     # A machine that is busy must not use the restarts up.
     settings = ["--set", f"name={name}", "--set", "supervision.restarts=1000"]
     process = subprocess.Popen([*command, *settings], cwd=ROOT, stdout=subprocess.PIPE, text=True)

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from backplane.segment import SHM_FOLDER
-from tests.processes import BOUND_S, children_of, named, wait_until
+from rack.backplane.segment import SHM_FOLDER
+from tests.processes import BOUND_S, RACK, children_of, named, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
@@ -30,7 +30,16 @@ class Run:
         self.name, self.folder = name, folder
         seconds = () if moment == "cycle" else ("--seconds", "0.5")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tools.cli", "run", str(small), "--set", f"name={name}", "--out", folder, *seconds],
+            [
+                *RACK,
+                "run",
+                str(small),
+                "--set",
+                f"name={name}",
+                "--out",
+                folder,
+                *seconds,
+            ],
             cwd=ROOT,
             env={**os.environ, "MOMENT": moment, "SIGNALS": " ".join(str(int(number)) for number in numbers)},
             stdout=subprocess.PIPE,
@@ -115,7 +124,7 @@ def test_a_terminal_that_is_gone_ends_a_run_in_order(small: Path, rack_name: str
     if pid == 0:
         words = ["run", str(small), "--set", f"name={rack_name}", "--set", "clock.mode=realtime"]
         os.chdir(ROOT)
-        os.execv(sys.executable, [sys.executable, "-m", "tools.cli", *words, "--out", str(tmp_path / "run")])
+        os.execv(sys.executable, [*RACK, *words, "--out", str(tmp_path / "run")])
     log = tmp_path / "run" / "events.jsonl"
     while not (log.is_file() and '"start"' in log.read_text()):
         os.read(terminal, 1 << 16)

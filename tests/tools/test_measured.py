@@ -8,17 +8,17 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from backplane.trace import Flag
-from boards.config import RackConfig, load
-from levels.timing.budget import Budget
+from rack.backplane.trace import Flag
+from rack.boards.config import RackConfig, load
+from rack.levels.timing.budget import Budget
+from rack.tools.analysis.cycles import cycles_of
+from rack.tools.analysis.occupation import Occupation
+from rack.tools.answer import Failure
+from rack.tools.display import SilentDisplay
+from rack.tools.recording import Recording
+from rack.tools.running import run_rack
+from rack.tools.timing.measured import measured_budgets
 from tests.tools.recordings import MS, Cycle, recorded
-from tools.analysis.cycles import cycles_of
-from tools.analysis.occupation import Occupation
-from tools.answer import Failure
-from tools.display import SilentDisplay
-from tools.recording import Recording
-from tools.running import run_rack
-from tools.timing.measured import measured_budgets
 
 PLANNED = int(Flag.PLANNED)
 SETTLED = 40

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from boards.config import load
-from boards.rack import Rack
-from tools.answer import Failure
-from tools.recording import Recording
-from tools.replay import replay
-from tools.viewer.reading import read
-from tools.viewer.window import Window
+from rack.boards.config import load
+from rack.boards.rack import Rack
+from rack.tools.answer import Failure
+from rack.tools.recording import Recording
+from rack.tools.replay import replay
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.window import Window
+from tests.processes import RACK
 
 ROOT = Path(__file__).resolve().parents[2]
 WATCHDOG_S = 50.0
@@ -26,7 +26,14 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
     config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
     with Rack(config) as rack:
         rack.start()
-        command = [sys.executable, "-m", "tools.cli", "record", rack_name, "--out", str(tmp_path / "run"), "--json"]
+        command = [
+            *RACK,
+            "record",
+            rack_name,
+            "--out",
+            str(tmp_path / "run"),
+            "--json",
+        ]
         with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
             deadline = time.monotonic() + WATCHDOG_S
             while not (tmp_path / "run" / "run.rrd").is_file() and time.monotonic() < deadline:

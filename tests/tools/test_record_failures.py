@@ -13,23 +13,23 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from boards.config import RackConfig, load
-from boards.events import Event
-from boards.rack import Rack
+from rack.boards.config import RackConfig, load
+from rack.boards.events import Event
+from rack.boards.rack import Rack
+from rack.tools.answer import Failure
+from rack.tools.display import SilentDisplay
+from rack.tools.recorder import process
+from rack.tools.recorder.files import mend
+from rack.tools.recorder.recorder import Recorder
+from rack.tools.recorder.side_sink import SideSink
+from rack.tools.recorder.spool import NAME
+from rack.tools.recording import Recording
+from rack.tools.reporting.report import write_report
+from rack.tools.running import LATE, run_rack
+from rack.tools.snapshot import Snapshot
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.window import executable
 from tests.processes import children_of
-from tools.answer import Failure
-from tools.display import SilentDisplay
-from tools.recorder import process
-from tools.recorder.files import mend
-from tools.recorder.recorder import Recorder
-from tools.recorder.side_sink import SideSink
-from tools.recorder.spool import NAME
-from tools.recording import Recording
-from tools.reporting.report import write_report
-from tools.running import LATE, run_rack
-from tools.snapshot import Snapshot
-from tools.viewer.reading import read
-from tools.viewer.window import executable
 
 WATCHDOG_S = 30.0
 FIRST_BLOCK = 400
@@ -133,7 +133,7 @@ class AtTick(SilentDisplay):
     def show(self, snapshot: Snapshot) -> None:
         """Look at the tick."""
         if snapshot.tick > self._tick and not self.struck:
-            self.struck = [pid for pid in children_of(os.getpid()) if b"tools.recorder" in command_of(pid)]
+            self.struck = [pid for pid in children_of(os.getpid()) if b"rack.tools.recorder" in command_of(pid)]
             os.kill(self.struck[0], self._number)
 
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backplane.layout import MailboxSpec
-from backplane.message import Field, MessageType
-from boards.config import load
-from boards.config.fields import field_specs
-from tools.answer import Failure
-from tools.display import SilentDisplay
-from tools.recorder.columns import columns_of
-from tools.recording import Recording
-from tools.running import RunResult, run_rack
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.message import Field, MessageType
+from rack.boards.config import load
+from rack.boards.config.fields import field_specs
+from rack.tools.answer import Failure
+from rack.tools.display import SilentDisplay
+from rack.tools.recorder.columns import columns_of
+from rack.tools.recording import Recording
+from rack.tools.running import RunResult, run_rack
 
 SECONDS = 4.0
 TICKS = 1600

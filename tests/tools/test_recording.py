@@ -11,15 +11,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from boards.config import load
+from rack.boards.config import load
+from rack.tools.analysis.analysis import Analysis
+from rack.tools.answer import Failure
+from rack.tools.charting.subject import subject_of
+from rack.tools.display import SilentDisplay
+from rack.tools.recording import Recording
+from rack.tools.reporting.report import write_report
+from rack.tools.running import run_rack
 from tests.conftest import SMALL
-from tools.analysis.analysis import Analysis
-from tools.answer import Failure
-from tools.charting.subject import subject_of
-from tools.display import SilentDisplay
-from tools.recording import Recording
-from tools.reporting.report import write_report
-from tools.running import run_rack
 
 READERS: tuple[Callable[[Path], object], ...] = (
     write_report,

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from backplane.layout import TaskSpec
-from backplane.trace import RECORD
-from boards.config import load, loads
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import RECORD
+from rack.boards.config import load, loads
+from rack.tools.display import SilentDisplay
+from rack.tools.recording import Recording
+from rack.tools.reporting.markdown import markdown, show
+from rack.tools.reporting.report import report_of, write_report
+from rack.tools.reporting.response import system_response
+from rack.tools.reporting.timing import plan_age_ms, task_times
+from rack.tools.running import run_rack
+from rack.tools.timing.prediction import response_ticks
 from tests.boards.told_racks import TOLD, commands
 from tests.conftest import SMALL
-from tools.display import SilentDisplay
-from tools.recording import Recording
-from tools.reporting.markdown import markdown, show
-from tools.reporting.report import report_of, write_report
-from tools.reporting.response import system_response
-from tools.reporting.timing import plan_age_ms, task_times
-from tools.running import run_rack
-from tools.timing.prediction import response_ticks
 
 TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
 MS = 1_000_000

@@ -11,21 +11,21 @@ from random import Random
 import numpy as np
 import pytest
 
-from boards.config import load, wire
-from boards.config.schema import RackConfig
-from boards.operating.config import CommandConfig
+from rack.boards.config import load, wire
+from rack.boards.config.schema import RackConfig
+from rack.boards.operating.config import CommandConfig
+from rack.tools.answer import Failure
+from rack.tools.bench.response import Bench
+from rack.tools.progress import Silent
+from rack.tools.recording import Recording
+from rack.tools.responding.course import Course, courses
+from rack.tools.responding.plot import plot
+from rack.tools.responding.response import Response, response_of
+from rack.tools.responding.schedule import RUN_S, draw
+from rack.tools.responding.shown import show
+from rack.tools.responding.trial import run
+from rack.tools.responding.twin import candidates, compare, first_difference
 from tests.boards.told_racks import TOLD
-from tools.answer import Failure
-from tools.bench.response import Bench
-from tools.progress import Silent
-from tools.recording import Recording
-from tools.responding.course import Course, courses
-from tools.responding.plot import plot
-from tools.responding.response import Response, response_of
-from tools.responding.schedule import RUN_S, draw
-from tools.responding.shown import show
-from tools.responding.trial import run
-from tools.responding.twin import candidates, compare, first_difference
 
 MakeConfig = Callable[..., RackConfig]
 NASREM = Course(("task", "elemental_move", "primitive", "servo"), (400, 100, 8, 1), 1, True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from backplane.segment import racks
-from boards.config import FAULTS, loads, names
+from rack.backplane.segment import racks
+from rack.boards.config import FAULTS, loads, names
+from tests.processes import RACK
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 50
@@ -18,7 +18,14 @@ HANG = '[[fault]]\nkind = "hang"\nboard = "upper"\nat = 0.5\n'
 
 
 def run(config: Path | str, name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", "run", str(config), "--set", f"name={name}", *map(str, arguments)]
+    command = [
+        *RACK,
+        "run",
+        str(config),
+        "--set",
+        f"name={name}",
+        *map(str, arguments),
+    ]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 

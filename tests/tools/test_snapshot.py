@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from backplane.fault_table import Entry, FaultTable, Stage
-from backplane.protocols import open_writer
-from backplane.segment import Segment, unlink
-from backplane.words import Block, Demand, System
-from boards.config import load, wire
-from boards.faults.request import injections
-from tools.snapshot import TaskRow, Viewer, joint_names
+from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.protocols import open_writer
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block, Demand, System
+from rack.boards.config import load, wire
+from rack.boards.faults.request import injections
+from rack.tools.snapshot import TaskRow, Viewer, joint_names
 
 FAULT = 'fault=[{ kind = "mute", board = "lower" }]'
 

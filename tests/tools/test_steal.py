@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from backplane.trace import Flag
-from boards.config import load
+from rack.backplane.trace import Flag
+from rack.boards.config import load
+from rack.tools.recorder import steal as meter
+from rack.tools.recorder.steal import Stolen
+from rack.tools.reporting.markdown import markdown
+from rack.tools.reporting.report import report_of
 from tests.tools.recordings import MS, Cycle, recorded
-from tools.recorder import steal as meter
-from tools.recorder.steal import Stolen
-from tools.reporting.markdown import markdown
-from tools.reporting.report import report_of
 
 HEAD = "cpu  9 9 9 9 9 9 9 99 0 0\n"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tools.text_table import fitting, table
+from rack.tools.text_table import fitting, table
 
 HEAD = ("task", "count", "what it says of itself")
 ROWS = (("servo", "12", "torque of j3 is NaN, and rejected"), ("elemental_move", "7", "idle"))

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from boards.config import load, loads
-from levels.cell import STATE, Cell, build_cell
-from tools.display import SilentDisplay
-from tools.recording import Recording
-from tools.running import run_rack
-from tools.viewer.pictures import NoViewerError, opened
-from tools.viewer.reading import read
-from tools.viewer.window import executable
+from rack.boards.config import load, loads
+from rack.levels.cell import STATE, Cell, build_cell
+from rack.tools.display import SilentDisplay
+from rack.tools.recording import Recording
+from rack.tools.running import run_rack
+from rack.tools.viewer.pictures import NoViewerError, opened
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.window import executable
 
 SECONDS = 6.5
 """The first way is planned, and some of it gone."""

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import rerun.blueprint as rrb
 
-from backplane.layout import TaskSpec
-from backplane.trace import RECORD, Flag
-from tools.viewer.blocks import Block
-from tools.viewer.misses import Misses
-from tools.viewer.reading import read
-from tools.viewer.stream import Stream
-from tools.viewer.timelines import Timelines
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import RECORD, Flag
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.misses import Misses
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.timelines import Timelines
 
 TICK_NS = 2_500_000
 SPAN = 100

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tools.viewer.pictures import PACKAGES, NoViewerError, _connected
-from tools.viewer.window import Window, free_port
+from rack.tools.viewer.pictures import PACKAGES, NoViewerError, _connected
+from rack.tools.viewer.window import Window, free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 60
@@ -23,7 +23,15 @@ def test_without_a_driver_the_cause_and_what_to_install_are_one_line(
 ) -> None:
     for name, value in NO_DRIVER.items():
         monkeypatch.setenv(name, value)
-    command = [sys.executable, "-m", "tools.viewer.pictures", tmp_path / "run.rrd", tmp_path / "out.png", "--at", "1"]
+    command = [
+        sys.executable,
+        "-m",
+        "rack.tools.viewer.pictures",
+        tmp_path / "run.rrd",
+        tmp_path / "out.png",
+        "--at",
+        "1",
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()

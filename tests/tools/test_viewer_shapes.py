@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from tools.viewer.geometry import moving_bodies
-from tools.viewer.shapes import colour, placed, shape_of
-from tools.viewer.ways import STEP_RAD, in_pieces
+from rack.tools.viewer.geometry import moving_bodies
+from rack.tools.viewer.shapes import colour, placed, shape_of
+from rack.tools.viewer.ways import STEP_RAD, in_pieces
 
 MODEL = """
 <mujoco>

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from boards.events import Event
-from tools.display import PlainDisplay
-from tools.holds import Hold
-from tools.live_table import COLUMNS, line_of, table_of
-from tools.snapshot import Progress, Snapshot, TaskRow
+from rack.boards.events import Event
+from rack.tools.display import PlainDisplay
+from rack.tools.holds import Hold
+from rack.tools.live_table import COLUMNS, line_of, table_of
+from rack.tools.snapshot import Progress, Snapshot, TaskRow
 
 ROW = TaskRow("servo", 2, 1, 80, 400.0, "executing", 1200, 1201, 0, 3, 4, 1, 0.25, None, "")
 PLANNER = replace(ROW, task="servo.planner", priority=0, missed=0, skipped=0, lateness_ms=1.5)

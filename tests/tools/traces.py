@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from backplane.trace import RECORD, SKIPPED_SHIFT, Flag
-from boards.config import RackConfig, wire
-from tools.charting.measured import Run
-from tools.recorder.cycles import CyclesFile
-from tools.recorder.signals import SignalsFile
-from tools.recording import Recording
+from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
+from rack.boards.config import RackConfig, wire
+from rack.tools.charting.measured import Run
+from rack.tools.recorder.cycles import CyclesFile
+from rack.tools.recorder.signals import SignalsFile
+from rack.tools.recording import Recording
 
 EPOCH_NS = 5_000_000_123
 US = 1_000

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from boards.config import RackConfig
-from boards.config.timing import budgets
-from tools.analysis.breaches import Breach, breaches
-from tools.analysis.comparison import Pair, compare
-from tools.analysis.cycles import Cycles, cycles_of
-from tools.analysis.model import Model
-from tools.answer import Failure
-from tools.recording import Recording
-from tools.timing.level_timing import LevelTiming, level_timings
-from tools.timing.measured import WORST, budgets_of
+from rack.boards.config import RackConfig
+from rack.boards.config.timing import budgets
+from rack.tools.analysis.breaches import Breach, breaches
+from rack.tools.analysis.comparison import Pair, compare
+from rack.tools.analysis.cycles import Cycles, cycles_of
+from rack.tools.analysis.model import Model
+from rack.tools.answer import Failure
+from rack.tools.recording import Recording
+from rack.tools.timing.level_timing import LevelTiming, level_timings
+from rack.tools.timing.measured import WORST, budgets_of
 
 MOSTLY = 99.0
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.analysis.company import Company, companies
-from tools.analysis.cycles import Cycles
-from tools.analysis.model import Model
-from tools.analysis.rules import Rule, response_ns, rules_for, steps_ns
+from rack.tools.analysis.company import Company, companies
+from rack.tools.analysis.cycles import Cycles
+from rack.tools.analysis.model import Model
+from rack.tools.analysis.rules import Rule, response_ns, rules_for, steps_ns
 
 
 @dataclass(frozen=True)

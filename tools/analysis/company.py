@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.analysis.cycles import Cycles, occupation
-from tools.analysis.occupation import Occupation
+from rack.tools.analysis.cycles import Cycles, occupation
+from rack.tools.analysis.occupation import Occupation
 
 TOLD = 0.1
 """Part of that time from which on what filled it is told."""

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from boards.config.schema import RackConfig
-from boards.config.timing import budgets
-from levels.timing.equations import system_response_bound_ns
-from levels.timing.relation import Relation
-from tools.analysis.cycles import Cycles
-from tools.analysis.model import Model
-from tools.analysis.rules import response_ns, steps_ns
-from tools.analysis.tasks import core_loads
-from tools.recording import Recording
-from tools.reporting.response import system_response
-from tools.timing.measured import WORST, budgets_of, worst_of
-from tools.timing.verdict import Verdict
-from tools.timing.verdicts import BEYOND, EQUATIONS, LOAD, RESPONSE_TIME, verdicts
+from rack.boards.config.schema import RackConfig
+from rack.boards.config.timing import budgets
+from rack.levels.timing.equations import system_response_bound_ns
+from rack.levels.timing.relation import Relation
+from rack.tools.analysis.cycles import Cycles
+from rack.tools.analysis.model import Model
+from rack.tools.analysis.rules import response_ns, steps_ns
+from rack.tools.analysis.tasks import core_loads
+from rack.tools.recording import Recording
+from rack.tools.reporting.response import system_response
+from rack.tools.timing.measured import WORST, budgets_of, worst_of
+from rack.tools.timing.verdict import Verdict
+from rack.tools.timing.verdicts import BEYOND, EQUATIONS, LOAD, RESPONSE_TIME, verdicts
 
 OBSERVED = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
 """What a run shows by itself, so that it need not be worked out from the times of its levels."""

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import TaskSpec
-from backplane.trace import FIELDS, Flag
-from tools.analysis.occupation import Occupation
-from tools.answer import Failure
-from tools.recording import Recording
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import FIELDS, Flag
+from rack.tools.analysis.occupation import Occupation
+from rack.tools.answer import Failure
+from rack.tools.recording import Recording
 
 START_UP_S = 0.1
 """Simulated time from the beginning of a process in which its cycles are not judged.

@@ -6,14 +6,14 @@ from dataclasses import asdict
 from math import isfinite
 from typing import Any
 
-from tools.analysis.analysis import MOSTLY, Analysis
-from tools.analysis.breaches import Breach
-from tools.analysis.comparison import Pair
-from tools.analysis.cycles import START_UP_S, restarts
-from tools.analysis.summary import summary
-from tools.analysis.tasks import core_loads, task_document
-from tools.reporting.response import system_response
-from tools.timing.verdict import Verdict
+from rack.tools.analysis.analysis import MOSTLY, Analysis
+from rack.tools.analysis.breaches import Breach
+from rack.tools.analysis.comparison import Pair
+from rack.tools.analysis.cycles import START_UP_S, restarts
+from rack.tools.analysis.summary import summary
+from rack.tools.analysis.tasks import core_loads, task_document
+from rack.tools.reporting.response import system_response
+from rack.tools.timing.verdict import Verdict
 
 Document = dict[str, Any]
 

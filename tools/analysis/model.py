@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from backplane.layout import Layout, TaskSpec
-from boards.config.schema import RackConfig
-from boards.config.timing import NS_PER_MS, is_critical, tick_ns
-from tools.timing.prediction import hierarchy, longest_cycles
+from rack.backplane.layout import Layout, TaskSpec
+from rack.boards.config.schema import RackConfig
+from rack.boards.config.timing import NS_PER_MS, is_critical, tick_ns
+from rack.tools.timing.prediction import hierarchy, longest_cycles
 
 
 @dataclass(frozen=True)

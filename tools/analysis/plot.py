@@ -12,9 +12,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from tools.analysis.analysis import Analysis
-from tools.analysis.summary import worst_words
-from tools.analysis.tasks import deviation_ns
+from rack.tools.analysis.analysis import Analysis
+from rack.tools.analysis.summary import worst_words
+from rack.tools.analysis.tasks import deviation_ns
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

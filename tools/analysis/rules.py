@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from backplane.trace import SKIPPED_SHIFT, Flag
-from levels.timing.equations import (
+from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.levels.timing.equations import (
     coupling_may_be_tight,
     executes_in_time,
     fits_cycle,
@@ -18,10 +18,10 @@ from levels.timing.equations import (
     plan_fits_tight,
     residual_is_left,
 )
-from levels.timing.relation import Relation
-from tools.analysis.cycles import Cycles
-from tools.analysis.model import Model
-from tools.timing.verdicts import LOOSE_PLAN, RESPONSE_TIME
+from rack.levels.timing.relation import Relation
+from rack.tools.analysis.cycles import Cycles
+from rack.tools.analysis.model import Model
+from rack.tools.timing.verdicts import LOOSE_PLAN, RESPONSE_TIME
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from backplane.trace import SKIPPED_SHIFT, Flag
-from levels.timing.equations import residual_deviation_ns
-from tools.analysis.cycles import Cycles
-from tools.analysis.model import Model
-from tools.recording import Recording
-from tools.reporting.statistics import distribution
+from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.levels.timing.equations import residual_deviation_ns
+from rack.tools.analysis.cycles import Cycles
+from rack.tools.analysis.model import Model
+from rack.tools.recording import Recording
+from rack.tools.reporting.statistics import distribution
 
 Document = dict[str, Any]
 MS = 1e-6

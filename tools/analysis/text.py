@@ -6,15 +6,15 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from tools.analysis.analysis import MOSTLY, Analysis
-from tools.analysis.breaches import Breach, Broken
-from tools.analysis.comparison import Pair
-from tools.analysis.cycles import START_UP_S, Cycles, restarts
-from tools.analysis.summary import summary, worst_words
-from tools.analysis.tasks import task_document
-from tools.text_table import table
-from tools.timing.level_timing import LevelTiming
-from tools.timing.verdict import Verdict
+from rack.tools.analysis.analysis import MOSTLY, Analysis
+from rack.tools.analysis.breaches import Breach, Broken
+from rack.tools.analysis.comparison import Pair
+from rack.tools.analysis.cycles import START_UP_S, Cycles, restarts
+from rack.tools.analysis.summary import summary, worst_words
+from rack.tools.analysis.tasks import task_document
+from rack.tools.text_table import table
+from rack.tools.timing.level_timing import LevelTiming
+from rack.tools.timing.verdict import Verdict
 
 SHOWN = 10
 """Cycles that broke an equation which the text shows; the document has them all."""

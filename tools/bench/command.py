@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from tools.answer import Json, print_json
-from tools.interrupt import INTERRUPT
+from rack.tools.answer import Json, print_json
+from rack.tools.interrupt import INTERRUPT
 
 bench = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -28,7 +28,7 @@ def mailbox(as_json: Json = False) -> None:
 
     Figures are medians; on a busy machine look at the best ones beside them.
     """
-    from tools.bench.mailbox import measure
+    from rack.tools.bench.mailbox import measure
 
     costs = measure()
     if as_json:
@@ -44,9 +44,9 @@ def mailbox(as_json: Json = False) -> None:
 @bench.command()
 def recording(config: Config = "nasrem", as_json: Json = False) -> None:
     """Misses and lateness of a rack without a recorder, with it, and with a live viewer, interleaved."""
-    from tools.bench.recording import measure
-    from tools.live_table import terminal_width
-    from tools.text_table import table
+    from rack.tools.bench.recording import measure
+    from rack.tools.live_table import terminal_width
+    from rack.tools.text_table import table
 
     costs = measure(config)
     if as_json:
@@ -78,7 +78,7 @@ def switch(as_json: Json = False) -> None:
     time from the planner's last instant to the executor's first, and back. Exit status 1 where the machine does not
     let a process have a real-time priority.
     """
-    from tools.bench.switch import measure
+    from rack.tools.bench.switch import measure
 
     cost = measure()
     print_json(asdict(cost)) if as_json else print(cost.text())
@@ -96,9 +96,9 @@ def partition(
     Runs them in real time, one after another, and prints what the paper argues about in words: misses, residuals,
     plan ages; and beside them what the timing model predicts of each from the budgets of the config.
     """
-    from tools.bench.partition import compare, lines_of
-    from tools.live_table import print_wrapped, terminal_width
-    from tools.progress import progress_for
+    from rack.tools.bench.partition import compare, lines_of
+    from rack.tools.live_table import print_wrapped, terminal_width
+    from rack.tools.progress import progress_for
 
     with progress_for(as_json) as progress:
         found = compare(config, seconds, rounds, progress)
@@ -124,9 +124,9 @@ def response(
     must come at the predicted tick; and without it, in a twin of the run, the torque must differ from that tick on.
     Exit status 1 where one does not, or is beyond a bound.
     """
-    from tools.bench.response import Bench
-    from tools.live_table import print_wrapped, terminal_width
-    from tools.progress import progress_for
+    from rack.tools.bench.response import Bench
+    from rack.tools.live_table import print_wrapped, terminal_width
+    from rack.tools.progress import progress_for
 
     with progress_for(as_json) as progress:
         measured = Bench(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)
@@ -135,7 +135,7 @@ def response(
     else:
         print_wrapped("\n".join(measured.lines(terminal_width())))
     if out is not None:
-        from tools.responding.plot import plot
+        from rack.tools.responding.plot import plot
 
         out.mkdir(parents=True, exist_ok=True)
         paths = plot(measured.response, out)

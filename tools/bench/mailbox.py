@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backplane import semaphores
-from backplane.layout import PROTOCOLS, Layout, MailboxSpec, Protocol, TaskSpec
-from backplane.message import Field, command
-from backplane.protocols import open_reader, open_writer
-from backplane.segment import Segment, unlink
-from boards.config.fields import field_specs
+from rack.backplane import semaphores
+from rack.backplane.layout import PROTOCOLS, Layout, MailboxSpec, Protocol, TaskSpec
+from rack.backplane.message import Field, command
+from rack.backplane.protocols import open_reader, open_writer
+from rack.backplane.segment import Segment, unlink
+from rack.boards.config.fields import field_specs
 
 CALLS = 20_000
 ROUNDS = 15

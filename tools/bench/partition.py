@@ -10,19 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
-from backplane.layout import Layout, TaskSpec
-from backplane.trace import SKIPPED_SHIFT, Flag
-from boards.config import RackConfig, budgets, load, timed_tasks, wire
-from levels.timing.response_time import response_times
-from tools.bench.partitions import PARTITIONS, Partition
-from tools.display import display_for
-from tools.progress import Progress
-from tools.recording import Recording
-from tools.reporting.statistics import Distribution, distribution
-from tools.reporting.timing import plan_ages_ms
-from tools.running import run_rack
-from tools.text_table import table
-from tools.timing.verdicts import context_switch_ns
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.boards.config import RackConfig, budgets, load, timed_tasks, wire
+from rack.levels.timing.response_time import response_times
+from rack.tools.bench.partitions import PARTITIONS, Partition
+from rack.tools.display import display_for
+from rack.tools.progress import Progress
+from rack.tools.recording import Recording
+from rack.tools.reporting.statistics import Distribution, distribution
+from rack.tools.reporting.timing import plan_ages_ms
+from rack.tools.running import run_rack
+from rack.tools.text_table import table
+from rack.tools.timing.verdicts import context_switch_ns
 
 LAUNCH_S = 3.0
 """About what launching and recording a run take besides its time."""

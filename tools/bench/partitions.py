@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from boards.config import RackConfig, loads
-from boards.config.schema import LAST_SLOT, BoardConfig, Coupling
-from tools.answer import Failure
+from rack.boards.config import RackConfig, loads
+from rack.boards.config.schema import LAST_SLOT, BoardConfig, Coupling
+from rack.tools.answer import Failure
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from backplane.segment import Segment
-from backplane.trace import Flag, trace_ring
-from boards.config import RackConfig, load
-from boards.rack import Rack
-from tools.answer import Failure
-from tools.recorder.process import RecorderProcess
-from tools.reporting.statistics import Distribution, distribution
-from tools.viewer.window import Window, free_port, url
+from rack.backplane.segment import Segment
+from rack.backplane.trace import Flag, trace_ring
+from rack.boards.config import RackConfig, load
+from rack.boards.rack import Rack
+from rack.tools.answer import Failure
+from rack.tools.recorder.process import RecorderProcess
+from rack.tools.reporting.statistics import Distribution, distribution
+from rack.tools.viewer.window import Window, free_port, url
 
 PHASES = ("without", "recording", "live viewer")
 PHASE_S = 6.0

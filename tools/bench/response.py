@@ -10,16 +10,16 @@ from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from boards.config import load, wire
-from boards.operating.config import CommandConfig
-from tools.answer import Failure
-from tools.progress import Progress
-from tools.recording import Recording
-from tools.responding.course import courses
-from tools.responding.response import Response, response_of
-from tools.responding.schedule import BREATH_S, RUN_S, draw
-from tools.responding.trial import run
-from tools.responding.twin import Twin, candidates, compare
+from rack.boards.config import load, wire
+from rack.boards.operating.config import CommandConfig
+from rack.tools.answer import Failure
+from rack.tools.progress import Progress
+from rack.tools.recording import Recording
+from rack.tools.responding.course import courses
+from rack.tools.responding.response import Response, response_of
+from rack.tools.responding.schedule import BREATH_S, RUN_S, draw
+from rack.tools.responding.trial import run
+from rack.tools.responding.twin import Twin, candidates, compare
 
 LOCKSTEP_RUN_S = 20.0
 """What a run in lockstep takes, about."""

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import posix_ipc
 
-from backplane.process import pin
-from boards.processor import die_with_parent, set_priority
-from tools.answer import Failure
-from tools.reporting.statistics import Distribution, distribution
+from rack.backplane.process import pin
+from rack.boards.processor import die_with_parent, set_priority
+from rack.tools.answer import Failure
+from rack.tools.reporting.statistics import Distribution, distribution
 
 PAPER_US = 100.0
 """Task switching of NIST's boards (NISTIR 90-4251, section 4)."""

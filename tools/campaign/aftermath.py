@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from backplane.alarms import Alarm
-from boards.events import Event
-from boards.faults.consequences import consequence
-from boards.faults.kinds import KINDS, NUMBERS, Where
-from tools.campaign.detection import table_kind
-from tools.campaign.ending import Strike
+from rack.backplane.alarms import Alarm
+from rack.boards.events import Event
+from rack.boards.faults.consequences import consequence
+from rack.boards.faults.kinds import KINDS, NUMBERS, Where
+from rack.tools.campaign.detection import table_kind
+from rack.tools.campaign.ending import Strike
 
 BRAKES = "brakes_closed"
 LATCHED = "latched"

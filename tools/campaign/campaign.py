@@ -11,21 +11,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from backplane.layout import Layout
-from boards.config import wire
-from boards.config.schema import RackConfig
-from boards.faults.request import injections
-from tools.answer import Failure
-from tools.campaign.draw import Course, fault_plans, kill_plans, needs_real_time, size_plans
-from tools.campaign.instruments import examine
-from tools.campaign.interrupt import Interrupt
-from tools.campaign.load import load
-from tools.campaign.plan import Plan
-from tools.campaign.results import Faultless, Finding, Results, kept
-from tools.campaign.targets import Targets, kinds_for
-from tools.campaign.trial import restart_s
-from tools.campaign.workers import Job, Workers
-from tools.progress import Progress
+from rack.backplane.layout import Layout
+from rack.boards.config import wire
+from rack.boards.config.schema import RackConfig
+from rack.boards.faults.request import injections
+from rack.tools.answer import Failure
+from rack.tools.campaign.draw import Course, fault_plans, kill_plans, needs_real_time, size_plans
+from rack.tools.campaign.instruments import examine
+from rack.tools.campaign.interrupt import Interrupt
+from rack.tools.campaign.load import load
+from rack.tools.campaign.plan import Plan
+from rack.tools.campaign.results import Faultless, Finding, Results, kept
+from rack.tools.campaign.targets import Targets, kinds_for
+from rack.tools.campaign.trial import restart_s
+from rack.tools.campaign.workers import Job, Workers
+from rack.tools.progress import Progress
 
 LAUNCH_S = 2.0
 """What a launch and an end take, about: the progress bar's guess."""

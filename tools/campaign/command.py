@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.answer import ConfigName, Failure, Json, Settings, print_json
+from rack.tools.answer import ConfigName, Failure, Json, Settings, print_json
 
 if TYPE_CHECKING:
-    from tools.campaign.campaign import Campaign, Order
-    from tools.campaign.results import Results
+    from rack.tools.campaign.campaign import Campaign, Order
+    from rack.tools.campaign.results import Results
 
 INJECTIONS = 3
 SIZES = 10
@@ -85,10 +85,10 @@ def campaign(
     to or not recovered from in its bound, a limit was violated, anything was left behind, a task was neither done
     nor safely stopped, or anything tripped without a fault.
     """
-    from tools.campaign.campaign import ORDER, Campaign
-    from tools.campaign.interrupt import Interrupt
-    from tools.folders import folder_of
-    from tools.progress import progress_for
+    from rack.tools.campaign.campaign import ORDER, Campaign
+    from rack.tools.campaign.interrupt import Interrupt
+    from rack.tools.folders import folder_of
+    from rack.tools.progress import progress_for
 
     order = _order(
         config, settings, injections, seed, kinds, kills, lockstep, realtime, faultless, load, sizes, seconds
@@ -119,8 +119,8 @@ def _order(
     seconds: float | None,
 ) -> Order:
     """Return what is asked for. Raises `ConfigError`, and `Failure` for options that exclude each other."""
-    from boards.config import load as load_config
-    from tools.campaign.campaign import Order
+    from rack.boards.config import load as load_config
+    from rack.tools.campaign.campaign import Order
 
     if lockstep and realtime:
         raise Failure("--lockstep and --realtime: each excludes the other; give one, or none for both by turns", 2)
@@ -148,9 +148,9 @@ def _order(
 
 def _written(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
     """Write campaign.json, campaign.md and campaign.png; return the first two."""
-    from tools.campaign.document import document
-    from tools.campaign.markdown import markdown
-    from tools.campaign.plot import plot
+    from rack.tools.campaign.document import document
+    from rack.tools.campaign.markdown import markdown
+    from rack.tools.campaign.plot import plot
 
     work.folder.mkdir(parents=True, exist_ok=True)
     report = document(work, results, wall_s)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from backplane.address_map import CLOCK
-from backplane.alarms import Alarm
-from boards.events import Event
-from boards.faults.consequences import consequence
-from boards.faults.kinds import KINDS, NUMBERS
-from boards.faults.text import ALL_JOINTS
-from tools.campaign.ending import Strike
-from tools.campaign.plan import EXTERNAL
+from rack.backplane.address_map import CLOCK
+from rack.backplane.alarms import Alarm
+from rack.boards.events import Event
+from rack.boards.faults.consequences import consequence
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.boards.faults.text import ALL_JOINTS
+from rack.tools.campaign.ending import Strike
+from rack.tools.campaign.plan import EXTERNAL
 
 FOUND = ("detection", "miss", "died")
 """Kinds of events that can be a detection."""

@@ -7,10 +7,10 @@ import platform
 from dataclasses import asdict
 from typing import Any
 
-from tools.campaign.campaign import Campaign
-from tools.campaign.results import Finding, Results
-from tools.campaign.shape import SIZED, judged_size
-from tools.campaign.statistics import by_kind, curve, rate, totals
+from rack.tools.campaign.campaign import Campaign
+from rack.tools.campaign.results import Finding, Results
+from rack.tools.campaign.shape import SIZED, judged_size
+from rack.tools.campaign.statistics import by_kind, curve, rate, totals
 
 Document = dict[str, Any]
 

@@ -8,12 +8,12 @@ from itertools import pairwise
 from random import Random
 from typing import Any
 
-from boards.faults.consequences import recovery_ticks
-from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.detection import table_kind
-from tools.campaign.plan import EXTERNAL, Kill, Plan, Purpose
-from tools.campaign.shape import SIZED, Drawing, Shape, shape, swept_sizes
-from tools.campaign.targets import Target, Targets
+from rack.boards.faults.consequences import recovery_ticks
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.tools.campaign.detection import table_kind
+from rack.tools.campaign.plan import EXTERNAL, Kill, Plan, Purpose
+from rack.tools.campaign.shape import SIZED, Drawing, Shape, shape, swept_sizes
+from rack.tools.campaign.targets import Target, Targets
 
 MOST = 40
 """Faults of one trial, at most: as many as fit into the task, and into the fault table."""
@@ -24,7 +24,7 @@ TAIL_S = 1.0
 SETTLE_S = 0.1
 """Simulated time between the end of all that a fault may lead to and the next fault."""
 EPISODE = 25
-"""Reads after which a reader tells of the next fault of a mailbox again: `backplane.episodes`, and some more."""
+"""Reads after which a reader tells of the next fault of a mailbox again: `rack.backplane.episodes`, and some more."""
 AHEAD = 60
 """Faults that are looked at for one that still fits into a trial."""
 KILL_GAP_S = 3.5

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backplane.address_map import CLOCK
-from backplane.fault_table import Entry, FaultTable, Injection, Stage
-from backplane.layout import MailboxSpec
-from backplane.message import Message, State
-from backplane.protocols import open_observer
-from backplane.segment import Segment
-from boards.faults.kinds import KINDS
-from levels.messages import Error
-from tools.campaign.external import Killed
-from tools.campaign.plan import EXTERNAL
+from rack.backplane.address_map import CLOCK
+from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.message import Message, State
+from rack.backplane.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.boards.faults.kinds import KINDS
+from rack.levels.messages import Error
+from rack.tools.campaign.external import Killed
+from rack.tools.campaign.plan import EXTERNAL
 
 AT_REST = 0.02
 """Joint velocity below which an arm stands, rad/s."""

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from backplane.address_map import CLOCK
-from backplane.process import is_alive, start_time
-from backplane.segment import Segment
-from backplane.words import Block, System, TaskState
-from tools.campaign.plan import Kill
+from rack.backplane.address_map import CLOCK
+from rack.backplane.process import is_alive, start_time
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System, TaskState
+from rack.tools.campaign.plan import Kill
 
 LOOK_S = 0.001
 """In lockstep time has no grid to sleep on: how often the tick is looked at."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import mujoco
 from numpy import isfinite
 
-from backplane.message import Message
-from boards.config.schema import RackConfig
-from levels.arm import SimulatedArm
-from levels.cell import STATE, build_cell, sizes
-from levels.messages import ARM_STATE
-from tools.answer import Failure
+from rack.backplane.message import Message
+from rack.boards.config.schema import RackConfig
+from rack.levels.arm import SimulatedArm
+from rack.levels.cell import STATE, build_cell, sizes
+from rack.levels.messages import ARM_STATE
+from rack.tools.answer import Failure
 
 FACTOR = 2.0
 """How many times its limit the velocity is that the counter must see."""

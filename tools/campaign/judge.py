@@ -6,17 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from backplane.fault_table import Injection
-from backplane.layout import Layout
-from boards.events import Event
-from boards.faults.bounds import MEMORY_NS, RACK_NS, bound_ticks, cycle_ticks, last_read
-from boards.faults.consequences import consequence, recovery_ticks
-from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.aftermath import COLLISION, LATCHED, Aftermath, aftermath, takes_cycles
-from tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, explains, fits, table_kind
-from tools.campaign.ending import Strike
-from tools.campaign.plan import EXTERNAL
-from tools.campaign.shape import SIZED, judged_size
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout
+from rack.boards.events import Event
+from rack.boards.faults.bounds import MEMORY_NS, RACK_NS, bound_ticks, cycle_ticks, last_read
+from rack.boards.faults.consequences import consequence, recovery_ticks
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.tools.campaign.aftermath import COLLISION, LATCHED, Aftermath, aftermath, takes_cycles
+from rack.tools.campaign.detection import MAILBOX_ALARMS, Detection, LeftOut, candidates, explains, fits, table_kind
+from rack.tools.campaign.ending import Strike
+from rack.tools.campaign.plan import EXTERNAL
+from rack.tools.campaign.shape import SIZED, judged_size
 
 Seen = Literal["detected", "missed", "not struck"]
 Bound = Callable[[Strike, str | None], int | None]

@@ -7,8 +7,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from backplane.process import is_alive, readable
-from backplane.segment import SHM_FOLDER
+from rack.backplane.process import is_alive, readable
+from rack.backplane.segment import SHM_FOLDER
 
 BOUND_S = 2.0
 """Time that processes which were killed get to be gone."""

@@ -1,6 +1,7 @@
 """Load beside a rack: a busy process a core, under ordinary scheduling, and one that has the disks written.
 
-As a program, `python -m tools.campaign.load PARENT WHAT`: one process of it, or stress-ng; it ends with its parent.
+As a program, `python -m rack.tools.campaign.load PARENT WHAT`: one of its processes, or stress-ng; it ends with its
+parent.
 """
 
 from __future__ import annotations
@@ -12,8 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from boards.crate_line import PROJECT
-from boards.processor import die_with_parent, name_process
+from rack.boards.processor import die_with_parent, name_process
 
 DISKS = "disks"
 
@@ -27,8 +27,8 @@ def load() -> Iterator[str]:
     cores = sorted(os.sched_getaffinity(0))
     stress = ["stress-ng", "--cpu", str(len(cores)), "--io", "1"]
     has_stress = shutil.which(stress[0]) is not None
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])}
-    command = [sys.executable, "-m", "tools.campaign.load", str(os.getpid())]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-m", "rack.tools.campaign.load", str(os.getpid())]
     parts = [stress] if has_stress else [*([str(core)] for core in cores), [DISKS]]
     busy = [
         subprocess.Popen([*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

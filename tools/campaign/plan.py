@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from boards.config.schema import RackConfig
-from boards.config.text import to_toml
-from boards.faults.config import FaultConfig
+from rack.boards.config.schema import RackConfig
+from rack.boards.config.text import to_toml
+from rack.boards.faults.config import FaultConfig
 
 EXTERNAL = "external kill"
 """The kind, in reports, of a SIGKILL that the campaign itself sends: no fault tool has a part in it."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from tools.campaign.statistics import part_of_bound
+from rack.tools.campaign.statistics import part_of_bound
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,11 +11,11 @@ from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
-from boards.events import Event
-from tools.campaign.judge import Circumstances, Judgement, Verdict, judge
-from tools.campaign.plan import Plan
-from tools.campaign.statistics import rate
-from tools.campaign.trial import Trial
+from rack.boards.events import Event
+from rack.tools.campaign.judge import Circumstances, Judgement, Verdict, judge
+from rack.tools.campaign.plan import Plan
+from rack.tools.campaign.statistics import rate
+from rack.tools.campaign.trial import Trial
 
 Ended = Literal["task done", "safely stopped", "not armed", "neither"]
 MISS = "miss"

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from random import Random
 from typing import NamedTuple
 
-from boards.faults.kinds import KINDS, NUMBERS, Parameter
-from tools.campaign.plan import EXTERNAL
-from tools.campaign.targets import Target
+from rack.boards.faults.kinds import KINDS, NUMBERS, Parameter
+from rack.tools.campaign.plan import EXTERNAL
+from rack.tools.campaign.targets import Target
 
 SIZED = ("sensor-bias", "sensor-noise")
-"""Kinds that are seen from a certain size on: the default of their `size` in `boards.faults.kinds`."""
+"""Kinds that are seen from a certain size on: the default of their `size` in `rack.boards.faults.kinds`."""
 LARGEST = 20.0
 """Sizes are drawn up to that many times the size from which the kind must be seen."""
 

@@ -7,9 +7,9 @@ from math import exp, lgamma, log, sqrt
 from statistics import median
 from typing import Any
 
-from boards.faults.kinds import KINDS, NUMBERS
-from tools.campaign.judge import Judgement
-from tools.campaign.plan import EXTERNAL
+from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.tools.campaign.judge import Judgement
+from rack.tools.campaign.plan import EXTERNAL
 
 Figures = dict[str, Any]
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from backplane.address_map import CLOCK
-from backplane.layout import Layout, MailboxSpec
-from boards.config.ports import all_ports
-from boards.config.schema import RackConfig
-from boards.faults.kinds import KINDS, Kind
-from boards.faults.request import cycle_ticks
-from levels.level import Executor
-from tools.answer import Failure
-from tools.campaign.plan import EXTERNAL
+from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.boards.config.ports import all_ports
+from rack.boards.config.schema import RackConfig
+from rack.boards.faults.kinds import KINDS, Kind
+from rack.boards.faults.request import cycle_ticks
+from rack.levels.level import Executor
+from rack.tools.answer import Failure
+from rack.tools.campaign.plan import EXTERNAL
 
 
 @dataclass(frozen=True)

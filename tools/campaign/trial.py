@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from backplane.errors import BackplaneError
-from backplane.layout import Layout
-from backplane.words import System
-from boards.config.schema import RackConfig
-from boards.errors import BoardError, ConfigError
-from boards.events import Event
-from boards.outcome import Outcome
-from boards.rack import Rack
-from tools.campaign.ending import Arm, Strike, arm_of, is_late, levels_of, strikes
-from tools.campaign.external import Killer
-from tools.campaign.interrupt import Interrupt
-from tools.campaign.leftovers import children, left_behind
-from tools.campaign.plan import Plan
+from rack.backplane.errors import BackplaneError
+from rack.backplane.layout import Layout
+from rack.backplane.words import System
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import BoardError, ConfigError
+from rack.boards.events import Event
+from rack.boards.outcome import Outcome
+from rack.boards.rack import Rack
+from rack.tools.campaign.ending import Arm, Strike, arm_of, is_late, levels_of, strikes
+from rack.tools.campaign.external import Killer
+from rack.tools.campaign.interrupt import Interrupt
+from rack.tools.campaign.leftovers import children, left_behind
+from rack.tools.campaign.plan import Plan
 
 LONGEST = 4
 """A run with faults may take that many times as long as without, and"""

@@ -1,6 +1,6 @@
 """Trials in processes of their own, as many at once as there are cores: each has its own rack, each leaves one file.
 
-As a program, `python -m tools.campaign.workers FD PARENT`: one such process; it ends with its parent.
+As a program, `python -m rack.tools.campaign.workers FD PARENT`: one such process; it ends with its parent.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
 from typing import Any
 
-from boards.config.schema import RackConfig
-from boards.crate_line import PROJECT
-from boards.processor import die_with_parent
-from tools.answer import Failure
-from tools.campaign.interrupt import Interrupt
-from tools.campaign.plan import Plan
-from tools.campaign.results import Judged, keep
-from tools.campaign.trial import run_trial
-from tools.interrupt import INTERRUPT
+from rack.boards.config.schema import RackConfig
+from rack.boards.processor import die_with_parent
+from rack.tools.answer import Failure
+from rack.tools.campaign.interrupt import Interrupt
+from rack.tools.campaign.plan import Plan
+from rack.tools.campaign.results import Judged, keep
+from rack.tools.campaign.trial import run_trial
+from rack.tools.interrupt import INTERRUPT
 
 LOOK_S = 0.2
 """How often a campaign that waits for its trials looks whether it is to end."""
@@ -99,10 +98,10 @@ class Workers:
                 process.terminate()
 
     def _some(self, count: int) -> list[Connection]:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])}
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         while len(self._lines) < count:
             here, there = Pipe()
-            command = [sys.executable, "-m", "tools.campaign.workers", str(there.fileno()), str(os.getpid())]
+            command = [sys.executable, "-m", "rack.tools.campaign.workers", str(there.fileno()), str(os.getpid())]
             # In a group of its own: Ctrl-C on the terminal is for the campaign, which asks for the end in order.
             self._processes.append(
                 subprocess.Popen(command, env=environment, pass_fds=[there.fileno()], process_group=0)

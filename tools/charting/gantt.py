@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from boards.config import budgets
-from tools.answer import Failure
-from tools.charting.measured import Run
-from tools.charting.panel import Panel
-from tools.charting.scheduled import Schedule
-from tools.charting.subject import Subject
-from tools.charting.text import column_for, lines
-from tools.charting.window import Wanted
+from rack.boards.config import budgets
+from rack.tools.answer import Failure
+from rack.tools.charting.measured import Run
+from rack.tools.charting.panel import Panel
+from rack.tools.charting.scheduled import Schedule
+from rack.tools.charting.subject import Subject
+from rack.tools.charting.text import column_for, lines
+from rack.tools.charting.window import Wanted
 
 NO_BUDGET = "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"
 
@@ -48,7 +48,7 @@ class Gantt:
 
     def save(self, folder: Path) -> list[Path]:
         """Draw the chart into `folder`, which must be there; return the paths of the pictures."""
-        from tools.charting.picture import save
+        from rack.tools.charting.picture import save
 
         return save(self.panels, self.rack, folder / "gantt")
 

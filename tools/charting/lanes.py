@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from levels.timing.tasks import TimedTask
+from rack.levels.timing.tasks import TimedTask
 
 
 @dataclass(frozen=True)

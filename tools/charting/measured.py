@@ -10,17 +10,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from backplane.trace import FIELDS, SKIPPED_SHIFT, Flag
-from boards.config import RackConfig, timed_tasks
-from levels.timing.budget import Budget
-from levels.timing.chart import Chart, Job, Span
-from levels.timing.tasks import TimedTask, Unit
-from tools.answer import Failure
-from tools.charting.lanes import Lane, lanes_of
-from tools.charting.panel import Count, Panel
-from tools.charting.patterns import Detail, Patterns, patterns
-from tools.charting.stretches import Stretch, union, without
-from tools.recording import Recording
+from rack.backplane.trace import FIELDS, SKIPPED_SHIFT, Flag
+from rack.boards.config import RackConfig, timed_tasks
+from rack.levels.timing.budget import Budget
+from rack.levels.timing.chart import Chart, Job, Span
+from rack.levels.timing.tasks import TimedTask, Unit
+from rack.tools.answer import Failure
+from rack.tools.charting.lanes import Lane, lanes_of
+from rack.tools.charting.panel import Count, Panel
+from rack.tools.charting.patterns import Detail, Patterns, patterns
+from rack.tools.charting.stretches import Stretch, union, without
+from rack.tools.recording import Recording
 
 SEQUENCES = {
     "executor": (

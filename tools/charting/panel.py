@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from levels.timing.chart import Chart, Job
-from tools.charting.lanes import Lane
-from tools.charting.patterns import Patterns
+from rack.levels.timing.chart import Chart, Job
+from rack.tools.charting.lanes import Lane
+from rack.tools.charting.patterns import Patterns
 
 NS_PER_MS = 1_000_000
 

@@ -9,9 +9,9 @@ from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
 
-from levels.timing.chart import Chart, Span
-from levels.timing.tasks import Unit
-from tools.charting.lanes import Lane
+from rack.levels.timing.chart import Chart, Span
+from rack.levels.timing.tasks import Unit
+from rack.tools.charting.lanes import Lane
 
 IDLE = "-"
 SHORT = 0.02

@@ -10,17 +10,17 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from levels.timing.tasks import Unit
-from tools.charting.panel import NS_PER_MS, Panel
-from tools.charting.patterns import IDLE
-from tools.charting.stretches import Stretch, union, without
-from tools.charting.text import step_for
+from rack.levels.timing.tasks import Unit
+from rack.tools.charting.panel import NS_PER_MS, Panel
+from rack.tools.charting.patterns import IDLE
+from rack.tools.charting.stretches import Stretch, union, without
+from rack.tools.charting.text import step_for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from levels.timing.chart import Chart, Job
-    from tools.charting.lanes import Lane
+    from rack.levels.timing.chart import Chart, Job
+    from rack.tools.charting.lanes import Lane
 
 COLOURS = {
     Unit.EXCHANGE: "#BBCC33",

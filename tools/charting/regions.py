@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from math import log10
 from typing import Any
 
-from boards.config import RackConfig
-from boards.config.timing import tick_ns
+from rack.boards.config import RackConfig
+from rack.boards.config.timing import tick_ns
 
 WIDTH = 84
 SHORTEST_S, LONGEST_S = 3e-5, 1e3

@@ -7,8 +7,8 @@ from pathlib import Path
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from boards.config import RackConfig
-from tools.charting.regions import LONGEST_S, REGIONS, SHORTEST_S, TICKS, duration, placed
+from rack.boards.config import RackConfig
+from rack.tools.charting.regions import LONGEST_S, REGIONS, SHORTEST_S, TICKS, duration, placed
 
 BANDS = ("#DDDDDD", "#F4C7B5", "#BFE3D8", "#C9DDF0")
 """From the fastest region to the slowest (light tints of Paul Tol's colours)."""

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import lcm
 
-from backplane.layout import Layout
-from boards.config import RackConfig, budgets, timed_tasks
-from levels.timing.chart import Chart
-from levels.timing.schedule import simulate
-from levels.timing.tasks import Part, Unit
-from tools.answer import Failure
-from tools.charting.lanes import lanes_of
-from tools.charting.panel import Count, Panel
-from tools.charting.patterns import Detail, patterns
+from rack.backplane.layout import Layout
+from rack.boards.config import RackConfig, budgets, timed_tasks
+from rack.levels.timing.chart import Chart
+from rack.levels.timing.schedule import simulate
+from rack.levels.timing.tasks import Part, Unit
+from rack.tools.answer import Failure
+from rack.tools.charting.lanes import lanes_of
+from rack.tools.charting.panel import Count, Panel
+from rack.tools.charting.patterns import Detail, patterns
 
 SLICES = 10
 """Slices of the slowest task over which patterns are counted, at least."""

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from backplane.layout import Layout
-from boards.config import RackConfig, load, wire
-from tools.answer import Failure
-from tools.charting.measured import Run
-from tools.folders import RUNS
-from tools.recording import Recording
+from rack.backplane.layout import Layout
+from rack.boards.config import RackConfig, load, wire
+from rack.tools.answer import Failure
+from rack.tools.charting.measured import Run
+from rack.tools.folders import RUNS
+from rack.tools.recording import Recording
 
 
 @dataclass(frozen=True)

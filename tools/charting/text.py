@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Iterator
 from itertools import groupby
 
-from levels.timing.chart import Chart, Job, Span
-from tools.charting.lanes import Lane
-from tools.charting.panel import NS_PER_MS, Panel
-from tools.charting.patterns import IDLE
+from rack.levels.timing.chart import Chart, Job, Span
+from rack.tools.charting.lanes import Lane
+from rack.tools.charting.panel import NS_PER_MS, Panel
+from rack.tools.charting.patterns import IDLE
 
 OTHER = "."
 """A column in which another board has the core."""

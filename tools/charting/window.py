@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from levels.timing.tasks import TimedTask
-from tools.answer import Failure
-from tools.charting.panel import NS_PER_MS
-from tools.charting.text import ms
+from rack.levels.timing.tasks import TimedTask
+from rack.tools.answer import Failure
+from rack.tools.charting.panel import NS_PER_MS
+from rack.tools.charting.text import ms
 
 SLICES = 2
 """Plans that a chart shows where nobody says otherwise."""

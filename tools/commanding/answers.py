@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from backplane.layout import MailboxSpec
-from backplane.ring import mailbox_ring
-from backplane.segment import Segment
-from levels.operator import Answer
-from tools.commanding.told import Told
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.ring import mailbox_ring
+from rack.backplane.segment import Segment
+from rack.levels.operator import Answer
+from rack.tools.commanding.told import Told
 
 
 def answering(segment: Segment, level: str) -> MailboxSpec | None:

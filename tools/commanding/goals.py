@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from tools.answer import Failure
+from rack.tools.answer import Failure
 
 KEYS = ("joints", "position", "quaternion", "direction")
 

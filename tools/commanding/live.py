@@ -7,22 +7,22 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
-from backplane.protocols import open_observer
-from backplane.segment import Segment
-from backplane.words import System
-from boards.config import loads
-from boards.config.commands import commandable
-from boards.errors import ConfigError, Mistake
-from boards.operating.request import asked, request
-from boards.operating.text import describe, message_of
-from levels.operator import What, listed
-from tools.answer import Failure
-from tools.commanding.answers import Answers, answering
-from tools.commanding.patience import SILENT_S, Patience
-from tools.commanding.told import Told
-from tools.holds import resume_command
-from tools.text_table import table
+from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
+from rack.backplane.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.config import loads
+from rack.boards.config.commands import commandable
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.operating.request import asked, request
+from rack.boards.operating.text import describe, message_of
+from rack.levels.operator import What, listed
+from rack.tools.answer import Failure
+from rack.tools.commanding.answers import Answers, answering
+from rack.tools.commanding.patience import SILENT_S, Patience
+from rack.tools.commanding.told import Told
+from rack.tools.holds import resume_command
+from rack.tools.text_table import table
 
 ANSWER_CYCLES = 4
 """Cycles of a level in which it answers: one to be read, one to be seen, and two that may be missed."""

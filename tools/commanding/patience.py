@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 import time
 
-from backplane.segment import Segment
-from backplane.words import Run, System
+from rack.backplane.segment import Segment
+from rack.backplane.words import Run, System
 
 LOOK_S = 0.001
 SILENT_S = 5.0

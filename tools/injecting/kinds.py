@@ -8,7 +8,7 @@ from typing import Any
 
 from typer.core import TyperCommand
 
-from tools.text_table import table
+from rack.tools.text_table import table
 
 
 class KindsCommand(TyperCommand):
@@ -16,14 +16,14 @@ class KindsCommand(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
-        from tools.live_table import terminal_width
+        from rack.tools.live_table import terminal_width
 
         return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text(terminal_width())])
 
 
 def kinds_text(width: int | None = None) -> Iterator[str]:
     """Yield the kinds as a table, and their parameters as another; with a width they fit into it."""
-    from boards.faults.kinds import KINDS
+    from rack.boards.faults.kinds import KINDS
 
     rows = [[kind.name, kind.means, kind.bound, _remarks(kind.realtime, kind.once)] for kind in KINDS]
     yield from table(["kind", "what happens", "found within", ""], rows, width)
@@ -49,6 +49,6 @@ def _remarks(realtime: bool, once: bool) -> str:
 
 def kinds_document() -> list[dict[str, Any]]:
     """Return the kinds as plain data."""
-    from boards.faults.kinds import KINDS
+    from rack.boards.faults.kinds import KINDS
 
     return [{**asdict(kind), "seen_as": [alarm.name.lower() for alarm in kind.seen_as]} for kind in KINDS]

@@ -10,20 +10,20 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
-from backplane.segment import Segment
-from backplane.words import Run, System
-from boards.config import loads
-from boards.config.schema_mistakes import mistakes_of
-from boards.errors import ConfigError, Mistake
-from boards.faults.condition import condition_text
-from boards.faults.config import FaultConfig
-from boards.faults.hog import run_hog
-from boards.faults.request import injection
-from boards.faults.text import describe, document
-from boards.processor import set_priority
-from tools.answer import Failure
-from tools.text_table import table
+from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.segment import Segment
+from rack.backplane.words import Run, System
+from rack.boards.config import loads
+from rack.boards.config.schema_mistakes import mistakes_of
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.condition import condition_text
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.hog import run_hog
+from rack.boards.faults.request import injection
+from rack.boards.faults.text import describe, document
+from rack.boards.processor import set_priority
+from rack.tools.answer import Failure
+from rack.tools.text_table import table
 
 BEGIN_S = 5.0
 """Bound of the wait for a fault that is to begin at once: a clock that gives out a tick begins it."""

@@ -1,4 +1,4 @@
-"""The recorder's process, `python -m tools.recorder`: stdin names rack and folder, and ends when the run is over.
+"""The recorder's process, `python -m rack.tools.recorder`: stdin names rack and folder, and ends when the run is over.
 
 On stdout it says "recording" once it has attached; every other line is something that the user should know.
 """
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from backplane.segment import Segment
-    from tools.recorder.side_sink import Sink
+    from rack.backplane.segment import Segment
+    from rack.tools.recorder.side_sink import Sink
 
 NICENESS = 10
 """On a core that it shares, the recorder comes behind boards without real-time priority too."""
@@ -27,17 +27,17 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
-    from backplane.segment import Segment
-    from tools.recorder.recorder import Recorder
-    from tools.recorder.side_sink import SideSink
+    from rack.backplane.segment import Segment
+    from rack.tools.recorder.recorder import Recorder
+    from rack.tools.recorder.side_sink import SideSink
 
     with suppress(ImportError):
-        import tools.viewer.sink  # noqa: F401  takes a second: spent while the rack is being launched
+        import rack.tools.viewer.sink  # noqa: F401  takes a second: spent while the rack is being launched
     line = sys.stdin.readline()
     if not line:
         return
-    rack, folder, port = json.loads(line)
-    segment = Segment.attach(rack)
+    name, folder, port = json.loads(line)
+    segment = Segment.attach(name)
     view = SideSink(lambda: _view(segment, Path(folder), port), _tell)
     with Recorder(segment, Path(folder), view) as recorder:
         _tell("recording")
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
-    from tools.viewer.sink import ViewSink
+    from rack.tools.viewer.sink import ViewSink
 
     return ViewSink(segment, folder, port)
 

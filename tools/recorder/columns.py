@@ -10,7 +10,7 @@ from math import prod
 import numpy as np
 import pyarrow as pa
 
-from backplane.layout import FieldSpec, MailboxSpec
+from rack.backplane.layout import FieldSpec, MailboxSpec
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from backplane.trace import FIELDS
-from tools.recorder.steal import Stolen
+from rack.backplane.trace import FIELDS
+from rack.tools.recorder.steal import Stolen
 
 BLOCK_ROWS = 1 << 16
 SCHEMA = pa.schema([pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS)])

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from backplane.layout import Layout
-from tools.recorder.cycles import CyclesFile
-from tools.recorder.signals import SignalsFile
-from tools.recorder.spool import NAME, Frame, read
-from tools.recorder.steal import Stolen
+from rack.backplane.layout import Layout
+from rack.tools.recorder.cycles import CyclesFile
+from rack.tools.recorder.signals import SignalsFile
+from rack.tools.recorder.spool import NAME, Frame, read
+from rack.tools.recorder.steal import Stolen
 
 CYCLES, SIGNALS = "cycles.parquet", "signals.parquet"
 MENDED = "-mended"

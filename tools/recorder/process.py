@@ -10,10 +10,9 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from backplane.process import STOPPED, readable, state_of
-from backplane.words import System
+from rack.backplane.process import STOPPED, readable, state_of
+from rack.backplane.words import System
 
-PROJECT = Path(__file__).resolve().parents[2]
 BEGUN = "recording"
 """What it says when it has attached."""
 ATTACH_S = 30.0
@@ -43,11 +42,11 @@ class RecorderProcess:
 
     def _start(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tools.recorder"],
+            [sys.executable, "-m", "rack.tools.recorder"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._complaints,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(PROJECT), *sys.path])},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         )
         self._unread = b""
         self._lines: list[str] = []

@@ -8,15 +8,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from backplane.process import is_alive
-from backplane.ring import mailbox_ring
-from backplane.segment import Segment
-from backplane.trace import trace_ring
-from backplane.words import Run, System
-from tools.recorder.files import RunFiles
-from tools.recorder.side_sink import Sink
-from tools.recorder.spool import Frame, Spool
-from tools.recorder.steal import StealMeter
+from rack.backplane.process import is_alive
+from rack.backplane.ring import mailbox_ring
+from rack.backplane.segment import Segment
+from rack.backplane.trace import trace_ring
+from rack.backplane.words import Run, System
+from rack.tools.recorder.files import RunFiles
+from rack.tools.recorder.side_sink import Sink
+from rack.tools.recorder.spool import Frame, Spool
+from rack.tools.recorder.steal import StealMeter
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005

@@ -14,8 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from backplane.layout import Layout
-from tools.recorder.columns import columns_of
+from rack.backplane.layout import Layout
+from rack.tools.recorder.columns import columns_of
 
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
 BLOCK_ROWS = 8192

@@ -21,11 +21,11 @@ from typing import IO, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from backplane.layout import Layout
-from backplane.ring import row_dtype
-from backplane.segment import layout_of
-from backplane.trace import RECORD
-from tools.answer import Failure
+from rack.backplane.layout import Layout
+from rack.backplane.ring import row_dtype
+from rack.backplane.segment import layout_of
+from rack.backplane.trace import RECORD
+from rack.tools.answer import Failure
 
 NAME = "recorder.spool"
 MAGIC = b"RACKSPL1"

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.answer import Failure
-from tools.recording import Recording
+from rack.tools.answer import Failure
+from rack.tools.recording import Recording
 
 
 @dataclass(frozen=True)

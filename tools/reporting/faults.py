@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from backplane.fault_table import Injection
-from backplane.layout import Layout
-from boards.events import Event
-from tools.campaign.ending import Strike
-from tools.campaign.judge import Circumstances, Judgement, judge
-from tools.recording import Recording
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout
+from rack.boards.events import Event
+from rack.tools.campaign.ending import Strike
+from rack.tools.campaign.judge import Circumstances, Judgement, judge
+from rack.tools.recording import Recording
 
 Report = dict[str, Any]
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import Layout
-from backplane.message import State
-from levels.operator import What
-from tools.recording import Recording
+from rack.backplane.layout import Layout
+from rack.backplane.message import State
+from rack.levels.operator import What
+from rack.tools.recording import Recording
 
 OWN = "holding"
 """What keeps a level that gives the reason itself."""

@@ -8,9 +8,9 @@ from typing import Any
 
 from rich.console import Console
 
-from tools.holds import resume_command
-from tools.reporting.misses import counted
-from tools.text_table import table
+from rack.tools.holds import resume_command
+from rack.tools.reporting.misses import counted
+from rack.tools.text_table import table
 
 Report = dict[str, Any]
 

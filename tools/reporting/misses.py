@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import Layout, TaskSpec
-from backplane.trace import SKIPPED_SHIFT, Flag
-from tools.recording import Recording
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.tools.recording import Recording
 
 
 def misses(recording: Recording, layout: Layout) -> list[dict[str, Any]]:

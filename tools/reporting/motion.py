@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import Layout
-from tools.recording import Recording
+from rack.backplane.layout import Layout
+from rack.tools.recording import Recording
 
 SERVO_STATUS = "servo_status"
 """Message type of the level that drives the arm."""

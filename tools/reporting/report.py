@@ -8,20 +8,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from backplane.layout import Layout, TaskSpec
-from backplane.message import State
-from boards.config import RackConfig, wire
-from tools.recording import Recording
-from tools.reporting.difference import first_difference
-from tools.reporting.faults import faults
-from tools.reporting.holds import holds
-from tools.reporting.markdown import markdown
-from tools.reporting.misses import counted, misses
-from tools.reporting.motion import motion
-from tools.reporting.response import system_response
-from tools.reporting.steal import steal
-from tools.reporting.timing import plan_age_ms, task_times
-from tools.snapshot import TASK_STATUS
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.message import State
+from rack.boards.config import RackConfig, wire
+from rack.tools.recording import Recording
+from rack.tools.reporting.difference import first_difference
+from rack.tools.reporting.faults import faults
+from rack.tools.reporting.holds import holds
+from rack.tools.reporting.markdown import markdown
+from rack.tools.reporting.misses import counted, misses
+from rack.tools.reporting.motion import motion
+from rack.tools.reporting.response import system_response
+from rack.tools.reporting.steal import steal
+from rack.tools.reporting.timing import plan_age_ms, task_times
+from rack.tools.snapshot import TASK_STATUS
 
 Report = dict[str, Any]
 

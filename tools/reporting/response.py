@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import Layout
-from backplane.trace import SKIPPED_SHIFT, Flag
-from boards.config.schema import RackConfig
-from tools.recording import Recording
-from tools.reporting.statistics import distribution
-from tools.timing.prediction import hierarchy, predict
+from rack.backplane.layout import Layout
+from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.boards.config.schema import RackConfig
+from rack.tools.recording import Recording
+from rack.tools.reporting.statistics import distribution
+from rack.tools.timing.prediction import hierarchy, predict
 
 LOSSES = ("died", "hang")
 """Codes of events that say that a board was lost."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import Layout
-from backplane.trace import Flag
-from tools.recording import Recording
+from rack.backplane.layout import Layout
+from rack.backplane.trace import Flag
+from rack.tools.recording import Recording
 
 
 def steal(recording: Recording, layout: Layout) -> dict[str, Any]:

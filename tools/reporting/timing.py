@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from backplane.layout import TaskSpec
-from levels.timing.equations import residual_bound_ns, residual_deviation_ns
-from tools.reporting.statistics import Distribution, distribution
+from rack.backplane.layout import TaskSpec
+from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
+from rack.tools.reporting.statistics import Distribution, distribution
 
 
 def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: bool = False) -> dict[str, Any]:

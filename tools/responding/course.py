@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from backplane.layout import Layout
-from boards.config.schema import RackConfig
-from tools.timing.prediction import hierarchy, response_ticks
+from rack.backplane.layout import Layout
+from rack.boards.config.schema import RackConfig
+from rack.tools.timing.prediction import hierarchy, response_ticks
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from tools.responding.response import Answered, Response
+from rack.tools.responding.response import Answered, Response
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

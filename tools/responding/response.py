@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from levels.operator import Answer, What
-from tools.recording import Recording
-from tools.responding.course import Course, acting, courses
-from tools.text_table import table
+from rack.levels.operator import Answer, What
+from rack.tools.recording import Recording
+from rack.tools.responding.course import Course, acting, courses
+from rack.tools.text_table import table
 
 Fate = Literal["acted on", "refused", "overtaken", "run over"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from random import Random
 
-from boards.operating.config import CommandConfig
-from tools.responding.course import Course
+from rack.boards.operating.config import CommandConfig
+from rack.tools.responding.course import Course
 
 RUN_S = 24.0
 """Simulated time of one run, at most."""

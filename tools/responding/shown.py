@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tools.answer import Failure, print_json
-from tools.live_table import print_wrapped, terminal_width
-from tools.recording import Recording
-from tools.responding.plot import plot
-from tools.responding.response import response_of
+from rack.tools.answer import Failure, print_json
+from rack.tools.live_table import print_wrapped, terminal_width
+from rack.tools.recording import Recording
+from rack.tools.responding.plot import plot
+from rack.tools.responding.response import response_of
 
 
 def show(recording: Recording, folder: Path, as_json: bool) -> bool:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from boards.config.schema import RackConfig
-from boards.operating.config import CommandConfig
-from boards.rack import Rack
-from tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
-from tools.recording import Recording
+from rack.boards.config.schema import RackConfig
+from rack.boards.operating.config import CommandConfig
+from rack.boards.rack import Rack
+from rack.tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
+from rack.tools.recording import Recording
 
 
 def run(config: RackConfig, commands: Sequence[CommandConfig], folder: Path, seconds: float) -> Recording:

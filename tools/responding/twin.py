@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from boards.config.schema import RackConfig
-from boards.operating.config import CommandConfig
-from tools.recording import Recording
-from tools.responding.response import Answered, Response
-from tools.responding.trial import run
+from rack.boards.config.schema import RackConfig
+from rack.boards.operating.config import CommandConfig
+from rack.tools.recording import Recording
+from rack.tools.responding.response import Answered, Response
+from rack.tools.responding.trial import run
 
 BEHIND_TICKS = 40
 """Ticks behind the predicted one up to which the twin runs."""

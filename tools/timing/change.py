@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from boards.config.cores import obtained_core
-from boards.config.timing import tick_ns
-from tools.timing.prediction import predict
-from tools.timing.trial import Trial
+from rack.boards.config.cores import obtained_core
+from rack.boards.config.timing import tick_ns
+from rack.tools.timing.prediction import predict
+from rack.tools.timing.trial import Trial
 
 TRIED = (
     "priority",

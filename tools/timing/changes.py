@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from backplane.layout import Protocol
-from boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
-from boards.config.timing import is_critical, tick_ns
-from tools.timing.change import Change
-from tools.timing.level_timing import LevelTiming
-from tools.timing.trial import Settings, Trial
+from rack.backplane.layout import Protocol
+from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
+from rack.boards.config.timing import is_critical, tick_ns
+from rack.tools.timing.change import Change
+from rack.tools.timing.level_timing import LevelTiming
+from rack.tools.timing.trial import Settings, Trial
 
 MOST_CYCLES = 10_000
 """What `within_cycles` may be."""

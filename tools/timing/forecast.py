@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from boards.config import shared_out
-from tools.timing.level_timing import LevelTiming, level_timings, unjudged
-from tools.timing.prediction import Prediction, predict
-from tools.timing.tables import level_table, ms, response_table, verdict_table
-from tools.timing.task_response import TaskResponse, task_responses
-from tools.timing.trial import Trial
-from tools.timing.verdict import Verdict
-from tools.timing.verdicts import LOAD, RESPONSE_TIME, context_switch_ns
+from rack.boards.config import shared_out
+from rack.tools.timing.level_timing import LevelTiming, level_timings, unjudged
+from rack.tools.timing.prediction import Prediction, predict
+from rack.tools.timing.tables import level_table, ms, response_table, verdict_table
+from rack.tools.timing.task_response import TaskResponse, task_responses
+from rack.tools.timing.trial import Trial
+from rack.tools.timing.verdict import Verdict
+from rack.tools.timing.verdicts import LOAD, RESPONSE_TIME, context_switch_ns
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from backplane.layout import Layout
-from boards.config.schema import BoardConfig, Coupling, RackConfig
-from boards.config.timing import tick_ns
-from levels.timing.budget import Budget
-from levels.timing.equations import communication_ns, residual_ns
-from tools.timing.prediction import longest_cycles
+from rack.backplane.layout import Layout
+from rack.boards.config.schema import BoardConfig, Coupling, RackConfig
+from rack.boards.config.timing import tick_ns
+from rack.levels.timing.budget import Budget
+from rack.levels.timing.equations import communication_ns, residual_ns
+from rack.tools.timing.prediction import longest_cycles
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from levels.timing.budget import Budget
-from tools.analysis.cycles import Cycles, cycles_of
-from tools.recording import Recording
+from rack.levels.timing.budget import Budget
+from rack.tools.analysis.cycles import Cycles, cycles_of
+from rack.tools.recording import Recording
 
 WORST = 100.0
 """The percentile that eq. 3.6 speaks of: the longest of all cycles."""
@@ -20,7 +20,7 @@ def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[st
     They are the longest times of all cycles, as eq. 3.6 has it, whether or not they fell into one cycle; with a
     `percentile` below 100 the longest of that many in a hundred: a virtual machine that its host stalls counts
     that as processor time of whoever was running. The start-up of processes does not count
-    (`tools.analysis.cycles.START_UP_S`). Raises `Failure` for a recording that lacks columns of the trace.
+    (`rack.tools.analysis.cycles.START_UP_S`). Raises `Failure` for a recording that lacks columns of the trace.
     """
     return budgets_of(cycles_of(recording), percentile)
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import gcd
 
-from backplane.layout import Layout
-from boards.config.schema import RackConfig
-from levels.timing.equations import system_response_bound_ns, system_response_ns
+from rack.backplane.layout import Layout
+from rack.boards.config.schema import RackConfig
+from rack.levels.timing.equations import system_response_bound_ns, system_response_ns
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from tools.timing.change import Change
-from tools.timing.changes import LONGEST, changes_for
-from tools.timing.trial import Trial
-from tools.timing.verdict import Verdict
+from rack.tools.timing.change import Change
+from rack.tools.timing.changes import LONGEST, changes_for
+from rack.tools.timing.trial import Trial
+from rack.tools.timing.verdict import Verdict
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from tools.text_table import table
-from tools.timing.level_timing import LevelTiming
-from tools.timing.task_response import TaskResponse
-from tools.timing.verdict import Verdict
+from rack.tools.text_table import table
+from rack.tools.timing.level_timing import LevelTiming
+from rack.tools.timing.task_response import TaskResponse
+from rack.tools.timing.verdict import Verdict
 
 
 def level_table(levels: Iterable[LevelTiming], width: int | None = None) -> Iterator[str]:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from levels.timing.response_time import blocking_ns, job_ns, response_times
-from levels.timing.tasks import TimedTask
+from rack.levels.timing.response_time import blocking_ns, job_ns, response_times
+from rack.levels.timing.tasks import TimedTask
 
 
 @dataclass(frozen=True)

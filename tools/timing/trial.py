@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
-from backplane.address_map import CLOCK
-from backplane.layout import Layout, Protocol
-from boards.config import RackConfig, loads, wire
-from boards.config.timing import asked_core, tick_ns, timed_tasks
-from boards.errors import ConfigError
-from levels.timing.budget import Budget
-from levels.timing.response_time import load_of
-from levels.timing.tasks import TimedTask
-from tools.timing.level_timing import LevelTiming, level_timings
-from tools.timing.verdict import Verdict
-from tools.timing.verdicts import LOAD, context_switch_ns, level_verdicts, system_verdicts, verdicts
+from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout, Protocol
+from rack.boards.config import RackConfig, loads, wire
+from rack.boards.config.timing import asked_core, tick_ns, timed_tasks
+from rack.boards.errors import ConfigError
+from rack.levels.timing.budget import Budget
+from rack.levels.timing.response_time import load_of
+from rack.levels.timing.tasks import TimedTask
+from rack.tools.timing.level_timing import LevelTiming, level_timings
+from rack.tools.timing.verdict import Verdict
+from rack.tools.timing.verdicts import LOAD, context_switch_ns, level_verdicts, system_verdicts, verdicts
 
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values; None takes a key out."""

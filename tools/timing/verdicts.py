@@ -10,17 +10,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from math import inf
 
-from backplane.layout import Layout
-from boards.config.schema import RackConfig
-from boards.config.timing import NS_PER_MS, tick_ns, timed_tasks
-from levels.timing import equations
-from levels.timing.budget import Budget
-from levels.timing.relation import Relation
-from levels.timing.response_time import load_of, response_times
-from levels.timing.tasks import TimedTask
-from tools.timing.level_timing import LevelTiming, level_timings
-from tools.timing.prediction import chains, longest_cycles, response_ticks
-from tools.timing.verdict import Verdict
+from rack.backplane.layout import Layout
+from rack.boards.config.schema import RackConfig
+from rack.boards.config.timing import NS_PER_MS, tick_ns, timed_tasks
+from rack.levels.timing import equations
+from rack.levels.timing.budget import Budget
+from rack.levels.timing.relation import Relation
+from rack.levels.timing.response_time import load_of, response_times
+from rack.levels.timing.tasks import TimedTask
+from rack.tools.timing.level_timing import LevelTiming, level_timings
+from rack.tools.timing.prediction import chains, longest_cycles, response_ticks
+from rack.tools.timing.verdict import Verdict
 
 SYSTEM = "system"
 """The subject of what the levels do together."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from backplane.layout import MailboxSpec
-from backplane.message import State
-from levels.messages import Verb
-from tools.viewer.blocks import Block, Changes
-from tools.viewer.lanes import style_lane, write_spans
-from tools.viewer.palette import STATES
-from tools.viewer.stream import Stream
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.message import State
+from rack.levels.messages import Verb
+from rack.tools.viewer.blocks import Block, Changes
+from rack.tools.viewer.lanes import style_lane, write_spans
+from rack.tools.viewer.palette import STATES
+from rack.tools.viewer.stream import Stream
 
 LEVELS, LOG = "levels", "log"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from backplane.layout import Layout, MailboxSpec
-from tools.viewer.blocks import Block
-from tools.viewer.stream import Stream
-from tools.viewer.timelines import Ints
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.timelines import Ints
 
 AGES = "ages"
 

@@ -8,13 +8,14 @@ from typing import Protocol
 import numpy as np
 import rerun as rr
 
-from tools.viewer.timelines import Ints, Timelines
+from rack.tools.viewer.timelines import Ints, Timelines
 
 
 class Block:
     """Rows of one ring, oldest first, with their times.
 
-    A mailbox's rows have the fields of `backplane.ring.mailbox_ring`, a trace's those of `backplane.trace.RECORD`.
+    A mailbox's rows have the fields of `rack.backplane.ring.mailbox_ring`, those of a trace the fields of
+    `rack.backplane.trace.RECORD`.
     """
 
     def __init__(self, rows: np.ndarray, stamp: str, timelines: Timelines) -> None:

@@ -6,26 +6,26 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
-from backplane.layout import Layout
-from boards.config import RackConfig
-from levels.cell import Cell
-from levels.messages import SERVO_STATUS
-from tools.timing.prediction import hierarchy
-from tools.viewer import ages, load
-from tools.viewer.activity import LEVELS, LOG
-from tools.viewer.document import CONFIG
-from tools.viewer.events import EVENTS
-from tools.viewer.eye import eye_on
-from tools.viewer.fields import SIGNALS
-from tools.viewer.gantt import BOARDS
-from tools.viewer.geometry import CELL, COLLISION
-from tools.viewer.hierarchy import COLUMN, HIERARCHY, ROW, positions
-from tools.viewer.joints import ERROR, GRIPPER, JOINTS, QUANTITIES
-from tools.viewer.lanes import lanes_view
-from tools.viewer.own import RECORDER
-from tools.viewer.poses import FRAMES
-from tools.viewer.stream import path
-from tools.viewer.timelines import SIM_TIME
+from rack.backplane.layout import Layout
+from rack.boards.config import RackConfig
+from rack.levels.cell import Cell
+from rack.levels.messages import SERVO_STATUS
+from rack.tools.timing.prediction import hierarchy
+from rack.tools.viewer import ages, load
+from rack.tools.viewer.activity import LEVELS, LOG
+from rack.tools.viewer.document import CONFIG
+from rack.tools.viewer.events import EVENTS
+from rack.tools.viewer.eye import eye_on
+from rack.tools.viewer.fields import SIGNALS
+from rack.tools.viewer.gantt import BOARDS
+from rack.tools.viewer.geometry import CELL, COLLISION
+from rack.tools.viewer.hierarchy import COLUMN, HIERARCHY, ROW, positions
+from rack.tools.viewer.joints import ERROR, GRIPPER, JOINTS, QUANTITIES
+from rack.tools.viewer.lanes import lanes_view
+from rack.tools.viewer.own import RECORDER
+from rack.tools.viewer.poses import FRAMES
+from rack.tools.viewer.stream import path
+from rack.tools.viewer.timelines import SIM_TIME
 
 CYCLES_S = 0.022
 """What the Gantt lanes show before and behind the time that is looked at: some cycles of fast and of slower boards."""

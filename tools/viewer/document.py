@@ -6,9 +6,9 @@ import platform
 
 import rerun as rr
 
-from backplane.layout import Layout
-from boards.config import RackConfig
-from tools.viewer.stream import Stream
+from rack.backplane.layout import Layout
+from rack.boards.config import RackConfig
+from rack.tools.viewer.stream import Stream
 
 CONFIG = "config"
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import rerun as rr
 
-from tools.viewer import palette
-from tools.viewer.activity import LOG
-from tools.viewer.hierarchy import Hierarchy
-from tools.viewer.lanes import style_lane, write_span
-from tools.viewer.stream import Stream
+from rack.tools.viewer import palette
+from rack.tools.viewer.activity import LOG
+from rack.tools.viewer.hierarchy import Hierarchy
+from rack.tools.viewer.lanes import style_lane, write_span
+from rack.tools.viewer.stream import Stream
 
 EVENTS = "events"
 UNSHOWN = ("printed", "miss")

@@ -6,9 +6,9 @@ from math import prod
 
 import rerun as rr
 
-from backplane.layout import FieldSpec, MailboxSpec
-from tools.viewer.blocks import Block
-from tools.viewer.stream import Stream
+from rack.backplane.layout import FieldSpec, MailboxSpec
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.stream import Stream
 
 SIGNALS = "signals"
 MOST_CURVES = 16

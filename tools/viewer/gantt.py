@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from backplane.layout import TaskSpec
-from backplane.trace import Flag
-from tools.viewer.blocks import Block
-from tools.viewer.lanes import style_lane, write_spans
-from tools.viewer.palette import PHASES
-from tools.viewer.stream import Stream
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import Flag
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.lanes import style_lane, write_spans
+from rack.tools.viewer.palette import PHASES
+from rack.tools.viewer.stream import Stream
 
 BOARDS = "boards"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")

@@ -7,8 +7,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from tools.viewer.shapes import shape_of, xyzw
-from tools.viewer.stream import Stream
+from rack.tools.viewer.shapes import shape_of, xyzw
+from rack.tools.viewer.stream import Stream
 
 CELL, COLLISION = "cell", "collision"
 WORLD = "world"

@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import rerun as rr
 
-from backplane.layout import Layout
-from backplane.message import State
-from backplane.trace import Flag
-from tools.viewer.blocks import Block
-from tools.viewer.palette import STATES
-from tools.viewer.stream import Stream
+from rack.backplane.layout import Layout
+from rack.backplane.message import State
+from rack.backplane.trace import Flag
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.palette import STATES
+from rack.tools.viewer.stream import Stream
 
 HIERARCHY = "hierarchy"
 ROW, COLUMN = 45.0, 110.0

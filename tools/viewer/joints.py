@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from levels.cell import Cell
-from tools.viewer.blocks import Block
-from tools.viewer.palette import COMMANDED, LIMIT, of_joint
-from tools.viewer.stream import Stream
+from rack.levels.cell import Cell
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.palette import COMMANDED, LIMIT, of_joint
+from rack.tools.viewer.stream import Stream
 
 JOINTS, ERROR, GRIPPER = "joints", "tracking_error", "gripper"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}

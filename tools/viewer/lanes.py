@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import rerun as rr
 import rerun.blueprint as rrb
 
-from tools.viewer.palette import Colour
-from tools.viewer.stream import Stream
+from rack.tools.viewer.palette import Colour
+from rack.tools.viewer.stream import Stream
 
 
 def style_lane(stream: Stream, entity: Sequence[str], colours: Mapping[str, Colour], quiet: Sequence[str] = ()) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from backplane.layout import TaskSpec
-from tools.viewer.blocks import Block
-from tools.viewer.palette import LIMIT, of_joint
-from tools.viewer.stream import Stream
+from rack.backplane.layout import TaskSpec
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.palette import LIMIT, of_joint
+from rack.tools.viewer.stream import Stream
 
 LOAD, TIMES = "load", "times"
 

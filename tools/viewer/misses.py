@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from backplane.layout import TaskSpec
-from backplane.trace import Flag
-from tools.viewer.activity import LEVELS, LOG
-from tools.viewer.blocks import Block
-from tools.viewer.lanes import style_lane, write_spans
-from tools.viewer.palette import PHASES
-from tools.viewer.stream import Stream
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import Flag
+from rack.tools.viewer.activity import LEVELS, LOG
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.lanes import style_lane, write_spans
+from rack.tools.viewer.palette import PHASES
+from rack.tools.viewer.stream import Stream
 
 MISSED = "missed"
 SPAN_S = 0.25

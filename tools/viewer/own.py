@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import rerun as rr
 
-from tools.viewer.activity import LOG
-from tools.viewer.stream import Stream
+from rack.tools.viewer.activity import LOG
+from rack.tools.viewer.stream import Stream
 
 RECORDER = "recorder"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping
 
-from backplane.layout import Layout, MailboxSpec
-from boards.config import RackConfig
-from levels.cell import Cell
-from levels.messages import (
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.boards.config import RackConfig
+from rack.levels.cell import Cell
+from rack.levels.messages import (
     ARM_STATE,
     JOINT_SET_POINT,
     MOVE_PLAN,
@@ -18,13 +18,13 @@ from levels.messages import (
     TASK_PLAN,
     WORLD_MODEL,
 )
-from tools.viewer.activity import Activity, Commanded, Moves
-from tools.viewer.blocks import Part
-from tools.viewer.fields import Fields
-from tools.viewer.joints import Joints
-from tools.viewer.poses import Poses
-from tools.viewer.stream import Stream
-from tools.viewer.ways import CurrentGoal, Goals, PlannedPath
+from rack.tools.viewer.activity import Activity, Commanded, Moves
+from rack.tools.viewer.blocks import Part
+from rack.tools.viewer.fields import Fields
+from rack.tools.viewer.joints import Joints
+from rack.tools.viewer.poses import Poses
+from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.ways import CurrentGoal, Goals, PlannedPath
 
 SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
 """Messages whose numbers nobody reads as curves."""

@@ -1,4 +1,4 @@
-"""Pictures of a recording without a screen: `python -m tools.viewer.pictures RUN/run.rrd OUT.png --at 7.5`."""
+"""Pictures of a recording without a screen: `python -m rack.tools.viewer.pictures RUN/run.rrd OUT.png --at 7.5`."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from tools.answer import Failure
-from tools.viewer.timelines import SIM_TIME
-from tools.viewer.window import HOST, Window, free_port, url
+from rack.tools.answer import Failure
+from rack.tools.viewer.timelines import SIM_TIME
+from rack.tools.viewer.window import HOST, Window, free_port, url
 
 PATIENCE_S = 30.0
 LOOK_S = 0.05
@@ -124,7 +124,7 @@ def packages_text() -> str:
 
 def main() -> int:
     """Save one picture; return 1 when the viewer complained of anything."""
-    parser = argparse.ArgumentParser(prog="python -m tools.viewer.pictures", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m rack.tools.viewer.pictures", description=__doc__)
     parser.add_argument("recording", type=Path, help="a run.rrd")
     parser.add_argument("out", type=Path, help="PNG file to write")
     parser.add_argument("--at", type=float, required=True, metavar="S", help="simulated time to look at, s")

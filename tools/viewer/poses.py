@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import rerun as rr
 
-from levels.cell import STATE, Cell
-from tools.viewer.blocks import Block
-from tools.viewer.geometry import CELL, WORLD, frame_of, moving_bodies
-from tools.viewer.shapes import xyzw
-from tools.viewer.stream import Stream
+from rack.levels.cell import STATE, Cell
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.geometry import CELL, WORLD, frame_of, moving_bodies
+from rack.tools.viewer.shapes import xyzw
+from rack.tools.viewer.stream import Stream
 
 FRAMES = "frames"
 POSES_S = 0.02

@@ -8,25 +8,25 @@ from pathlib import Path
 
 import numpy as np
 
-from backplane.address_map import CLOCK
-from backplane.segment import Segment
-from backplane.words import Head, System
-from boards.config import loads
-from tools.timing.prediction import hierarchy
-from tools.viewer.ages import Age
-from tools.viewer.blocks import Block, Part
-from tools.viewer.blueprint import blueprint
-from tools.viewer.document import write_document
-from tools.viewer.events import Events
-from tools.viewer.gantt import Gantt
-from tools.viewer.geometry import write_geometry
-from tools.viewer.hierarchy import Hierarchy
-from tools.viewer.load import Load
-from tools.viewer.misses import Misses
-from tools.viewer.own import Losses
-from tools.viewer.parts import parts_of
-from tools.viewer.stream import Stream
-from tools.viewer.timelines import Timelines
+from rack.backplane.address_map import CLOCK
+from rack.backplane.segment import Segment
+from rack.backplane.words import Head, System
+from rack.boards.config import loads
+from rack.tools.timing.prediction import hierarchy
+from rack.tools.viewer.ages import Age
+from rack.tools.viewer.blocks import Block, Part
+from rack.tools.viewer.blueprint import blueprint
+from rack.tools.viewer.document import write_document
+from rack.tools.viewer.events import Events
+from rack.tools.viewer.gantt import Gantt
+from rack.tools.viewer.geometry import write_geometry
+from rack.tools.viewer.hierarchy import Hierarchy
+from rack.tools.viewer.load import Load
+from rack.tools.viewer.misses import Misses
+from rack.tools.viewer.own import Losses
+from rack.tools.viewer.parts import parts_of
+from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.timelines import Timelines
 
 FILE = "run.rrd"
 BLOCK_S = 1.0
@@ -47,7 +47,7 @@ class ViewSink:
         config = loads(segment.config)
         cell = None
         if config.robot is not None:
-            from levels.cell import build_cell
+            from rack.levels.cell import build_cell
 
             cell = build_cell(config.robot, config.scene, config.clock_ns)
         self._times = Timelines(layout.clock_ns)

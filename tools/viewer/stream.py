@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from tools.viewer.timelines import SIM_TIME, TICK, WALL, Timelines
+from rack.tools.viewer.timelines import SIM_TIME, TICK, WALL, Timelines
 
 APPLICATION = "rack"
 FLUSH_S = 0.5

@@ -9,12 +9,12 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from levels.cell import Cell
-from levels.messages import SegmentKind, Verb
-from tools.viewer.blocks import Block, Changes
-from tools.viewer.geometry import CELL, WORLD
-from tools.viewer.palette import CURRENT, GOAL, PLANNED
-from tools.viewer.stream import Stream
+from rack.levels.cell import Cell
+from rack.levels.messages import SegmentKind, Verb
+from rack.tools.viewer.blocks import Block, Changes
+from rack.tools.viewer.geometry import CELL, WORLD
+from rack.tools.viewer.palette import CURRENT, GOAL, PLANNED
+from rack.tools.viewer.stream import Stream
 
 PATH, WAYPOINTS = (CELL, "planned_path"), (CELL, "way_points")
 GOALS, CURRENT_GOAL = (CELL, "goals"), (CELL, "current_goal")

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tools.answer import Failure
+from rack.tools.answer import Failure
 
 HOST = "127.0.0.1"
 PANIC = "panicked at "

@@ -1,4 +1,4 @@
-"""One core, one unit of time after the other: what `levels.timing.schedule` works out from event to event.
+"""One core, one unit of time after the other: what `rack.levels.timing.schedule` works out from event to event.
 
 Written for tests, from the rules alone: slow, and too simple to be wrong in the same way.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from levels.timing.tasks import TimedTask
+from rack.levels.timing.tasks import TimedTask
 
 
 def run(tasks: Sequence[TimedTask], until: int) -> tuple[list[str], dict[tuple[str, int], int]]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from levels.timing.chart import Chart, Job, Span
-from levels.timing.tasks import Unit
+from rack.levels.timing.chart import Chart, Job, Span
+from rack.levels.timing.tasks import Unit
 
 SPANS = (
     Span("a", 0, Unit.PROCESS, 0, 10, 0),

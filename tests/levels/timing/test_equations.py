@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import pytest
 
-from levels.timing import equations as timing
-from levels.timing.relation import Relation
+from rack.levels.timing import equations as timing
+from rack.levels.timing.relation import Relation
 
 MS = 1_000_000
 READ = WRITE = UPDATE = PLANNER_EXCHANGE = 1 * MS

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
-from levels.timing.response_time import blocking_ns, load_of, response_time, response_times
-from levels.timing.schedule import simulate
-from levels.timing.tasks import Part, TimedTask, Unit
+from rack.levels.timing.response_time import blocking_ns, load_of, response_time, response_times
+from rack.levels.timing.schedule import simulate
+from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 SETS = 300
 PERIODS = (4, 5, 6, 8, 10, 12, 15, 20, 24)

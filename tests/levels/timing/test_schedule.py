@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from levels.timing.chart import Chart
-from levels.timing.schedule import simulate
-from levels.timing.tasks import Part, TimedTask, Unit
+from rack.levels.timing.chart import Chart
+from rack.levels.timing.schedule import simulate
+from rack.levels.timing.tasks import Part, TimedTask, Unit
 from tests.levels.timing.step_by_step import run
 
 C, R, X, W, P, U = Unit

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from boards.config import budgets, load
-from tools.timing.trial import Trial
+from rack.boards.config import budgets, load
+from rack.tools.timing.trial import Trial
 
 BUDGETED = f"""
 name = "budgeted"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from boards.config import budgets, load, loads
+from rack.boards.config import budgets, load, loads
+from rack.tools.timing.change import Change
+from rack.tools.timing.changes import changes_for, first_that
+from rack.tools.timing.repair import repair
+from rack.tools.timing.trial import Trial
 from tests.tools.timing.conftest import Judge
-from tools.timing.change import Change
-from tools.timing.changes import changes_for, first_that
-from tools.timing.repair import repair
-from tools.timing.trial import Trial
 
 
 def settings_for(trial: Trial, board: str = "lower") -> list[dict[str, object]]:

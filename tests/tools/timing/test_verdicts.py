@@ -6,10 +6,10 @@ from math import inf
 
 import pytest
 
-from boards.config import budgets, load
+from rack.boards.config import budgets, load
+from rack.tools.timing.trial import Trial
+from rack.tools.timing.verdict import Verdict
 from tests.tools.timing.conftest import Judge
-from tools.timing.trial import Trial
-from tools.timing.verdict import Verdict
 
 MS = 1_000_000
 LOOSE = ("board.lower.coupling=loose", "board.lower.planner_slot=4", "board.lower.planner_core=2")
