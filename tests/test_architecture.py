@@ -1,9 +1,13 @@
-"""The house: imports point downward only, and files stay small."""
+"""The house: imports point downward only, folders form no circle, and files stay small."""
 
 from __future__ import annotations
 
 import ast
 import sys
+import tomllib
+from collections import defaultdict
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -15,23 +19,52 @@ LONGEST_FILE = 400
 SOURCES = sorted(path for floor in FLOORS for path in (ROOT / floor).rglob("*.py"))
 
 
-def imported(path: Path) -> set[str]:
-    """Return the top-level packages that a file imports, at its head or later."""
+@cache
+def imported(path: Path) -> frozenset[str]:
+    """Return the modules that a file imports, at its head or later, by their dotted names."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
     names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    names |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom) and node.level == 0}
-    return {name.partition(".")[0] for name in names}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            submodules = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= {name for name in submodules if file_of(name)} or {node.module}
+    return frozenset(names)
+
+
+def file_of(module: str) -> Path | None:
+    """Return the file of one of our own modules."""
+    place = ROOT.joinpath(*module.split(".")[1:]) if module.startswith("rack.") else None
+    found = [p for p in (place.with_suffix(".py"), place / "__init__.py") if p.exists()] if place else []
+    return found[0] if found else None
+
+
+def packages(path: Path) -> set[str]:
+    """Return the top-level packages that a file imports; of our own, the floors."""
+    return {".".join(name.split(".")[: 1 + name.startswith("rack.")]) for name in imported(path)}
 
 
 @pytest.mark.parametrize("floor", FLOORS)
 def test_imports_point_downward_only(floor: str) -> None:
-    above = set(FLOORS[FLOORS.index(floor) + 1 :]) | {"tests"}
+    above = {f"rack.{name}" for name in FLOORS[FLOORS.index(floor) + 1 :]} | {"tests"}
     upward = {
         f"{path.relative_to(ROOT)} imports {', '.join(sorted(found))}"
         for path in SOURCES
-        if path.is_relative_to(ROOT / floor) and (found := imported(path) & above)
+        if path.is_relative_to(ROOT / floor) and (found := packages(path) & above)
     }
     assert not upward
+
+
+def test_folders_form_no_circle() -> None:
+    # A folder's __init__ shows what the folder has to offer: it is no part of what the folder's files need.
+    needs: defaultdict[Path, set[Path]] = defaultdict(set)
+    for path in SOURCES:
+        if path.name != "__init__.py":
+            found = {file.parent for name in imported(path) if (file := file_of(name))}
+            needs[path.parent.relative_to(ROOT)] |= {folder.relative_to(ROOT) for folder in found - {path.parent}}
+    try:
+        TopologicalSorter(needs).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(str(folder) for folder in reversed(error.args[1])))
 
 
 def test_no_import_is_relative() -> None:
@@ -49,16 +82,31 @@ def test_no_file_grows_beyond_what_one_can_read() -> None:
     assert not long
 
 
+def test_no_two_classes_share_a_name() -> None:
+    places = defaultdict(list)
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(str(path.relative_to(ROOT)))
+    assert not {name: files for name, files in places.items() if len(files) > 1}
+
+
 def test_bus_and_levels_need_no_tool_of_the_host_side() -> None:
     # A board's process must not carry what only a terminal or a recorder needs.
     host_side = {"pyarrow", "rerun", "rich", "typer"}
     needing = {
-        str(p.relative_to(ROOT)) for p in SOURCES if p.parts[len(ROOT.parts)] != "tools" and imported(p) & host_side
+        str(p.relative_to(ROOT)) for p in SOURCES if p.parts[len(ROOT.parts)] != "tools" and packages(p) & host_side
     }
     assert not needing
 
 
 def test_the_ground_floor_stands_on_published_packages_alone() -> None:
-    allowed = set(sys.stdlib_module_names) | {"backplane", "numpy", "posix_ipc"}
-    other = {name for path in SOURCES if path.is_relative_to(ROOT / "backplane") for name in imported(path)} - allowed
+    allowed = set(sys.stdlib_module_names) | {"rack.backplane", "numpy", "posix_ipc"}
+    other = {name for path in SOURCES if path.is_relative_to(ROOT / "backplane") for name in packages(path)} - allowed
     assert not other
+
+
+def test_every_folder_is_installed() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {".".join(("rack", *path.parent.relative_to(ROOT).parts)) for path in SOURCES} | {"rack.configs"}
+    assert set(listed) == folders

@@ -68,7 +68,7 @@ def test_the_example_level_runs_as_the_readme_has_it(example: Path) -> None:
 
 
 def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
-    script = re.search(r"```python\n(from boards.rack.*?)```", README.read_text(), re.DOTALL)
+    script = re.search(r"```python\n(from rack\.boards.*?)```", README.read_text(), re.DOTALL)
     assert script
     named = script[1].replace('["clock', f'["name={OWN_NAME}", "clock').replace("seconds=10", "seconds=1")
     (tmp_path / "script.py").write_text(named)
