@@ -1,13 +1,19 @@
-"""Configs: found, merged, validated, and wired into the layout of a rack."""
+"""Configs: from TOML to a rack.
 
-from rack.boards.config.context import context
-from rack.boards.config.cores import shared_out
+- `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a `RackConfig`.
+- `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults, commands.
+- `wire(config)`: the layout alone.
+- `names()`, `CONFIGS`, `FAULTS`: the bundled configs and fault scripts.
+- `budgets(config)`, `timed_tasks(config, layout, budgets)`: the config in terms of the timing model.
+
+Everything wrong with a config is a `ConfigError`, which reports all mistakes at once.
+"""
+
 from rack.boards.config.files import CONFIGS, FAULTS, names
-from rack.boards.config.loading import load, loads
-from rack.boards.config.ports import TaskPorts, task_ports
+from rack.boards.config.layout import shared_out
+from rack.boards.config.resolve import Resolved, load, loads, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
 from rack.boards.config.timing import budgets, timed_tasks
-from rack.boards.config.wiring import wire
 
 __all__ = [
     "CLOCK_SLOT",
@@ -16,14 +22,13 @@ __all__ = [
     "BoardConfig",
     "ClockConfig",
     "RackConfig",
-    "TaskPorts",
+    "Resolved",
     "budgets",
-    "context",
     "load",
     "loads",
     "names",
+    "resolve",
     "shared_out",
-    "task_ports",
     "timed_tasks",
     "wire",
 ]

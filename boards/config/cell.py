@@ -1,4 +1,4 @@
-"""The sizes of messages that follow from the arm and its cell, built once in a process."""
+"""What follows from the arm and its cell, built once per process: sizes of messages, names of geoms."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from rack.levels.scene import SceneConfig
 
 
 def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = True) -> dict[str, int]:
-    """Return the symbolic sizes by name, none without an arm; add what is wrong with the cell to `mistakes`.
+    """Return the symbolic sizes by name, none without an arm; add everything wrong with the cell to `mistakes`.
 
-    Of a cell that is not whole, as [robot] or [scene] have mistakes of their own, only names are looked up.
+    If the cell is not whole, as [robot] or [scene] has mistakes of its own, only names are looked up.
     """
     if config.robot is None:
         return {}
@@ -32,7 +32,7 @@ def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = Tru
 
 
 def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
-    """Return a line for every name that the model does not have; none of a model that cannot be read."""
+    """Return a line for every name that the model does not have; none if the model cannot be read."""
     from rack.levels.cell_index import unknown_names
 
     try:
@@ -43,7 +43,7 @@ def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
 
 @lru_cache(maxsize=4)
 def _sizes(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[tuple[str, int], ...]:
-    from rack.levels.cell import build_cell, sizes  # MuJoCo takes half a second to import: only who has an arm pays
+    from rack.levels.cell import build_cell, sizes  # importing MuJoCo takes half a second: only racks with an arm pay
 
     return tuple(sizes(build_cell(robot, scene, clock_ns)).items())
 
@@ -56,7 +56,7 @@ def geom_name(robot: RobotConfig, scene: SceneConfig, clock_ns: int, geom: int) 
 @lru_cache(maxsize=4)
 def _geom_names(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[str, ...]:
     from rack.levels import touches
-    from rack.levels.cell import build_cell  # likewise
+    from rack.levels.cell import build_cell
 
     model = build_cell(robot, scene, clock_ns).model
     return tuple(touches.geom_name(model, geom) for geom in range(model.ngeom))

@@ -18,7 +18,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
 from rack.boards.faults.config import FaultConfig
-from rack.boards.operating.text import message_of
+from rack.boards.operating.command import message_of
 from rack.boards.outcome import Outcome
 from rack.boards.rack import Rack
 from rack.levels.operator import Answer, Goal, What
@@ -189,7 +189,7 @@ def test_what_a_program_says_must_fit_the_rack(told: Callable[..., RackConfig]) 
     with Rack(told()) as rack:
         with pytest.raises(ConfigError, match="what = \"halt\": should be 'hold', 'resume'"):
             rack.command("lower", "halt")
-        with pytest.raises(ConfigError, match="'lower' takes no goto; it takes: hold, resume"):
+        with pytest.raises(ConfigError, match="'lower' does not take goto; it takes: hold, resume"):
             rack.command("lower", "goto", home=True)
 
 
@@ -208,23 +208,23 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 MISTAKES = {
     "no such level": (
         "level='uper', what='hold'",
-        'command[0].level = "uper": no level that can be commanded; levels: upper, lower',
+        'command[0].level = "uper": no such level takes commands; levels: upper, lower',
     ),
     "not for this level": (
         "level='lower', what='goto', home=true",
-        "command[0].what = \"goto\": 'lower' takes no goto; it takes: hold, resume",
+        "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume",
     ),
-    "no goal": ("level='upper', what='goto'", "command[0].goal: missing; goto of 'upper' has one of: home"),
+    "no goal": ("level='upper', what='goto'", "command[0].goal: missing; goto of 'upper' takes one of: home"),
     "another goal": (
         "level='upper', what='goto', joints=[1.0]",
-        "command[0].joints: no goal for goto of 'upper'; permitted: home",
+        "command[0].joints: not a goal for goto of 'upper'; permitted: home",
     ),
     "two goals": (
         "level='upper', what='goto', joints=[1.0], home=true",
-        "command[0].goal: joints|home are given; goto of 'upper' has one of: home",
+        "command[0].goal: several given: joints|home; goto of 'upper' takes one of: home",
     ),
-    "a goal too much": ("level='upper', what='hold', home=true", "command[0].home: hold has no goal; leave it out"),
-    "two times": ("level='upper', what='hold', tick=3, at=1", "command[0].at = 1.0: tick is given as well"),
+    "a goal too much": ("level='upper', what='hold', home=true", "command[0].home: hold takes no goal; remove it"),
+    "two times": ("level='upper', what='hold', tick=3, at=1", "command[0].at = 1.0: tick is also given"),
     "unknown key": ("level='upper', what='hold', tik=3", "command[0].tik = 3: unknown key; did you mean 'tick'?"),
 }
 
@@ -244,11 +244,11 @@ def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
     beyond = [*robot.home[:2], 9.0, *robot.home[3:]]
     with pytest.raises(ConfigError) as caught:
         wire(load("nasrem", [commands(f"level='servo', what='setpoint', joints={beyond}")]))
-    assert str(caught.value).startswith("command[0].joints = 9.0: joint 'j3' cannot be there; permitted: ")
-    with pytest.raises(ConfigError, match="2 values; one a joint makes 6: j1, j2, "):
+    assert str(caught.value).startswith("command[0].joints = 9.0: out of range for joint 'j3'; permitted: ")
+    with pytest.raises(ConfigError, match="2 values; permitted: 6, one per joint: j1, j2, "):
         wire(load("nasrem", [commands("level='servo', what='setpoint', joints=[0.0, 0.0]")]))
 
 
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
-    with pytest.raises(ConfigError, match="the clock writes it, and waits for nobody"):
+    with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
         wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=TOLD))

@@ -113,15 +113,15 @@ def test_what_can_be_told_to_whom_is_listed(running: str) -> None:
 
 
 REFUSED = {
-    "no level": (("uper", "hold"), 'level = "uper": no level that can be commanded; levels: upper, lower'),
+    "no level": (("uper", "hold"), 'level = "uper": no such level takes commands; levels: upper, lower'),
     "no wait to bound": (
         ("upper", "hold", "--timeout", "1"),
         "--timeout is the bound of --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
     "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
-    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' takes no setpoint; it takes: hold, resume"),
-    "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' has one of: home"),
+    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
+    "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
     "no word": (("upper", "goto", "hom"), "'hom' is no goal; permitted: home, joints=..., position=..."),
     "no number": (("upper", "goto", "joints=1,x"), "'joints=1,x': 'x' is not a number; permitted: numbers with commas"),
     "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),

@@ -13,7 +13,7 @@ import pytest
 
 from rack.boards.config import load, wire
 from rack.boards.config.schema import RackConfig
-from rack.boards.operating.config import CommandConfig
+from rack.boards.operating.command import CommandConfig
 from rack.tools.answer import Failure
 from rack.tools.bench.response import Bench
 from rack.tools.progress import Silent

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from rack.boards.config import load, wire
-from rack.boards.operating.config import CommandConfig
+from rack.boards.operating.command import CommandConfig
 from rack.tools.answer import Failure
 from rack.tools.progress import Progress
 from rack.tools.recording import Recording

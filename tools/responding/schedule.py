@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from random import Random
 
-from rack.boards.operating.config import CommandConfig
+from rack.boards.operating.command import CommandConfig
 from rack.tools.responding.course import Course
 
 RUN_S = 24.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rack.boards.config.schema import RackConfig
-from rack.boards.operating.config import CommandConfig
+from rack.boards.operating.command import CommandConfig
 from rack.boards.rack import Rack
 from rack.tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
 from rack.tools.recording import Recording

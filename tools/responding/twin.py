@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rack.boards.config.schema import RackConfig
-from rack.boards.operating.config import CommandConfig
+from rack.boards.operating.command import CommandConfig
 from rack.tools.recording import Recording
 from rack.tools.responding.response import Answered, Response
 from rack.tools.responding.trial import run

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from rack.boards.config.cores import obtained_core
+from rack.boards.config.layout import obtained_core
 from rack.boards.config.timing import tick_ns
 from rack.tools.timing.prediction import predict
 from rack.tools.timing.trial import Trial

@@ -9,9 +9,8 @@ import pytest
 
 from rack.backplane.layout import depth_for
 from rack.backplane.slots import message_dtype
-from rack.boards.config import context, load, shared_out, task_ports, wire
-from rack.boards.config.cores import obtained_core
-from rack.boards.config.fields import field_specs
+from rack.boards.config import load, resolve, shared_out, wire
+from rack.boards.config.layout import field_specs, obtained_core
 from rack.levels.messages import TASK_COMMAND, TASK_PLAN
 
 SIZES = {"joints": 6, "bodies": 3, "state": 120}
@@ -65,8 +64,10 @@ def test_a_loose_planner_has_a_board_of_its_own(small: Path) -> None:
 
 
 def test_a_port_can_be_wired_to_another_mailbox(small: Path) -> None:
-    config = load(small, ["board.lower.reads={ command = 'upper.command' }", "board.lower.above=upper"])
-    assert task_ports(config, "lower", "executor").reads == {"command": "upper.command", "plan": "lower.plan"}
+    tasks = {
+        task.task: task for task in resolve(load(small, ["board.lower.reads={ command = 'upper.command' }"])).tasks
+    }
+    assert tasks["lower"].inputs == {"command": "upper.command", "plan": "lower.plan"}
 
 
 @pytest.mark.parametrize("kind", [TASK_COMMAND, TASK_PLAN], ids=lambda kind: kind.name)
@@ -89,8 +90,8 @@ def test_cores_that_the_machine_lacks_are_shared_out_and_told(small: Path, monke
 
 
 def test_context_tells_a_level_its_rack_in_ticks(small: Path) -> None:
-    told = context(load(small, ["board.lower.params.gain=2", "seed=5"]), "lower")
+    upper, told, _ = (task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks)
     assert (told.board, told.every, told.within_cycles, told.clock_ns, told.seed) == ("lower", 1, 4, 2_500_000, 5)
     assert told.below is None
-    assert context(load(small), "upper").below == (1, 4)
+    assert upper.below == (1, 4)
     assert told.params == {"gain": 2}
