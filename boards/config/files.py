@@ -13,6 +13,8 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FAULTS = CONFIGS / "faults"
 """Bundled fault scripts, for `--faults`."""
 MAX_FILE_BYTES = 1_000_000
+EXTENDS = "configs that this file extends, by name or path, in order; its own keys override theirs"
+"""Meaning of `extends`, the one key that only files have."""
 
 
 def read(name_or_path: str | Path) -> Tables:

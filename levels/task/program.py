@@ -24,7 +24,7 @@ class Action(Table):
 class Transfer(Action):
     """Take an object to another place."""
 
-    do: Literal["transfer"] = "transfer"
+    do: Literal["transfer"] = Field("transfer", description="the kind of action")
     object: str = Field(description="object of the scene")
     to: Vector = Field(description="where the object's origin goes, m")
     yaw: Finite | None = Field(None, description="turn of the object's x axis there, rad; free when not given")
@@ -37,7 +37,7 @@ class Transfer(Action):
 class Goto(Action):
     """Bring the tool to a pose, or the joints to positions."""
 
-    do: Literal["goto"] = "goto"
+    do: Literal["goto"] = Field("goto", description="the kind of action")
     position: Vector | None = Field(None, description="of the tool, m")
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(None, description="of the tool, as w, x, y, z")
     direction: Vector | None = Field(None, description="of the tool's z axis, any turn about it; down when not given")
@@ -63,7 +63,7 @@ class Goto(Action):
 class Home(Action):
     """Bring the arm back to where it starts."""
 
-    do: Literal["home"] = "home"
+    do: Literal["home"] = Field("home", description="the kind of action")
 
     def __str__(self) -> str:
         return "home"
