@@ -210,7 +210,9 @@ class RackConfig(Table):
 
     def text(self) -> str:
         """Return the config as TOML that loads again with the same meaning, by itself."""
-        tables = self.model_dump(mode="json", exclude_none=True, by_alias=True)
+        # Not in JSON's mode, which knows no infinity and no NaN: a level's parameters may be such numbers.
+        tables = self.model_dump(exclude_none=True, by_alias=True)
+        tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:
             tables["robot"]["model"] = portable(self.robot.model)
         return to_toml(tables)

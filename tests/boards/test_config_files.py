@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,11 +32,17 @@ def test_text_names_a_bundled_model_without_its_folder() -> None:
 
 def test_text_of_a_config_with_strings_and_nested_values_loads_again(small: Path) -> None:
     overrides = [
-        'board.lower.params = { note = "two \\"lines\\"\\nand a tab\\t", gains = [1.5, 2e-9], deep = { on = true } }'
+        "board.lower.params = { gains = [1.5, 2e-9], deep = { on = true } }",
+        'board.lower.params.note = "two \\"lines\\"\\nand a tab\\t, \\u0001, \\u007f"',
+        "board.lower.params.none = []",
+        "board.lower.params.most = [inf, -inf]",
+        'board.lower.params."odd key.x" = [{ empty = {} }]',
     ]
     config = load(small, overrides)
     assert config.board["lower"].params["deep"] == {"on": True}
     assert loads(config.text()) == config
+    config = load(small, [*overrides, "board.lower.params.gain = nan"])
+    assert math.isnan(loads(config.text()).board["lower"].params["gain"])
 
 
 def test_an_unknown_name_lists_the_names_there_are() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rack.boards.config import RackConfig, loads
+from rack.boards.config import RackConfig, loads, resolve
 from rack.boards.config.schema import LAST_SLOT, BoardConfig, Coupling
 from rack.tools.answer import Failure
 
@@ -31,8 +31,8 @@ class Partition:
         boards = {name: self._board(board, free) for name, board in config.board.items()}
         clock = config.clock.model_copy(update={"mode": "realtime", "core": config.clock.core % self.cores})
         changed = config.model_copy(update={"board": boards, "clock": clock})
-        # What a copy permits may still be a mistake: the config is read again as a user's own would be.
-        return loads(changed.text())
+        # A copy is not validated: read and check the config again, as a user's own would be.
+        return resolve(loads(changed.text())).config
 
     def _board(self, board: BoardConfig, free: Iterator[int]) -> BoardConfig:
         core = board.core % self.cores
