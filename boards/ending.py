@@ -7,7 +7,6 @@ from rack.backplane.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.outcome import Cause
-from rack.levels.messages import TASK_STATUS
 
 
 class Ending:
@@ -42,10 +41,13 @@ class Ending:
         """Return why a run ended that was not stopped."""
         if self._observer is None or self._ends_run is None:
             return "time over"
-        status, kind = self._observer.peek().value, self._segment.layout.mailbox(self._ends_run).message
+        status, fields = self._observer.peek().value, self._segment.layout.mailbox(self._ends_run).fields
         if status.state != State.ERROR and not self._silence():
             return "task done" if status.state == State.DONE else "time over"
-        return "task refused" if kind == TASK_STATUS.name and not status.moves else "task failed"
+        # A status with a field `moves` says how many moves its program has: none if it was refused.
+        counts_moves = any(field.name == "moves" and not field.shape for field in fields)
+        is_refused = counts_moves and not status.moves
+        return "task refused" if is_refused else "task failed"
 
     def _silence(self) -> int:
         """Return the ticks since the last status of the level that ends the run; 0: within bounds, or it has ended."""

@@ -1,8 +1,14 @@
-"""What follows from the arm and its cell, built once per process: sizes of messages, names of geoms."""
+"""What follows from the arm and its cell, built once per process.
+
+Importing MuJoCo takes half a second, so functions import it: only racks with an arm pay.
+"""
 
 from __future__ import annotations
 
 from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake
@@ -43,7 +49,7 @@ def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
 
 @lru_cache(maxsize=4)
 def _sizes(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[tuple[str, int], ...]:
-    from rack.levels.cell import build_cell, sizes  # importing MuJoCo takes half a second: only racks with an arm pay
+    from rack.levels.cell import build_cell, sizes
 
     return tuple(sizes(build_cell(robot, scene, clock_ns)).items())
 
@@ -60,3 +66,11 @@ def _geom_names(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[
 
     model = build_cell(robot, scene, clock_ns).model
     return tuple(touches.geom_name(model, geom) for geom in range(model.ngeom))
+
+
+@lru_cache(maxsize=4)
+def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
+    """Return the positions that joints may be commanded to, (joints, 2), rad. Raises `RobotError`."""
+    from rack.levels.cell import build_cell
+
+    return build_cell(robot, scene, clock_ns).limits.position

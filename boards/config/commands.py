@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
@@ -16,6 +14,7 @@ from rack.backplane.message import Message
 from rack.backplane.operator_table import Request
 from rack.backplane.slots import message_dtype
 from rack.boards.classes import find_class
+from rack.boards.config.cell import joint_ranges
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
@@ -24,8 +23,6 @@ from rack.levels.algebra import norm
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor
 from rack.levels.operator import Commands, Goal, goal_names, listed
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
 
 OWN_OPERATOR = "own.operator"
 DOWN = (0.0, 0.0, -1.0)
@@ -158,17 +155,9 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
         yield Mistake(place, list(joints), why)
         return
     try:
-        ranges = _ranges(robot, config.scene, config.clock_ns)
+        ranges = joint_ranges(robot, config.scene, config.clock_ns)
     except RobotError:
         return  # a mistake of its own, reported elsewhere
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
             yield Mistake(place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad")
-
-
-@lru_cache(maxsize=4)
-def _ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
-    """Return the positions that joints may be commanded to, (joints, 2), rad."""
-    from rack.levels.cell import build_cell  # importing MuJoCo takes half a second: only racks with an arm pay
-
-    return build_cell(robot, scene, clock_ns).limits.position

@@ -22,8 +22,8 @@ from rack.boards.operating.command import message_of
 from rack.boards.outcome import Outcome
 from rack.boards.rack import Rack
 from rack.levels.operator import Answer, Goal, What
+from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
-from tests.boards.told_racks import TOLD, commands
 from tests.processes import FORKS, forked, kill, wait_until
 
 HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
@@ -33,7 +33,7 @@ SECONDS = 1.0
 
 @pytest.fixture
 def told(config: MakeConfig) -> Callable[..., RackConfig]:
-    return lambda *settings: config(*settings, text=TOLD)
+    return lambda *settings: config(*settings, text=COMMANDED)
 
 
 def run(config: RackConfig, seconds: float = SECONDS) -> tuple[Outcome, list[Event], dict[str, np.ndarray]]:
@@ -234,7 +234,7 @@ def test_mistakes_of_a_command_name_place_value_and_what_is_permitted(
     config: MakeConfig, table: str, told_as: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
-        wire(config(commands(table), text=TOLD))
+        wire(config(commands(table), text=COMMANDED))
     assert any(str(mistake).startswith(told_as) for mistake in caught.value.mistakes), str(caught.value)
 
 
@@ -251,4 +251,4 @@ def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
 
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
     with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
-        wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=TOLD))
+        wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))

@@ -21,7 +21,7 @@ from rack.tools.commanding import patience
 from rack.tools.commanding.answers import Answers
 from rack.tools.commanding.goals import goal_of
 from rack.tools.commanding.live import LiveDesk
-from tests.boards.told_racks import TOLD
+from tests.boards.commanded_racks import COMMANDED
 from tests.processes import RACK, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +35,7 @@ def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
     """Start a rack that runs until it is stopped; return when it does."""
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -176,7 +176,7 @@ def test_a_clock_without_ticks_is_not_waited_for(
 ) -> None:
     monkeypatch.setattr(patience, "SILENT_S", 0.05)
     path = tmp_path / "told.toml"
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     # Launched and not started: there is a rack, and no clock yet.
     with Rack(load(path, [f"name={rack_name}"])):
         with pytest.raises(Failure, match="no tick for"):

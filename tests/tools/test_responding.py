@@ -25,7 +25,7 @@ from rack.tools.responding.schedule import RUN_S, draw
 from rack.tools.responding.shown import show
 from rack.tools.responding.trial import run
 from rack.tools.responding.twin import candidates, compare, first_difference
-from tests.boards.told_racks import TOLD
+from tests.boards.commanded_racks import COMMANDED
 
 MakeConfig = Callable[..., RackConfig]
 NASREM = Course(("task", "elemental_move", "primitive", "servo"), (400, 100, 8, 1), 1, True)
@@ -87,7 +87,7 @@ def test_commands_are_drawn_with_room_for_each_response_and_a_seed_draws_the_sam
 @pytest.fixture
 def config(rack_name: str, tmp_path: Path) -> MakeConfig:
     path = tmp_path / "told.toml"
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     return lambda *settings: load(path, [f"name={rack_name}", *settings])
 
 
