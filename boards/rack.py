@@ -26,7 +26,7 @@ from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.alarm_watch import AlarmWatch, Heard
 from rack.boards.clean import remove_dead, remove_own
 from rack.boards.config.commands import asked, request
-from rack.boards.config.resolve import load, modules, resolve
+from rack.boards.config.resolved import load, modules, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate_line import CrateLine
 from rack.boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload

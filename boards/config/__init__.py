@@ -11,7 +11,7 @@ Everything wrong with a config is a `ConfigError`, which reports all mistakes at
 
 from rack.boards.config.files import CONFIGS, FAULTS, names
 from rack.boards.config.layout import shared_out
-from rack.boards.config.resolve import Resolved, load, loads, resolve, wire
+from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
 from rack.boards.config.timing import budgets, timed_tasks
 

@@ -51,7 +51,7 @@ def test_an_unknown_name_lists_the_names_there_are() -> None:
     assert lines(error) == [f'config = "nasrm": no such file; by name: {", ".join(names())}; or a path']
 
 
-def test_what_is_not_toml_is_told_with_its_line(write: Write) -> None:
+def test_text_that_is_not_toml_is_reported_with_its_line(write: Write) -> None:
     with pytest.raises(ConfigError, match=r"broken.toml: not TOML: .*line 2"):
         load(write("broken.toml", 'name = "x"\nclock = = 3\n'))
 
@@ -86,7 +86,7 @@ def test_an_arm_without_a_model_of_its_own_is_merged_as_every_table_is(write: Wr
     assert config.scene == whole.scene.model_copy(update={"clearance": 0.03})
 
 
-def test_an_arm_that_lacks_something_is_said_to_stand_alone(write: Write) -> None:
+def test_an_arm_that_lacks_something_is_said_to_inherit_nothing(write: Write) -> None:
     model = write("arm.xml", "<mujoco/>")
     with pytest.raises(ConfigError) as error:
         load(write("mine.toml", f'extends = ["nasrem"]\n[robot]\nmodel = "{model.name}"\n'))
@@ -119,11 +119,11 @@ VALUES = {
 }
 
 
-@pytest.mark.parametrize(("value", "told"), VALUES.values(), ids=VALUES)
+@pytest.mark.parametrize(("value", "expected"), VALUES.values(), ids=VALUES)
 def test_values_that_no_config_has_are_refused_in_files_and_settings(
-    write: Write, small: Path, value: str, told: str
+    write: Write, small: Path, value: str, expected: str
 ) -> None:
-    with pytest.raises(ConfigError, match=f"^odd.toml: {told}"):
+    with pytest.raises(ConfigError, match=f"^odd.toml: {expected}"):
         load(write("odd.toml", f"[task]\nx = {value}\n"))
     with pytest.raises(ConfigError, match=r"^--set = .*: (integer|dates|text) "):
         load(small, [f"task.x={value}"])
@@ -169,7 +169,7 @@ def test_a_config_that_extends_itself_is_refused(write: Write) -> None:
         load(write("b.toml", 'extends = ["a.toml"]'))
 
 
-def test_every_missing_base_is_told(write: Write) -> None:
+def test_every_missing_base_is_reported(write: Write) -> None:
     with pytest.raises(ConfigError) as error:
         load(write("mine.toml", 'extends = ["no.toml", "nor.toml"]'))
     assert [mistake.value for mistake in error.value.mistakes] == ["no.toml", "nor.toml"]
@@ -201,7 +201,7 @@ def test_an_override_reaches_into_a_list(small: Path) -> None:
     assert load(small, settings).task["action"] == [{"do": "home"}, {"do": "home", "by": 30}]
 
 
-def test_every_override_that_cannot_be_is_told(small: Path) -> None:
+def test_every_override_that_cannot_be_is_reported(small: Path) -> None:
     with pytest.raises(ConfigError) as error:
         load(small, ["clock", "name.low=1", ".=2"])
     assert lines(error) == [

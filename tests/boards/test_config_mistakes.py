@@ -89,12 +89,12 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize(("setting", "told"), MISTAKES.values(), ids=MISTAKES)
+@pytest.mark.parametrize(("setting", "expected"), MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_is_reported_alone_with_place_value_and_what_is_permitted(
-    small: Path, setting: str, told: str
+    small: Path, setting: str, expected: str
 ) -> None:
     (mistake,) = mistakes(small, setting)
-    assert told in str(mistake)
+    assert expected in str(mistake)
 
 
 def test_all_mistakes_are_reported_at_once_wherever_they_are(small: Path) -> None:
@@ -115,7 +115,7 @@ def test_all_mistakes_are_reported_at_once_wherever_they_are(small: Path) -> Non
     }
 
 
-def test_mistakes_of_tables_model_scene_faults_and_commands_are_told_together(write: Write) -> None:
+def test_mistakes_of_tables_model_scene_faults_and_commands_are_reported_together(write: Write) -> None:
     text = """
 extends = ["nasrem"]
 [clock]
@@ -163,7 +163,7 @@ home = true
     assert found["scene.supports"].startswith("no geom 'shelf' in the model; it has: pedestal, floor, table")
 
 
-def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_told() -> None:
+def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_reported() -> None:
     settings = [f"board.level.{setting}" for setting in ("slot=99", "params.plan_ms=1")]
     settings += ["timing.small_share=2", "scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]"]
     assert {mistake.place for mistake in mistakes("fig2", *settings)} == {
@@ -221,10 +221,10 @@ PARAMS = {
 }
 
 
-@pytest.mark.parametrize(("rack", "setting", "told"), PARAMS.values(), ids=PARAMS)
-def test_a_parameter_that_no_level_has_is_a_mistake(rack: str, setting: str, told: str) -> None:
+@pytest.mark.parametrize(("rack", "setting", "expected"), PARAMS.values(), ids=PARAMS)
+def test_a_parameter_that_no_level_has_is_a_mistake(rack: str, setting: str, expected: str) -> None:
     (mistake,) = mistakes(rack, f"board.{setting}")
-    assert str(mistake).startswith(f"board.{setting.partition('=')[0]} {told}")
+    assert str(mistake).startswith(f"board.{setting.partition('=')[0]} {expected}")
 
 
 def test_every_mistake_of_parameters_is_reported() -> None:
