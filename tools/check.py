@@ -62,7 +62,7 @@ def check(
     """
     from rack.boards.config import load, shared_out
     from rack.levels.timing.forecast import Forecast
-    from rack.tools.inventory import Inventory
+    from rack.tools.inventory import inventory, inventory_lines
     from rack.tools.live_table import print_wrapped, terminal_width
     from rack.tools.timing.judged_config import JudgedConfig
     from rack.tools.timing.repair import repair
@@ -79,12 +79,13 @@ def check(
         _print_fixed(fitting, as_json)
         sys.exit(1 if fitting.left else 0)
     lacking = shared_out(found)
-    inventory, forecast = Inventory.of(found, judged.layout, lacking), Forecast.of(judged.timing, not lacking)
+    stock, forecast = inventory(found, judged.layout, lacking), Forecast.of(judged.timing, not lacking)
     if as_json:
-        print_json(inventory.document() | {"timing": forecast.document() | {"repair": fitting.document()}})
+        print_json(stock | {"timing": forecast.document() | {"repair": fitting.document()}})
     else:
         width = terminal_width()
-        print_wrapped("\n".join([*inventory.lines(width), *forecast_lines(forecast, width), "", *fitting.lines()]))
+        lines = [*inventory_lines(stock, width), *forecast_lines(forecast, width), "", *fitting.lines()]
+        print_wrapped("\n".join(lines))
     sys.exit(0 if forecast.holds else 1)
 
 

@@ -36,5 +36,5 @@ def test_a_switch_is_measured_with_real_processes_and_nothing_is_left() -> None:
     cost = measure()
     assert 0 < cost.wakes <= WAKES
     assert 0 < cost.switch_us["min"] <= cost.switch_us["p50"] <= cost.switch_us["max"]
-    assert f"{PAPER_US:g}" in cost.text()
+    assert f"{PAPER_US:g}" in "\n".join(cost.lines())
     assert not [name for name in {path.name for path in SHM_FOLDER.iterdir()} - before if "posix_ipc" in name]

@@ -12,7 +12,7 @@ import pytest
 
 from rack.boards.config import budgets, load
 from rack.levels.timing.forecast import Forecast
-from rack.tools.inventory import Inventory
+from rack.tools.inventory import inventory, inventory_lines
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.tables import forecast_lines
 from tests.tools.test_commands import rack
@@ -68,7 +68,8 @@ def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
 def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
     found = load("nasrem")
     judged = JudgedConfig.of(found)
-    lines = [*Inventory.of(found, judged.layout, []).lines(width), *forecast_lines(Forecast.of(judged.timing), width)]
+    lines = [*inventory_lines(inventory(found, judged.layout, []), width)]
+    lines += forecast_lines(Forecast.of(judged.timing), width)
     # Text that is no table is wrapped as it is printed.
     rows = [line for line in lines if "  " in line.strip()]
     assert len(rows) > 50
