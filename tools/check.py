@@ -1,4 +1,4 @@
-"""`rack check`: validate a config, show what it makes, and predict whether its levels meet their cycles."""
+"""`rack check`: validate a config, show its inventory, and predict whether its levels meet their cycles."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ if TYPE_CHECKING:
 
 From = Annotated[
     Path | None,
-    typer.Option("--from", metavar="RUN", help="budgets as this run of the rack has measured them, not the config's"),
+    typer.Option("--from", metavar="RUN", help="budgets measured in this run of the rack, instead of the config's"),
 ]
 Percentile = Annotated[
     float,
     typer.Option(
-        metavar="P", min=0.0, max=100.0, help="with --from: the worst of P in 100 cycles, as a host may stall some"
+        metavar="P",
+        min=0.0,
+        max=100.0,
+        help="with --from: the worst of P in 100 cycles, without those that the host stalled",
     ),
 ]
 Fix = Annotated[
@@ -38,25 +41,25 @@ def check(
     fix: Fix = False,
     as_json: Json = False,
 ) -> None:
-    """Validate a config, show what it makes, and predict its timing.
+    """Validate a config, show its inventory, and predict its timing.
 
-    Slots, cores, rates, mailboxes with their bus addresses; or every mistake, one a line.
+    Prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per line.
     On a terminal the tables show as many columns as fit; --json has all.
 
-    The timing comes from budgets, the longest that each part of a level's cycle may take, as processor time:
-    [board.<name>.budget] in the config, with read_ms (R), process_ms (X), write_ms (W), exchange_ms (C, reading the
-    plan), plan_ms (P), update_ms (U), and plan_within_ms, how soon a new plan is wanted; or measured, with --from RUN.
-    [timing] holds t_cs (context_switch_ms), the clock's time (clock_ms), what is small in eq. 3.10 (small_share), and a
-    goal for the system's response (response_ms).
+    The timing rests on budgets, the longest processor time of each part of a level's cycle: [board.<name>.budget] in
+    the config, with read_ms (R), process_ms (X), write_ms (W), exchange_ms (C, reading the plan), plan_ms (P),
+    update_ms (U), and plan_within_ms, a limit on the time to a new plan; or measured, with --from RUN. [timing] holds
+    t_cs (context_switch_ms), the clock's time (clock_ms), the limit of eq. 3.10 (small_share), and a goal for the
+    system's response (response_ms).
 
-    Every equation of the paper, 3.1 to 3.10, is put to every level that has a budget: both sides, the margin, ok or
-    FAILS. Beyond the paper: the worst-case response time of every task among those on its core, and the core's load.
+    Every equation of the paper, 3.1 to 3.10, is applied to every level that has a budget: both sides, the margin, ok or
+    FAILS. Beyond the paper: every task's worst-case response time on its core, and the load of every core.
 
-    Where something fails it says what would do, each change tried on the whole rack, the cheapest first: another
-    priority or core, a planner on a board of its own, older plans, a longer cycle, of that board or of one that shares
-    its core; last what needs a core that this machine lacks. --fix prints the config with the first.
+    If something fails, it lists changes that help, cheapest first, each tried on the whole rack: another priority or
+    core, a board for the planner, older plans, a longer cycle, of that board or of one that shares its core; last,
+    changes that need a core that this machine lacks. --fix prints the config with the first of them.
 
-    Exit status: 0 all holds, or there is nothing to judge; 1 an equation fails, or nothing helps; 2 a bad config.
+    Exit status: 0 everything holds, or nothing can be judged; 1 an equation fails, or no change helps; 2 a bad config.
 
     Examples: rack check fig3; rack check fig3 --fix > fits.toml; rack check nasrem --from runs/nasrem-20250101-120000
     """
@@ -73,7 +76,7 @@ def check(
         found = _measured(found, run, percentile)
     judged = JudgedConfig.of(found)
     if judged.failing and sys.stderr.isatty():
-        print("something fails; looking for what would do", file=sys.stderr)
+        print("the timing does not fit; looking for changes that help", file=sys.stderr)
     fitting = repair(judged)
     if fix:
         _print_fixed(fitting, as_json)
@@ -90,7 +93,7 @@ def check(
 
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
-    """Return a config with the budgets that a run has measured. Raises `Failure` for a run of another rack."""
+    """Return a config with the budgets measured in a run. Raises `Failure` for a run of another rack."""
     from rack.boards.config.timing import with_budgets
     from rack.tools.analysis.measured_budgets import measured_budgets
     from rack.tools.recording import Recording
@@ -103,7 +106,7 @@ def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
-    """Print the config that fits on stdout, what was changed on stderr."""
+    """Print the config that fits on stdout, its changes on stderr."""
     document = fitting.document()
     if as_json:
         print_json(document | {"config": None if fitting.left else fitting.end.config.text()})

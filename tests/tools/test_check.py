@@ -47,8 +47,8 @@ def told(done: subprocess.CompletedProcess[str]) -> list[str]:
 def test_a_rack_that_fits_ends_with_status_0(small: Path) -> None:
     done = rack("check", small, *FITS, *ALONE)
     assert (done.returncode, told(done)) == (0, [])
-    assert "what would do" not in done.stdout
-    assert "for want of a budget (in the config, or --from a run): upper" in done.stdout
+    assert "to make it fit" not in done.stdout
+    assert "not counted (set one in the config, or use --from RUN): upper" in done.stdout
 
 
 def test_a_rack_that_fails_says_where_and_what_would_do(small: Path) -> None:
@@ -61,7 +61,7 @@ def test_a_rack_that_fails_says_where_and_what_would_do(small: Path) -> None:
 def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
     done = rack("check", small)
     assert done.returncode == 0
-    assert "for want of a budget (in the config, or --from a run): upper, lower" in done.stdout
+    assert "not counted (set one in the config, or use --from RUN): upper, lower" in done.stdout
 
 
 @pytest.mark.parametrize("width", [80, 120])
@@ -121,7 +121,7 @@ def test_a_fix_is_json_too(small: Path) -> None:
 def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
     done = rack("check", small, "--set", "board.lower.budget.process_ms=100", "--fix")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("nothing helps against 3.1 of lower")
+    assert done.stderr.startswith("no change helps with 3.1 of lower")
 
 
 def test_a_rack_that_fits_is_fixed_as_it_is(small: Path) -> None:

@@ -126,8 +126,8 @@ class OperatorResponse:
         return "\n".join(self._lines(width))
 
     def _lines(self, width: int | None) -> Iterator[str]:
-        yield f"response to {len(self.measured)} commands of an operator, ms of simulated time, to the end of the cycle"
-        yield "whose torque rests on it: from its giving, and from the release that reads it"
+        yield f"response to {len(self.measured)} operator commands, ms of simulated time: from giving a command, and"
+        yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
         head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
         yield from table(head, [[*self._cells(row)] for row in self.rows()], width, ("min", "sum, eq. 3.3", "median"))

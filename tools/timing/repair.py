@@ -49,13 +49,13 @@ class Repair:
         """Return every step as text, a line per change, and the failures that remain."""
         found: list[str] = []
         for changes in self.steps:
-            start = "with the first of those, then" if found else "what would do"
-            found.append(f"{start}{', any one of them, the cheapest first' if len(changes) > 1 else ''}:")
+            start = "then, with the first of these" if found else "to make it fit"
+            found.append(f"{start}{', one of these, cheapest first' if len(changes) > 1 else ''}:")
             found += [f"  {change.text}" for change in changes]
         if self.left:
             failing = ", ".join(dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left))
-            tried = f"other priorities and cores, plans and cycles up to {MAX_FACTOR} times as long, others' cycles too"
-            found.append(f"nothing helps against {failing}; tried: {tried}")
+            tried = f"other priorities and cores, cycles and plans up to {MAX_FACTOR} times as long, also of others"
+            found.append(f"no change helps with {failing}; tried: {tried}")
         return found
 
     def document(self) -> dict[str, Any]:

@@ -103,7 +103,7 @@ def test_a_new_core_is_asked_for_where_no_used_one_has_room(judge: Judge) -> Non
     judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
     change = change_of(judged, "planner_core")
     assert change.settings["planner_core"] == 2
-    assert "planner_core 2 (a core of its own" in change.text
+    assert "planner_core 2 (not shared" in change.text
 
 
 def test_a_core_of_unknown_load_is_left_alone(judge: Judge, budgeted: object) -> None:
@@ -182,8 +182,8 @@ def test_boards_are_mended_one_after_another(judge: Judge) -> None:
     # The second step rests on the first.
     assert mended.end.config.board["lower"].within_cycles == 2
     assert [line.split(":")[0] for line in mended.lines() if not line.startswith(" ")] == [
-        "what would do, any one of them, the cheapest first",
-        "with the first of those, then",
+        "to make it fit, one of these, cheapest first",
+        "then, with the first of these",
     ]
 
 
@@ -191,7 +191,7 @@ def test_what_nothing_helps_against_is_said(judge: Judge) -> None:
     hopeless = repair(judge("board.lower.budget.process_ms=200"))
     assert hopeless.steps == ()
     assert {verdict.equation for verdict in hopeless.left} >= {"3.1", "3.4"}
-    assert hopeless.lines()[-1].startswith("nothing helps against 3.1 of lower, ")
+    assert hopeless.lines()[-1].startswith("no change helps with 3.1 of lower, ")
     assert hopeless.document() == {"steps": [], "fits": False}
 
 
@@ -216,4 +216,4 @@ def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_core_that_the_machine_lacks_is_said_to_be_lacking(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
-    assert "this machine has no core 2 and gives core 0" in change_of(judged, "planner_core").text
+    assert "this machine has no core 2, uses core 0" in change_of(judged, "planner_core").text
