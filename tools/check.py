@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
+from rack.backplane.address_map import AddressMap
+from rack.backplane.layout import Layout
+from rack.boards.config import load, shared_out
+from rack.boards.config.schema import CLOCK_SLOT, RackConfig
+from rack.boards.config.timing import with_budgets
+from rack.levels.timing.forecast import Forecast
 from rack.tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
-
-if TYPE_CHECKING:
-    from rack.boards.config import RackConfig
-    from rack.tools.timing.repair import Repair
+from rack.tools.live_table import print_wrapped, terminal_width
+from rack.tools.text_table import table
+from rack.tools.timing.judged_config import JudgedConfig
+from rack.tools.timing.repair import Repair, repair
+from rack.tools.timing.tables import forecast_lines
 
 From = Annotated[
     Path | None,
@@ -63,14 +71,6 @@ def check(
 
     Examples: rack check fig3; rack check fig3 --fix > fits.toml; rack check nasrem --from runs/nasrem-20250101-120000
     """
-    from rack.boards.config import load, shared_out
-    from rack.levels.timing.forecast import Forecast
-    from rack.tools.inventory import inventory, inventory_lines
-    from rack.tools.live_table import print_wrapped, terminal_width
-    from rack.tools.timing.judged_config import JudgedConfig
-    from rack.tools.timing.repair import repair
-    from rack.tools.timing.tables import forecast_lines
-
     found = load(config, settings, faults)
     if run is not None:
         found = _measured(found, run, percentile)
@@ -94,7 +94,7 @@ def check(
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     """Return a config with the budgets measured in a run. Raises `Failure` for a run of another rack."""
-    from rack.boards.config.timing import with_budgets
+    # Only --from needs them, and they take long to load.
     from rack.tools.analysis.measured_budgets import measured_budgets
     from rack.tools.recording import Recording
 
@@ -114,3 +114,91 @@ def _print_fixed(fitting: Repair, as_json: bool) -> None:
     print(*(fitting.lines() or ["nothing to change"]), sep="\n", file=sys.stderr)
     if not fitting.left:
         print(fitting.end.config.text(), end="")
+
+
+def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str, Any]:
+    """Return the inventory of a config as plain data; addresses and sizes in bytes.
+
+    Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox `delay_ms` the same;
+    `depth` is the number of a mailbox's slots, `size` the bytes of one message.
+    """
+    places, tick_ms = AddressMap(layout), layout.clock_ns * 1e-6
+    tasks = [
+        {
+            "slot": task.slot,
+            "task": task.name,
+            "core": task.core,
+            "priority": task.priority,
+            "rate_hz": 1e9 / (task.every * layout.clock_ns),
+            "every_ticks": task.every,
+            "slice_ms": task.every * task.within_cycles * tick_ms,
+            "trace_address": places.traces[task.name],
+        }
+        for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
+    ]
+    mailboxes = [
+        {
+            "address": places.mailboxes[mailbox.name],
+            "mailbox": mailbox.name,
+            "message": f"{mailbox.message} {mailbox.version}",
+            "size": mailbox.size,
+            "depth": mailbox.depth,
+            "protocol": mailbox.protocol,
+            "writer": mailbox.writer,
+            "readers": mailbox.readers,
+            "delay_ms": mailbox.delay * tick_ms,
+        }
+        for mailbox in layout.mailboxes
+    ]
+    return {
+        "rack": config.name,
+        "mode": config.clock.mode,
+        "clock_ms": tick_ms,
+        "clock_core": config.clock.core,
+        "clock_priority": config.clock.priority,
+        "segment_bytes": places.size,
+        "windows": {window.board: window.address for window in places.windows},
+        "tasks": tasks,
+        "mailboxes": mailboxes,
+        "notes": notes,
+    }
+
+
+def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator[str]:
+    """Yield an inventory as text for people, the tables fitted to `width`."""
+    boards = len({task["slot"] for task in found["tasks"]})
+    crate = f"{boards} board{'s' * (boards > 1)} and the clock"
+    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
+    yield from found["notes"]
+    clock = [CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-", "", "", "", ""]
+    rows = [
+        [
+            *(t["slot"], t["task"], t["core"], t["priority"] or "-"),
+            *(f"{t['rate_hz']:g}", t["every_ticks"], f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+        ]
+        for t in found["tasks"]
+    ]
+    head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", "slice, ms", "trace at"]
+    yield ""
+    yield from _table(head, [clock, *rows], width, ("trace at", "slice, ms"))
+    rows = [
+        [
+            *(_hex(m["address"]), m["mailbox"], m["message"], m["size"], m["depth"], m["protocol"]),
+            *(f"{m['delay_ms']:g}", f"{m['writer']} > {', '.join(m['readers']) or '(nobody)'}"),
+        ]
+        for m in found["mailboxes"]
+    ]
+    head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
+    yield ""
+    yield from _table(head, rows, width, ("slots", "bytes", "message", "protocol"))
+    yield ""
+    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
+    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+
+
+def _table(head: list[str], rows: list[list[Any]], width: int | None, dropped: tuple[str, ...]) -> Iterator[str]:
+    yield from table(head, [[str(cell) for cell in row] for row in rows], width, dropped)
+
+
+def _hex(address: int) -> str:
+    return f"0x{address:06x}"

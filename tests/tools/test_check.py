@@ -13,8 +13,8 @@ import pytest
 
 from rack.boards.config import budgets, load
 from rack.levels.timing.forecast import Forecast
+from rack.tools.check import inventory, inventory_lines
 from rack.tools.cli import run_commands
-from rack.tools.inventory import inventory, inventory_lines
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.tables import forecast_lines
 from tests.conftest import SMALL
