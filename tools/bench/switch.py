@@ -17,7 +17,7 @@ from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Barrier
 from threading import BrokenBarrierError
 from time import monotonic_ns
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import posix_ipc
@@ -69,18 +69,27 @@ def measure() -> SwitchCost:
     return cost_of(cores[-1], *_run(cores[-1], cores[0]))
 
 
+class _Shared(NamedTuple):
+    """Shared by both processes. `gaps` and `awake` hold two times per wake-up, ns; `ready` 1 or -1 for each process."""
+
+    parent: int
+    core: int
+    gaps: Any
+    awake: Any
+    ready: Any
+    start: Barrier
+
+
 def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
     """Run both processes; return the planner's gaps and the executor's times awake, shape (n, 2), ns."""
     spawn = multiprocessing.get_context("spawn")
     gaps, awake, ready = (spawn.RawArray("q", size) for size in (2 * WAKES, 2 * WAKES, 2))
-    start = spawn.Barrier(3)
+    shared = _Shared(os.getpid(), core, gaps, awake, ready, spawn.Barrier(3))
     with _semaphore() as wake, _semaphore() as work:
-        executor = spawn.Process(target=_execute, args=(os.getpid(), core, wake.name, awake, ready, start), daemon=True)
-        planner = spawn.Process(
-            target=_plan, args=(os.getpid(), core, work.name, gaps, awake, ready, start), daemon=True
-        )
+        executor = spawn.Process(target=_execute, args=(wake.name, shared), daemon=True)
+        planner = spawn.Process(target=_plan, args=(work.name, shared), daemon=True)
         with _alive(executor, planner), _pinned(other):
-            _await(start, ready)
+            _await(shared)
             for _ in range(WAKES):
                 work.release()
                 time.sleep(HEAD_START_S)
@@ -91,26 +100,18 @@ def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(gaps).reshape(-1, 2), np.array(awake).reshape(-1, 2)
 
 
-def _execute(parent: int, core: int, wake: str, awake: Any, ready: Any, start: Barrier) -> None:
+def _execute(wake: str, shared: _Shared) -> None:
     """Wake up and wait again: an executor with nothing to do."""
-    die_with_parent(parent)
-    pin(core)
-    semaphore = posix_ipc.Semaphore(wake)
-    ready[0] = 1 if set_priority(EXECUTOR) else -1
-    start.wait(READY_S)
+    semaphore, awake = _begin(wake, shared, 0, EXECUTOR), shared.awake
     for at in range(WAKES):
         semaphore.acquire()
         awake[2 * at] = monotonic_ns()
         awake[2 * at + 1] = monotonic_ns()
 
 
-def _plan(parent: int, core: int, work: str, gaps: Any, awake: Any, ready: Any, start: Barrier) -> None:
+def _plan(work: str, shared: _Shared) -> None:
     """Compute when there is work, until the executor has interrupted; keep the longest gap."""
-    die_with_parent(parent)
-    pin(core)
-    semaphore = posix_ipc.Semaphore(work)
-    ready[1] = 1 if set_priority(PLANNER) else -1
-    start.wait(READY_S)
+    semaphore, gaps, awake = _begin(work, shared, 1, PLANNER), shared.gaps, shared.awake
     for at in range(WAKES):
         semaphore.acquire()
         begin = last = monotonic_ns()
@@ -124,6 +125,16 @@ def _plan(parent: int, core: int, work: str, gaps: Any, awake: Any, ready: Any, 
                 gaps[2 * at], gaps[over] = last, now
                 now = monotonic_ns()
             last = now
+
+
+def _begin(semaphore: str, shared: _Shared, number: int, priority: int) -> posix_ipc.Semaphore:
+    """Pin this process, set its priority, and wait for the other one; return its semaphore."""
+    die_with_parent(shared.parent)
+    pin(shared.core)
+    found = posix_ipc.Semaphore(semaphore)
+    shared.ready[number] = 1 if set_priority(priority) else -1
+    shared.start.wait(READY_S)
+    return found
 
 
 @contextmanager
@@ -158,13 +169,13 @@ def _pinned(core: int) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _await(start: Barrier, ready: Any) -> None:
+def _await(shared: _Shared) -> None:
     """Wait until both run: importing takes a moment."""
     try:
-        start.wait(READY_S)
+        shared.start.wait(READY_S)
     except BrokenBarrierError:
         raise Failure("a process of the measurement did not start") from None
-    if min(ready) < 0:
+    if min(shared.ready) < 0:
         raise Failure("SCHED_FIFO is refused: an executor cannot preempt its planner")
 
 
