@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +46,14 @@ class RecordingCost:
     recorder_percent: float
 
 
+class _Sample(NamedTuple):
+    """One round of one phase; `flags` and `lateness_ms` are of shape (cycles,)."""
+
+    flags: np.ndarray
+    lateness_ms: np.ndarray
+    recorder_percent: float
+
+
 class Meter:
     """Reads the traces of a running rack, phase by phase."""
 
@@ -66,7 +75,7 @@ def measure(name: str) -> list[RecordingCost]:
     Raises `Failure` if the rack ends early or a recorder cannot attach.
     """
     config = _endless(load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"]))
-    found: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {phase: [] for phase in PHASES}
+    found: dict[str, list[_Sample]] = {phase: [] for phase in PHASES}
     with tempfile.TemporaryDirectory() as folder, Rack(config) as rack:
         rack.start()
         meter = Meter(rack.segment)
@@ -77,13 +86,13 @@ def measure(name: str) -> list[RecordingCost]:
                     _watch(rack, SETTLE_S)
                     meter.read()
                     used_ns, began_ns = _processor_ns(pid), time.monotonic_ns()
-                    readings = [_reading(rack, meter) for _ in range(round(PHASE_S))]
+                    flags, lateness = zip(*(_reading(rack, meter) for _ in range(round(PHASE_S))), strict=True)
                     share = 100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
-                    found[phase] += [(flags, lateness, share) for flags, lateness in readings]
+                    found[phase].append(_Sample(np.concatenate(flags), np.concatenate(lateness), share))
         rack.stop("measured")
         while rack.watch(0.5):
             continue
-    return [_cost(phase, taken) for phase, taken in found.items()]
+    return [_cost(phase, samples) for phase, samples in found.items()]
 
 
 def _endless(config: RackConfig) -> RackConfig:
@@ -128,15 +137,15 @@ def _processor_ns(pid: int | None) -> int:
     return 0 if pid is None else processor_ns(pid)
 
 
-def _cost(phase: str, taken: list[tuple[np.ndarray, np.ndarray, float]]) -> RecordingCost:
-    flags, lateness = (np.concatenate(column) for column in list(zip(*taken, strict=True))[:2])
+def _cost(phase: str, samples: Sequence[_Sample]) -> RecordingCost:
+    flags = np.concatenate([sample.flags for sample in samples])
     return RecordingCost(
         phase=phase,
         cycles=len(flags),
         missed=int(np.count_nonzero(flags & Flag.MISSED)),
         skipped=int(np.count_nonzero(flags & Flag.SKIPPED)),
-        lateness_ms=distribution(lateness),
-        recorder_percent=round(float(np.mean([share for _, _, share in taken])), 2),
+        lateness_ms=distribution(np.concatenate([sample.lateness_ms for sample in samples])),
+        recorder_percent=round(float(np.mean([sample.recorder_percent for sample in samples])), 2),
     )
 
 
