@@ -1,4 +1,4 @@
-"""What a context switch costs: the gap in a planner's time, less the executor's time in it."""
+"""The cost of a context switch: the gap in a planner's time, less the executor's time in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rack check` as a user runs it: what it shows, what it says would do, and how it ends."""
+"""`rack check` as a user runs it: its tables, the changes that it proposes, and its exit status."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
 
 @pytest.fixture(autouse=True)
 def two_cores() -> Iterator[None]:
-    """What is cheapest depends on the cores that there are: let every machine have two."""
+    """Let every machine have two cores: the cheapest change depends on them."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(before)[:2])
     yield
@@ -60,21 +60,21 @@ def check(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -
     return ended
 
 
-def told(done: subprocess.CompletedProcess[str]) -> list[str]:
+def failures(done: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in done.stdout.splitlines() if "FAILS" in line]
 
 
 def test_a_rack_that_fits_ends_with_status_0(check: Check, small: Path) -> None:
     done = check(small, *FITS, *ALONE)
-    assert (done.returncode, told(done)) == (0, [])
+    assert (done.returncode, failures(done)) == (0, [])
     assert "to make it fit" not in done.stdout
     assert "not counted (set one in the config, or use --from RUN): upper" in done.stdout
 
 
-def test_a_rack_that_fails_says_where_and_what_would_do(check: Check, small: Path) -> None:
+def test_a_rack_that_fails_shows_where_and_which_changes_help(check: Check, small: Path) -> None:
     done = check(small, *FAILS, *ALONE)
     assert done.returncode == 1
-    assert {line.split()[0] for line in told(done)} == {"3.8", "1", "load:"}
+    assert {line.split()[0] for line in failures(done)} == {"3.8", "1", "load:"}
     assert "  board 'lower': within_cycles 4 -> 7 (a plan every 17.5 ms)" in done.stdout
 
 
@@ -90,7 +90,7 @@ def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
     judged = JudgedConfig.of(found)
     lines = [*inventory_lines(inventory(found, judged.layout, []), width)]
     lines += forecast_lines(Forecast.of(judged.timing), width)
-    # Text that is no table is wrapped as it is printed.
+    # Other text is wrapped when it is printed.
     rows = [line for line in lines if "  " in line.strip()]
     assert len(rows) > 50
     assert max(map(len, rows)) <= width
