@@ -4,7 +4,7 @@
 - `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults, commands.
 - `wire(config)`: the layout alone.
 - `names()`, `CONFIGS`, `FAULTS`: the bundled configs and fault scripts.
-- `budgets(config)`, `timed_tasks(config, layout, budgets)`: the config in terms of the timing model.
+- `budgets(config)`, `rack_timing(config, layout)`: the config in terms of the timing model.
 
 Everything wrong with a config is a `ConfigError`, which reports all mistakes at once.
 """
@@ -13,7 +13,7 @@ from rack.boards.config.files import CONFIGS, FAULTS, names
 from rack.boards.config.layout import shared_out
 from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
-from rack.boards.config.timing import budgets, timed_tasks
+from rack.boards.config.timing import budgets, rack_timing
 
 __all__ = [
     "CLOCK_SLOT",
@@ -27,8 +27,8 @@ __all__ = [
     "load",
     "loads",
     "names",
+    "rack_timing",
     "resolve",
     "shared_out",
-    "timed_tasks",
     "wire",
 ]
