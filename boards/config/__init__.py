@@ -3,6 +3,7 @@
 - `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a `RackConfig`.
 - `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults, commands.
 - `wire(config)`: the layout alone.
+- `shared_out(config)`: the cores that the machine lacks.
 - `names()`, `CONFIGS`, `FAULTS`: the bundled configs and fault scripts.
 - `budgets(config)`, `rack_timing(config, layout)`: the config in terms of the timing model.
 
@@ -12,15 +13,12 @@ Everything wrong with a config is a `ConfigError`, which reports all mistakes at
 from rack.boards.config.files import CONFIGS, FAULTS, names
 from rack.boards.config.layout import shared_out
 from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
-from rack.boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
+from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import budgets, rack_timing
 
 __all__ = [
-    "CLOCK_SLOT",
     "CONFIGS",
     "FAULTS",
-    "BoardConfig",
-    "ClockConfig",
     "RackConfig",
     "Resolved",
     "budgets",

@@ -154,13 +154,19 @@ def _type(entry: Schema) -> str:
 
 
 def _type_of(entry: Schema) -> str:
-    if "prefixItems" in entry:
-        return f"list of {len(entry['prefixItems'])} {_plural(entry['prefixItems'][0])}"
-    if "items" in entry:
-        return f"list of {_plural(entry['items'])}"
-    if isinstance(entry.get("additionalProperties"), dict):
-        return f"table of {_plural(entry['additionalProperties'])}"
-    return "path" if entry.get("format") == "path" else str(entry.get("type", "any")).replace("object", "table")
+    kind = "path" if entry.get("format") == "path" else entry.get("type", "any")
+    kind = {"array": "list", "object": "table"}.get(kind, kind)
+    if (held := _held(entry)) is None:
+        return kind
+    count = f"{len(entry['prefixItems'])} " if "prefixItems" in entry else ""
+    return f"{kind} of {count}{_plural(held)}"
+
+
+def _held(entry: Schema) -> Schema | None:
+    """Return the schema of what a list or a table holds, all alike; None for others."""
+    places = (entry.get("items"), *entry.get("prefixItems", ()), entry.get("additionalProperties"))
+    held = (*places, *entry.get("patternProperties", {}).values())
+    return next((found for found in held if isinstance(found, dict)), None)
 
 
 def _plural(entry: Schema) -> str:
@@ -176,10 +182,9 @@ def _range(entry: Schema) -> str:
     """Return the permitted values of one type; of a list, those of its items."""
     if values := entry.get("enum") or ([entry["const"]] if "const" in entry else []):
         return ", ".join(map(shown, values))
-    inner = entry.get("items") or (entry.get("prefixItems") or [None])[0] or entry.get("additionalProperties")
-    if isinstance(inner, dict):
+    if (held := _held(entry)) is not None:
         count = f"{entry['minItems']} to {entry['maxItems']} items" if "maxItems" in entry and "items" in entry else ""
-        return "; ".join(filter(None, (count, _permitted(inner))))
+        return "; ".join(filter(None, (count, _permitted(held))))
     low, high, above, below = (
         _number(entry[key]) if key in entry else ""
         for key in ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum")
