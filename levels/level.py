@@ -17,8 +17,7 @@ from rack.backplane.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
 from rack.backplane.words import Demand
 from rack.levels.operator import Commands
-from rack.levels.robot import RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import RobotConfig, SceneConfig, Table
 
 __all__ = [
     "Demand",

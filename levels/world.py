@@ -12,8 +12,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import each
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import SCENE, WORLD_MODEL
-from rack.levels.params import read_params
-from rack.levels.robot import Positive, Table
+from rack.levels.tables import Positive, Table, read_params
 
 Array = NDArray[np.float64]
 

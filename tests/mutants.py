@@ -89,7 +89,7 @@ MUTANTS = (
     Mutant(
         "violation counter",
         "violation counter",
-        (("levels/arm/limit_monitor.py", "self.count += int(steps.sum())", "self.count += 0"),),
+        (("levels/arm/monitors.py", "self.count += int(steps.sum())", "self.count += 0"),),
     ),
 )
 KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation counter"))

@@ -16,8 +16,7 @@ from rack.boards.operating.config import CommandConfig
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor
 from rack.levels.operator import Commands, Goal, goal_names, listed
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import RobotConfig, SceneConfig
 
 OWN_OPERATOR = "own.operator"
 
@@ -66,7 +65,7 @@ def joint_ranges(config: RackConfig) -> NDArray[np.float64] | None:
 
 @lru_cache(maxsize=4)
 def _ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
-    from rack.levels.cell import build_cell  # MuJoCo takes half a second to import: only who sends joints pays
+    from rack.levels.robot.cell import build_cell  # MuJoCo takes half a second to import: only who sends joints pays
 
     return build_cell(robot, scene, clock_ns).limits.position
 

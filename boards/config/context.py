@@ -8,7 +8,7 @@ from rack.boards.config.cell import cell_sizes
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.levels.level import LevelContext, Pace
-from rack.levels.robot import RobotConfig
+from rack.levels.tables import RobotConfig
 
 
 def context(config: RackConfig, board: str) -> LevelContext:

@@ -19,7 +19,7 @@ from rack.boards.config.wiring import judged
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.operating.config import CommandConfig
-from rack.levels.robot import Table
+from rack.levels.tables import Table
 
 T = TypeVar("T", bound=Table)
 

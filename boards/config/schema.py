@@ -15,8 +15,7 @@ from rack.backplane.layout import Protocol
 from rack.boards.config.text import portable, to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.operating.config import CommandConfig
-from rack.levels.robot import Positive, RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""

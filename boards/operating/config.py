@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rack.levels.operator import Goal, What
-from rack.levels.robot import LAST_TICK, Finite, Table
+from rack.levels.operator import Goal, Operation
+from rack.levels.tables import LAST_TICK, Finite, Table
 
 Vector = tuple[Finite, Finite, Finite]
 Said = Literal["hold", "resume", "setpoint", "goto"]
@@ -31,9 +31,9 @@ class CommandConfig(Table):
     home: bool = Field(False, description="goal: where the arm starts")
 
     @property
-    def said(self) -> What:
+    def said(self) -> Operation:
         """What is to be done."""
-        return What[self.what.upper()]
+        return Operation[self.what.upper()]
 
     @property
     def goals(self) -> list[Goal]:

@@ -11,7 +11,7 @@ from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry, RequestWord
 from rack.backplane.slots import message_dtype
 from rack.boards.events import Event
-from rack.levels.operator import Goal, What
+from rack.levels.operator import Goal, Operation
 
 
 def level_of(entry: RequestEntry, layout: Layout) -> str:
@@ -29,7 +29,7 @@ def message_of(entry: RequestEntry, layout: Layout) -> Message:
 
 def describe(message: Message) -> str:
     """Return a command as one line: what, and its goal."""
-    what, goal = What(message.what).name.lower(), message.goal
+    what, goal = Operation(message.what).name.lower(), message.goal
     if goal == Goal.JOINTS:
         return f"{what} joints {_numbers(message.joints[: message.count])}"
     if goal == Goal.POSE:
@@ -44,7 +44,7 @@ def command_event(row: np.void, entry: RequestEntry, layout: Layout) -> Event:
     level, message, serial = level_of(entry, layout), message_of(entry, layout), int(row["value"])
     text = f"{describe(message)} (command {serial})"
     realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
-    code = What(message.what).name.lower()
+    code = Operation(message.what).name.lower()
     return Event(realtime_ns, int(row["tick"]), "command", level, text, code, subject=level, value=serial)
 
 

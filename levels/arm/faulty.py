@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.arm.arm import Arm, Sensed
-from rack.levels.cell import Cell
-from rack.levels.dynamics import FRICTION_SPEED
 from rack.levels.level import Fault, Finding
-from rack.levels.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import FRICTION_SPEED
+from rack.levels.robot.limits import PRESSING, RESTING, TURNING_JOINTS
 
 Array = NDArray[np.float64]
 

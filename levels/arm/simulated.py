@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -10,17 +11,14 @@ from numpy.typing import NDArray
 
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
+from rack.levels.algebra import norm
 from rack.levels.arm.arm import Sensed
-from rack.levels.arm.brake import Brake
-from rack.levels.arm.coarse_sensors import CoarseSensors
-from rack.levels.arm.contact_monitor import ContactMonitor
-from rack.levels.arm.limit_monitor import LimitMonitor
-from rack.levels.arm.limits import LimitGate
-from rack.levels.arm.motion import ObstacleMotion
-from rack.levels.cell import STATE, Cell
-from rack.levels.dynamics import Dynamics
+from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate
+from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
 from rack.levels.level import Finding
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import STATE, Cell
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.tables import MotionConfig, SceneConfig
 
 Array = NDArray[np.float64]
 
@@ -28,8 +26,6 @@ PATIENCE_CYCLES = 2
 """Torque cycles for which the motors go on with the last command when none comes; then the brakes close."""
 FARTHEST = 1.001
 """Multiple of a torque limit beyond which a command is none that a servo level gives: it keeps the limits itself."""
-
-
 STRUCK_TICKS = 40
 """Ticks behind a contact, or behind the last limit broken after it, for which the arm moves on from the blow."""
 
@@ -273,3 +269,25 @@ class SimulatedArm:
         if not (np.isfinite(d.qpos).all() and np.isfinite(d.qvel).all()):
             return f"the simulated state is not finite at {self._now_s:.4f} s"
         return ""
+
+
+class ObstacleMotion:
+    """The moves of one obstacle, one after the other; a move that starts before the last has ended cuts that off."""
+
+    def __init__(self, start: Array, moves: tuple[MotionConfig, ...]) -> None:
+        """Take the place `start` (3,), m, and the obstacle's moves."""
+        self._start = np.array(start)
+        self._moves = tuple(sorted(moves, key=lambda move: move.at))
+        self._ends = (*(later.at for _, later in pairwise(self._moves)), np.inf)
+
+    def position(self, time_s: float) -> Array:
+        """Return the obstacle's origin (3,), m, at simulated `time_s`."""
+        place = self._start
+        for move, end in zip(self._moves, self._ends, strict=False):
+            if time_s <= move.at:
+                break
+            way = np.array(move.to) - place
+            length = norm(way)
+            driven = move.speed * (min(time_s, end) - move.at)
+            place = np.array(move.to) if driven >= length else place + way * (driven / length)
+        return place

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from rack.backplane.alarms import Alarm
 from rack.levels.algebra import each, mat_vec
-from rack.levels.cell import Cell
-from rack.levels.dynamics import FRICTION_SPEED, Terms
 from rack.levels.level import Finding
-from rack.levels.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
+from rack.levels.robot.limits import PRESSING, RESTING, TURNING_JOINTS
 
 Array = NDArray[np.float64]
 

@@ -10,21 +10,18 @@ from numpy.typing import NDArray
 from rack.backplane.message import Message, State
 from rack.levels.arm import Arm, FaultyLink, Link, Sensed, SimulatedArm
 from rack.levels.arm.faulty import KINDS
-from rack.levels.cell import build_cell
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
-from rack.levels.operator import OPERATOR_COMMAND, Goal, What
-from rack.levels.params import read_params
+from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.robot.cell import build_cell
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
-from rack.levels.servo.brake_log import BrakeLog
-from rack.levels.servo.computed_torque import ComputedTorque
+from rack.levels.servo.control import ComputedTorque, Grip, ServoParams
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.grip import Grip
-from rack.levels.servo.params import ServoParams
+from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.servo.sensor_monitor import SensorMonitor
-from rack.levels.servo.standing import Standing
-from rack.levels.servo.stopping import Reaction, Stopping
+from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
+from rack.levels.tables import read_params
 
 Array = NDArray[np.float64]
 
@@ -45,7 +42,7 @@ class ServoExecutor(Executor):
     }
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
     faults = KINDS
-    commands = {What.HOLD: (), What.RESUME: (), What.SETPOINT: (Goal.JOINTS,)}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
     params = ServoParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -64,7 +61,7 @@ class ServoExecutor(Executor):
         )
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
-        self.standing = Standing(self.commands, context.robot.joints, cell.limits.position)
+        self.standing = OperatorControl(self.commands, context.robot.joints, cell.limits.position)
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._rest = np.zeros(len(cell.home))

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.algebra import mat_vec, transposed_mat_vec
-from rack.levels.cell import build_cell
-from rack.levels.dynamics import Dynamics, Payload
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Dynamics, Payload
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.cell import Bounds, Limits
+from rack.levels.robot.limits import Bounds, Limits
 from rack.levels.servo.curves import Curve, Decay, Hermite, Motion, Passage, Ramp
 
 Array = NDArray[np.float64]

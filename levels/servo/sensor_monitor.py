@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
 from rack.levels.arm import Sensed
-from rack.levels.cell import Bounds
 from rack.levels.level import Finding
-from rack.levels.limits import Encoders
+from rack.levels.robot.limits import Bounds, Encoders
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from rack.levels.errors import ProgramError
-from rack.levels.robot import Finite, Positive, RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
 
 Vector = tuple[Finite, Finite, Finite]
 

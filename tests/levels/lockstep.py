@@ -13,11 +13,10 @@ from typing import Any
 
 from rack.backplane.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
-from rack.levels.cell import build_cell, sizes
 from rack.levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
 from rack.levels.operator import OPERATOR_COMMAND
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.box import Box, Disturbance
 
 CLOCK_NS = 2_500_000

@@ -12,9 +12,8 @@ from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
 from rack.levels.level import Fault, Finding
 from rack.levels.messages import JOINT_SET_POINT
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
 from rack.levels.servo import ServoExecutor, ServoPlanner
+from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
 Array = NDArray[np.float64]

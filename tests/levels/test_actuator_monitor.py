@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.dynamics import Dynamics
 from rack.levels.level import Finding
-from rack.levels.limits import PRESSING
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.limits import PRESSING
 from rack.levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
 from tests.levels.arms import cell
 from tests.levels.servo_rig import TICK_S

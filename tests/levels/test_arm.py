@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.arm import SimulatedArm
-from rack.levels.arm.motion import ObstacleMotion
-from rack.levels.arm.simulated import PATIENCE_CYCLES
-from rack.levels.cell import Cell, sizes
-from rack.levels.dynamics import Dynamics
+from rack.levels.arm.simulated import PATIENCE_CYCLES, ObstacleMotion
 from rack.levels.messages import ARM_STATE, SCENE
-from rack.levels.scene import MotionConfig, SceneConfig
+from rack.levels.robot.cell import Cell, sizes
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.tables import MotionConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
 
 Array = NDArray[np.float64]

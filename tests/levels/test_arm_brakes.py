@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
 from rack.levels.arm import SimulatedArm
-from rack.levels.cell import Cell, sizes
-from rack.levels.dynamics import Dynamics
 from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import Cell, sizes
+from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config
 
 Array = NDArray[np.float64]

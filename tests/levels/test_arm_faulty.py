@@ -8,9 +8,9 @@ import pytest
 
 from rack.backplane.alarms import Alarm
 from rack.levels.arm import FaultyLink, SimulatedArm
-from rack.levels.cell import Cell
-from rack.levels.dynamics import Dynamics
 from rack.levels.level import Fault
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config
 
 

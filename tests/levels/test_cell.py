@@ -8,10 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.cell import Cell, build_cell, sizes
 from rack.levels.errors import RobotError
-from rack.levels.robot import GripperConfig, RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from tests.levels.arms import BLOCK, CLOCK_NS, MOTORS, cell, config, pendulum
 
 EMPTY = SceneConfig()
@@ -138,7 +137,7 @@ WRONG_CONFIGS = {
     "joint": ({"joints": ("shoulder", "wrist")}, "no joint 'wrist' in the model; it has: shoulder, elbow"),
     "twice": ({"joints": ("elbow", "elbow")}, "'elbow' is named 2 times"),
     "tool": ({"tool": "tcp"}, "robot.tool: no site 'tcp' in the model; it has: tip"),
-    "length": ({"velocity": (1.0,)}, "robot.velocity: 1 values; one a joint is 2"),
+    "length": ({"velocity": (1.0,)}, "robot.velocity: 1 values; one per joint: 2"),
     "home outside": ({"home": (0.0, 2.5)}, "joint 'elbow' at 2.5 rad; -1.995 to 1.995 is valid"),
     "home touches": ({"home": (1.5, 0.5)}, "'floor' touches 'lower'"),
     "too weak": ({"torque": (1.0, 20.0)}, "joint 'shoulder' carries"),

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.cell import Cell, build_cell
-from rack.levels.dynamics import Dynamics, Payload
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.robot.dynamics import Dynamics, Payload
+from rack.levels.tables import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
 
 DATA = Path(__file__).parent / "data"

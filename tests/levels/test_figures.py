@@ -11,8 +11,7 @@ import pytest
 from rack.backplane.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State
 from rack.levels.errors import LevelError
-from rack.levels.figures import FigureExecutor, FigurePlanner
-from rack.levels.figures.messages import FIGURE_PLAN, FIGURE_STATUS
+from rack.levels.figures import FIGURE_PLAN, FIGURE_STATUS, FigureExecutor, FigurePlanner
 from rack.levels.level import LevelContext, Ports
 
 MS = 1_000_000

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.levels.cell import Cell, build_cell
 from rack.levels.errors import RobotError
+from rack.levels.robot.cell import Cell, build_cell
 from tests.levels.arms import CLOCK_NS, cell, four_bar
 from tests.levels.whole_rack import WholeRack
 

@@ -9,7 +9,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.messages import Verb
-from rack.levels.operator import Answer, Goal, What
+from rack.levels.operator import Answer, Goal, Operation
 from tests.levels.operators import Operator
 from tests.levels.whole_rack import WholeRack
 
@@ -40,7 +40,7 @@ def test_a_level_that_was_held_in_motion_goes_on_to_the_end_of_the_task(level: s
     rack = WholeRack(actions=[REACH, HOME])
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
-    serial = operator.say(level, What.HOLD)
+    serial = operator.say(level, Operation.HOLD)
     assert rack.run(6.0, answers(level, Answer.DONE, serial))
     held = rack.read("servo.status").position.copy()
     rack.run(2.0)
@@ -55,7 +55,7 @@ def test_a_level_that_was_held_in_motion_goes_on_to_the_end_of_the_task(level: s
         assert f"{level}" in status.reason
         assert "held by the operator" in status.reason
     assert level == "task" or rack.move.operated
-    operator.say(level, What.RESUME)
+    operator.say(level, Operation.RESUME)
     assert rack.run_to_end(30.0).state == State.DONE
 
 
@@ -64,14 +64,14 @@ def test_a_restarted_board_holds_on(level: str) -> None:
     rack = WholeRack(actions=[REACH, HOME])
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
-    serial = operator.say(level, What.HOLD)
+    serial = operator.say(level, Operation.HOLD)
     assert rack.run(6.0, answers(level, Answer.DONE, serial))
     held = rack.read("servo.status").position.copy()
     rack.lose(level, 200)
     rack.run(3.0)
-    assert rack.read(f"{level}.status").standing == What.HOLD
+    assert rack.read(f"{level}.status").standing == Operation.HOLD
     assert np.abs(rack.read("servo.status").position - held).max() < 1e-3
-    operator.say(level, What.RESUME)
+    operator.say(level, Operation.RESUME)
     assert rack.run_to_end(30.0).state == State.DONE
 
 
@@ -88,7 +88,7 @@ def test_a_goto_leaves_a_free_motion_and_the_program_goes_on_behind_it() -> None
     assert rack.task.reason == "diverted by the operator: goto direction done; `resume` goes on"
     rack.run(2.0)
     assert np.abs(rack.read("servo.scene").tool_position - ASIDE).max() < 5e-3
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
     assert rack.task.detour == 0
 
@@ -100,9 +100,9 @@ def test_a_goto_takes_the_next_one_from_where_it_is() -> None:
     first = operator.goto("task", ASIDE, DOWN)
     assert rack.run(20.0, answers("task", Answer.TAKEN, first))
     rack.run(2.0)
-    second = operator.say("task", What.GOTO, goal=Goal.HOME)
+    second = operator.say("task", Operation.GOTO, goal=Goal.HOME)
     assert rack.run(20.0, answers("task", Answer.DONE, second))
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
     assert rack.task.moves_done == rack.task.moves
 
@@ -117,7 +117,7 @@ def test_what_is_done_with_an_object_is_done_before_a_goto() -> None:
     # The block is taken and not put down, or put down and left alone.
     next_move = rack.read("task.plan").moves["verb"][rack.task.moves_done]
     assert next_move in (Verb.MOVE, Verb.MOVE_JOINTS)
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(60.0).state == State.DONE
     assert np.abs(rack.read("world.model").position[0] - TRANSFER["to"]).max() < 0.01
 
@@ -129,8 +129,8 @@ def test_a_goto_that_cannot_be_is_refused_and_the_task_goes_on_behind_it() -> No
     serial = operator.goto("task", [3.0, 0.0, 0.5], DOWN)
     assert rack.run(20.0, answers("task", Answer.REFUSED, serial))
     assert "cannot bring the tool to" in rack.task.objection
-    assert (rack.task.standing, rack.task.state) == (What.HOLD, State.HOLDING)
-    operator.say("task", What.RESUME)
+    assert (rack.task.standing, rack.task.state) == (Operation.HOLD, State.HOLDING)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
 
 
@@ -144,7 +144,7 @@ def test_a_goto_goes_on_when_the_board_of_the_task_level_has_died() -> None:
     rack.lose("task", 200)
     assert rack.run(20.0, answers("task", Answer.DONE, serial))
     assert rack.task.detour == move
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
 
 
@@ -153,7 +153,7 @@ def test_set_points_in_the_middle_of_a_transfer_do_not_hinder_it() -> None:
     operator = Operator(rack)
     assert rack.run(20.0, lambda r: r.read("elemental_move.status").verb == Verb.DEPART)
     goal = rack.read("servo.status").target + np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0])
-    serial = operator.say("servo", What.SETPOINT, goal)
+    serial = operator.say("servo", Operation.SETPOINT, goal)
     assert rack.run(10.0, answers("servo", Answer.DONE, serial))
-    operator.say("servo", What.RESUME)
+    operator.say("servo", Operation.RESUME)
     assert rack.run_to_end(60.0).state == State.DONE

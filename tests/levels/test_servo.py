@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from rack.backplane.message import State
-from rack.levels.dynamics import Dynamics
 from rack.levels.errors import LevelError
 from rack.levels.messages import Error
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.tables import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config, pendulum
 from tests.levels.servo_rig import PERIOD, TICK_S, Course, ServoRig
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import State
 from rack.levels.messages import Error
-from rack.levels.scene import MotionConfig
+from rack.levels.tables import MotionConfig
 from tests.levels.arms import config
 from tests.levels.servo_rig import ServoRig
 

@@ -10,10 +10,10 @@ import pytest
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import State
 from rack.levels.arm import SimulatedArm
-from rack.levels.cell import build_cell
 from rack.levels.errors import RobotError
 from rack.levels.messages import Error
-from rack.levels.robot import RobotConfig, SensorConfig
+from rack.levels.robot.cell import build_cell
+from rack.levels.tables import RobotConfig, SensorConfig
 from tests.levels.arms import CLOCK_NS, config, pendulum
 from tests.levels.servo_rig import Course, ServoRig
 from tests.levels.whole_rack import WholeRack
@@ -113,5 +113,5 @@ def test_a_fault_of_a_coarse_sensor_is_still_told_from_one_of_a_motor(
 
 def test_a_list_of_another_length_is_refused_with_both_numbers(tmp_path: Path) -> None:
     robot = pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1)))
-    with pytest.raises(RobotError, match=r"robot.sensors.noise: 3 values; one for all joints, or one a joint: 2"):
+    with pytest.raises(RobotError, match=r"robot.sensors.noise: 3 values; one for all joints, or one per joint: 2"):
         build_cell(robot, config("puma560")[1], CLOCK_NS)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rack.backplane.words import Demand
-from rack.levels.operator import Answer, What
+from rack.levels.operator import Answer, Operation
 from tests.levels.arms import cell, config
 from tests.levels.operators import Operator
 from tests.levels.servo_rig import TICK_S, Course, ServoRig
@@ -28,20 +28,20 @@ def rig() -> ServoRig:
 def test_a_hold_ramps_to_rest_and_stays_whatever_comes_from_above(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     assert np.abs(rig.status.target_velocity).max() > 0.1
-    serial = Operator(rig.rack).say("servo", What.HOLD)
+    serial = Operator(rig.rack).say("servo", Operation.HOLD)
     rig.run(1, COURSE.at)
     assert (rig.status.order, rig.status.operator, rig.status.answer) == (serial, serial, Answer.TAKEN)
     rig.run(2 * SECOND, COURSE.at)
     held = rig.status.position.copy()
     rig.run(SECOND, COURSE.at)
-    assert (rig.status.answer, rig.status.standing) == (Answer.DONE, What.HOLD)
+    assert (rig.status.answer, rig.status.standing) == (Answer.DONE, Operation.HOLD)
     assert (rig.status.holding, rig.status.stopped, rig.status.braked) == (1, 1, 0)
     assert np.abs(rig.status.position - held).max() < 1e-4
 
 
 def test_a_hold_brakes_no_joint_harder_than_planned_motion(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
-    Operator(rig.rack).say("servo", What.HOLD)
+    Operator(rig.rack).say("servo", Operation.HOLD)
     rig.run(SECOND, COURSE.at)
     assert_within_limits(np.array(rig.targets[SECOND:]))
 
@@ -49,18 +49,18 @@ def test_a_hold_brakes_no_joint_harder_than_planned_motion(rig: ServoRig) -> Non
 def test_behind_a_hold_the_set_points_are_followed_again(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND, COURSE.at)
-    operator.say("servo", What.HOLD)
+    operator.say("servo", Operation.HOLD)
     rig.run(SECOND // 2, COURSE.at)
-    serial = operator.say("servo", What.RESUME)
+    serial = operator.say("servo", Operation.RESUME)
     rig.run(3 * SECOND, COURSE.at)
-    assert (rig.status.order, rig.status.answer, rig.status.standing) == (serial, Answer.DONE, What.NONE)
+    assert (rig.status.order, rig.status.answer, rig.status.standing) == (serial, Answer.DONE, Operation.NONE)
     assert (rig.status.holding, rig.status.stopped) == (0, 0)
     assert np.abs(rig.status.position - COURSE.goal).max() < 1e-3
 
 
 def test_a_set_point_is_reached_within_the_limits_of_every_joint(rig: ServoRig) -> None:
     rig.run(SECOND // 2)
-    Operator(rig.rack).say("servo", What.SETPOINT, AWAY)
+    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
     rig.run(1)
     assert rig.status.answer == Answer.TAKEN
     rig.run(3 * SECOND)
@@ -72,7 +72,7 @@ def test_a_set_point_is_reached_within_the_limits_of_every_joint(rig: ServoRig) 
 
 def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
-    Operator(rig.rack).say("servo", What.SETPOINT, AWAY)
+    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
     rig.run(3 * SECOND, COURSE.at)
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
     assert_within_limits(np.array(rig.targets[SECOND:]))
@@ -83,11 +83,11 @@ def test_from_its_set_points_the_arm_comes_back_the_way_it_went(rig: ServoRig) -
     rig.run(SECOND // 2)
     second = AWAY + 0.1
     for goal in (AWAY, second):
-        operator.say("servo", What.SETPOINT, goal)
+        operator.say("servo", Operation.SETPOINT, goal)
         rig.run(2 * SECOND)
-    operator.say("servo", What.RESUME)
+    operator.say("servo", Operation.RESUME)
     rig.run(1)
-    assert (rig.status.answer, rig.status.standing, rig.status.stopped) == (Answer.TAKEN, What.NONE, 1)
+    assert (rig.status.answer, rig.status.standing, rig.status.stopped) == (Answer.TAKEN, Operation.NONE, 1)
     began = len(rig.targets)
     rig.run(3 * SECOND)
     assert (rig.status.answer, rig.status.stopped) == (Answer.DONE, 0)
@@ -98,9 +98,9 @@ def test_from_its_set_points_the_arm_comes_back_the_way_it_went(rig: ServoRig) -
 def test_a_hold_on_the_way_to_a_set_point_stops_there(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND // 2)
-    operator.say("servo", What.SETPOINT, AWAY)
+    operator.say("servo", Operation.SETPOINT, AWAY)
     rig.run(SECOND // 4)
-    operator.say("servo", What.HOLD)
+    operator.say("servo", Operation.HOLD)
     rig.run(SECOND)
     assert rig.status.answer == Answer.DONE
     assert 0.01 < np.abs(rig.status.target - HOME).max() < np.abs(AWAY - HOME).max() - 0.01
@@ -109,13 +109,13 @@ def test_a_hold_on_the_way_to_a_set_point_stops_there(rig: ServoRig) -> None:
 
 def test_a_set_point_out_of_range_is_refused_and_what_stood_stands(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
-    operator.say("servo", What.HOLD)
+    operator.say("servo", Operation.HOLD)
     rig.run(SECOND // 2, COURSE.at)
     beyond = AWAY.copy()
     beyond[1] = LIMITS.position[1, 1] + 0.001
-    operator.say("servo", What.SETPOINT, beyond)
+    operator.say("servo", Operation.SETPOINT, beyond)
     rig.run(SECOND // 2, COURSE.at)
-    assert (rig.status.answer, rig.status.standing) == (Answer.REFUSED, What.HOLD)
+    assert (rig.status.answer, rig.status.standing) == (Answer.REFUSED, Operation.HOLD)
     assert rig.status.objection.startswith(f"joint '{config('puma560')[0].joints[1]}' at ")
     assert np.abs(rig.status.position - HOME).max() < 1e-3
 
@@ -123,22 +123,22 @@ def test_a_set_point_out_of_range_is_refused_and_what_stood_stands(rig: ServoRig
 def test_a_demand_comes_before_the_operator(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND // 2)
-    operator.say("servo", What.SETPOINT, AWAY)
+    operator.say("servo", Operation.SETPOINT, AWAY)
     rig.run(SECOND // 4)
     rig.rack.stop(Demand.BRAKE, SECOND)
     rig.run(SECOND)
-    assert (rig.status.braked, rig.status.standing) == (1, What.SETPOINT)
+    assert (rig.status.braked, rig.status.standing) == (1, Operation.SETPOINT)
     assert np.abs(rig.status.position - AWAY).max() > 0.01
     rig.run(3 * SECOND)
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
 
 
 def test_a_restarted_board_goes_on_with_what_stands(rig: ServoRig) -> None:
-    Operator(rig.rack).say("servo", What.SETPOINT, AWAY)
+    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
     rig.run(2 * SECOND, COURSE.at)
     rig.restart()
     rig.run(SECOND, COURSE.at)
-    assert (rig.status.standing, rig.status.answer) == (What.SETPOINT, Answer.DONE)
+    assert (rig.status.standing, rig.status.answer) == (Operation.SETPOINT, Answer.DONE)
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rack.levels.operator import Answer, What
+from rack.levels.operator import Answer, Operation
 from rack.tools.recording import Recording
 from rack.tools.responding.course import Course, acting, courses
 from rack.tools.text_table import table
@@ -166,7 +166,7 @@ def _commands(recording: Recording, level: str, course: Course) -> Iterator[tupl
             Answered(
                 serial=int(serial),
                 level=level,
-                what=What(int(what)).name.lower(),
+                what=Operation(int(what)).name.lower(),
                 given=int(tick),
                 sampled=course.samples_at(int(seen)),
                 predicted=course.acts_at(int(seen)),

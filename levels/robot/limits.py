@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
-from rack.levels.robot import RobotConfig
+from rack.levels.tables import RobotConfig
 
 VELOCITY_ROOM = 0.05
 """Part of a velocity limit that planned motion leaves free, so that tracking it does not run into the limit gate."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import each, gram, mat_vec, transposed_mat_vec
-from rack.levels.cell import Cell
+from rack.levels.robot.cell import Cell
 
 Array = NDArray[np.float64]
 

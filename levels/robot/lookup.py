@@ -1,4 +1,4 @@
-"""Look up in a compiled model what a config names. Every mistake is one `RobotError` that says what the model has."""
+"""Look up in a compiled model what a config names. Every mistake is one `RobotError` that lists what the model has."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
-from rack.levels.mjcf import compile_spec, load_spec
-from rack.levels.motors import listed
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
-from rack.levels.touches import below
+from rack.levels.robot.model import compile_spec, listed, load_spec
+from rack.levels.tables import RobotConfig, SceneConfig
 
 NOUNS = {
     mujoco.mjtObj.mjOBJ_SITE: "site",
@@ -33,8 +30,13 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
     raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
 
 
+def find_all(model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str) -> NDArray[np.int_]:
+    """Return the ids of named elements. Raises `RobotError`."""
+    return np.array([find(model, kind, name, place) for name in names], dtype=int)
+
+
 def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
-    """Yield a line for every name in the config that the model does not have. Raises `RobotError`, of the model."""
+    """Yield a line for every name in the config that the model lacks. Raises `RobotError` for a broken model."""
     model = compile_spec(load_spec(robot.model), robot.model)
     kind = mujoco.mjtObj
     wanted = [(kind.mjOBJ_JOINT, name, "robot.joints") for name in robot.joints]
@@ -52,11 +54,6 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
             yield str(error)
 
 
-def find_all(model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str) -> NDArray[np.int_]:
-    """Return the ids of named elements. Raises `RobotError`."""
-    return np.array([find(model, kind, name, place) for name in names], dtype=int)
-
-
 def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_]) -> int:
     """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm. Raises `RobotError`."""
     tool = find(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
@@ -72,12 +69,14 @@ def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.b
     name = robot.gripper.joint
     joint = find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
     if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
-        raise RobotError(f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of its own")
+        raise RobotError(
+            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the arm's own"
+        )
     return joint
 
 
 def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> NDArray[np.bool_]:
-    """Mark (nbody,) the body that carries the gripper's linkage, and all that hang on it.
+    """Mark (nbody,) the body that carries the gripper's linkage, and its descendants.
 
     The driven joint may be anywhere in the linkage; the joints `arm` are not part of it.
     """
@@ -105,3 +104,25 @@ def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int
             name = model.body(body).name
             raise RobotError(f"scene.obstacles: body '{name}' cannot move by itself; give it mocap='true'")
     return np.asarray(model.body_mocapid[bodies], dtype=int)
+
+
+# ==== levels/touches.py: """Which contacts a task means, and which are touches."""
+
+
+def below(model: mujoco.MjModel, roots: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Mark (nbody,) the bodies `roots` and their descendants."""
+    marked = np.zeros(model.nbody, dtype=bool)
+    marked[roots] = True
+    for body in range(1, model.nbody):
+        marked[body] |= marked[model.body_parentid[body]]
+    return marked
+
+
+def geoms_of(model: mujoco.MjModel, bodies: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """Return the ids of the geoms on the bodies marked (nbody,)."""
+    return np.flatnonzero(bodies[model.geom_bodyid])
+
+
+def geom_name(model: mujoco.MjModel, geom: int) -> str:
+    """Return a geom's name or, when it has none, its body's."""
+    return model.geom(geom).name or f"body {model.body(model.geom_bodyid[geom]).name}"

@@ -1,4 +1,4 @@
-"""The limit gate: no torque passes that would break a torque, velocity or position limit within the cycle."""
+"""Parts of the simulated arm's drives: brakes, the limit gate on torques, and encoders of finite resolution."""
 
 from __future__ import annotations
 
@@ -7,19 +7,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import mat_vec, solve
-from rack.levels.cell import Bounds
-from rack.levels.dynamics import Dynamics
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
 
 Array = NDArray[np.float64]
 
+STANDSTILL = 0.01
+"""Joint speed, rad/s, below which a joint holds its position."""
 SPEED_USED = 0.99
 """Part of a velocity limit that the gate lets a joint reach; what its model leaves out in a cycle fits in the rest."""
 RANGE_KEPT_RAD = 0.002
 """What the gate keeps from the ends of a joint's range, for the same reason."""
-
-
 HARD, SOFT = 0, 8
 """Kinds of constraints of the solver."""
+
+
+class Brake:
+    """Stops the joints with `braking` (joints,), rad/s2, at most, and holds them where they came to rest.
+
+    `rest` (joints,), rad, is where that is. `stiffness`, rad/s, is the bandwidth of the hold.
+    """
+
+    def __init__(self, braking: Array, dynamics: Dynamics, stiffness: float = 20.0) -> None:
+        self._braking, self._dynamics = braking, dynamics
+        self._stiffness = stiffness
+        self.closed = False
+        self.rest: Array = np.zeros(len(braking))
+
+    def close(self, q: Array) -> None:
+        """Close at positions `q`, rad."""
+        if not self.closed:
+            self.closed = True
+            np.copyto(self.rest, q)
+
+    def open(self) -> None:
+        """Let the arm move again."""
+        self.closed = False
+
+    def torque(self, q: Array, qd: Array) -> Array:
+        """Return the torques (joints,), N m, that stop or hold the arm at state `q`, `qd`."""
+        np.copyto(self.rest, q, where=np.abs(qd) > STANDSTILL)
+        wanted = self._stiffness**2 * (self.rest - q) - 2.0 * self._stiffness * qd
+        inertia, bias = self._dynamics.terms(q, qd)
+        return np.asarray(mat_vec(inertia, np.clip(wanted, -self._braking, self._braking)) + bias)
 
 
 class LimitGate:
@@ -87,3 +117,28 @@ class LimitGate:
         left = np.maximum(distance - 0.5 * speed * self._period_s, 0.0)
         stoppable = np.sqrt(half * half + 2.0 * self._braking * left) - half
         return np.minimum(stoppable, self._fastest)
+
+
+class CoarseSensors:
+    """Samples positions and velocities of the joints: noise on the truth, then the nearest step of the encoder.
+
+    Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as positions over
+    `EDGE_TIMING_S`. The noise of a tick is always the same: a board that starts anew, and a second look, see it again.
+    """
+
+    def __init__(self, encoders: Encoders, seed: int) -> None:
+        self._seed = seed
+        per_second = np.array([[1.0], [1.0 / EDGE_TIMING_S]])
+        self._noise, self._step = encoders.noise * per_second, encoders.resolution * per_second
+        self._noisy, self._stepped = bool(encoders.noise.any()), self._step > 0.0
+        self._per_step = 1.0 / np.where(self._stepped, self._step, 1.0)
+
+    def sample(self, position: Array, velocity: Array, tick: int) -> Array:
+        """Return (2, joints): positions, rad, and velocities, rad/s, of a tick as sensed."""
+        sample = np.array((position, velocity))
+        if self._noisy:
+            sample += self._noise * np.random.default_rng((self._seed, tick)).standard_normal(sample.shape)
+        steps = np.rint(sample * self._per_step)
+        steps *= self._step
+        np.copyto(sample, steps, where=self._stepped)
+        return sample

@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 
 from rack.backplane.mailbox import Reading
 from rack.backplane.message import Message
-from rack.levels.operator import Commands, What
-from rack.levels.orders import Orders, joints_of
+from rack.levels.operator import Commands, Operation, Orders, joints_of
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
 
 Array = NDArray[np.float64]
 
 
-class Standing:
+class OperatorControl:
     """Follows the operator. `stands`: the level follows the operator, and not the level above.
 
     To resume, the arm goes back by the places from which it set out: the level above finds it on its path, and what
@@ -37,23 +36,23 @@ class Standing:
         """Take up what is new."""
         if not self.orders.take(operator, self._judge):
             return
-        if self.orders.standing is What.NONE and self._way:
+        if self.orders.standing is Operation.NONE and self._way:
             self.orders.under_way()
-        self.stands = self.orders.standing is not What.NONE or bool(self._way)
+        self.stands = self.orders.standing is not Operation.NONE or bool(self._way)
 
     @property
     def reason(self) -> str:
         """Say for whom the arm does not follow the level above; empty: it does."""
         if not self.stands:
             return ""
-        if self.orders.standing is What.NONE:
+        if self.orders.standing is Operation.NONE:
             return "goes back to where the operator took over, then follows the level above"
-        what = "held" if self.orders.standing is What.HOLD else f"at the {self.orders.standing.name.lower()}"
+        what = "held" if self.orders.standing is Operation.HOLD else f"at the {self.orders.standing.name.lower()}"
         return f"{what} by the operator; `resume` goes on"
 
     def _judge(self, command: Message) -> None:
         """Take the goal of a set point, or refuse it."""
-        if self.orders.standing is What.SETPOINT:
+        if self.orders.standing is Operation.SETPOINT:
             try:
                 self._goal = joints_of(command, self._joints, self._ranges)
             except ValueError as error:
@@ -66,7 +65,7 @@ class Standing:
             motion = reference.rest(tick)
         else:
             before, motion = reference.goal, reference.to(goal, tick)
-            if reference.goal is not before and self.orders.standing is What.SETPOINT:
+            if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
                 self._way.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
             self._arrive()
@@ -74,14 +73,14 @@ class Standing:
 
     def _aim(self) -> Array | None:
         """Return where the joints are to go; None: nowhere."""
-        if self.orders.standing is What.SETPOINT:
+        if self.orders.standing is Operation.SETPOINT:
             return self._goal
-        return self._way[-1] if self.orders.standing is What.NONE and self._way else None
+        return self._way[-1] if self.orders.standing is Operation.NONE and self._way else None
 
     def _arrive(self) -> None:
         """Take in that the arm rests where it should."""
-        if self.orders.standing is What.NONE and self._way:
+        if self.orders.standing is Operation.NONE and self._way:
             self._way.pop()
-        if self.orders.standing is not What.NONE or not self._way:
-            self.stands = self.orders.standing is not What.NONE
+        if self.orders.standing is not Operation.NONE or not self._way:
+            self.stands = self.orders.standing is not Operation.NONE
             self.orders.done()
