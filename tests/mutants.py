@@ -82,7 +82,7 @@ MUTANTS = (
     Mutant(
         "limit gate",
         "command-limit",
-        (first(ARM, "def _wrong(self, torque: Array) -> Finding | None:", "return None"),),
+        (first("levels/arm/arm.py", "def refused(self, torque: Array) -> Finding | None:", "return None"),),
     ),
     Mutant("brake", "sensor-nan", (first(ARM, "def brake(self) -> None:", "return"),)),
     Mutant("restart", "kill", (("boards/supervision.py", "if len(recent) >= most:", "if True:"),)),

@@ -23,26 +23,17 @@ HARD, SOFT = 0, 8
 
 
 class Brake:
-    """Stops the joints with `braking` (joints,), rad/s2, at most, and holds them where they came to rest.
+    """Stops the joints and holds them where they came to rest, also a joint whose motor is off."""
 
-    `rest` (joints,), rad, is where that is. `stiffness`, rad/s, is the bandwidth of the hold.
-    """
-
-    def __init__(self, braking: Array, dynamics: Dynamics, stiffness: float = 20.0) -> None:
+    def __init__(self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0) -> None:
+        """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of the hold."""
         self._braking, self._dynamics = braking, dynamics
         self._stiffness = stiffness
-        self.closed = False
-        self.rest: Array = np.zeros(len(braking))
+        self.rest: Array = rest.copy()  # (joints,), rad: where the joints came to rest
 
-    def close(self, q: Array) -> None:
-        """Close at positions `q`, rad."""
-        if not self.closed:
-            self.closed = True
-            np.copyto(self.rest, q)
-
-    def open(self) -> None:
-        """Let the arm move again."""
-        self.closed = False
+    def hold_at(self, q: Array) -> None:
+        """Engage at positions `q`, (joints,), rad."""
+        np.copyto(self.rest, q)
 
     def torque(self, q: Array, qd: Array) -> Array:
         """Return the torques (joints,), N m, that stop or hold the arm at state `q`, `qd`."""

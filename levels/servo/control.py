@@ -7,10 +7,11 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from rack.backplane.message import Message
 from rack.levels.algebra import mat_vec
+from rack.levels.arm import find_arm
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
@@ -21,7 +22,7 @@ Reacting = Literal["hold", "stop", "brake"]
 
 
 class ServoParams(Table):
-    """`[board.servo.params]`: gains of the joint loop, and the reactions to faults of sensors and motors."""
+    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
 
     bandwidth: Positive = Field(60.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
     damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
@@ -39,6 +40,15 @@ class ServoParams(Table):
     patience: Positive = Field(
         5.0, description="time for which faults may keep the arm from its set points before they are latched, s"
     )
+    arm: str = Field(
+        "rack.levels.arm:SimulatedArm", description="class of the arm, package.module:Class; see rack.levels.arm.Arm"
+    )
+
+    @field_validator("arm")
+    @classmethod
+    def _is_an_arm(cls, reference: str) -> str:
+        find_arm(reference)
+        return reference
 
 
 class ComputedTorque:

@@ -46,7 +46,7 @@ class Found(NamedTuple):
 class ServoRig:
     """Runs executor and planner of the servo level tick by tick; the set points come from a function of time."""
 
-    def __init__(self, robot: RobotConfig, scene: SceneConfig, **params: float) -> None:
+    def __init__(self, robot: RobotConfig, scene: SceneConfig, **params: float | str) -> None:
         board = BoardSpec("servo", 1, ServoExecutor, ServoPlanner, PERIOD, above="primitive", params=params)
         self.rack = Lockstep([board], robot, scene, outside={"primitive.command": JOINT_SET_POINT})
         self.command: Message = self.rack.message("primitive.command")

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.arm import SimulatedArm
-from rack.levels.arm.simulated import PATIENCE_CYCLES, ObstacleMotion
+from rack.levels.arm.arm import PATIENCE_CYCLES
+from rack.levels.arm.simulated import ObstacleMotion
 from rack.levels.messages import ARM_STATE, SCENE
 from rack.levels.robot.cell import Cell, sizes
 from rack.levels.robot.dynamics import Dynamics

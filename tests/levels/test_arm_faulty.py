@@ -82,21 +82,21 @@ def test_a_dropout_leaves_the_tick_of_the_last_sample() -> None:
 def test_a_motor_that_is_off_gives_nothing_and_the_others_what_they_are_told() -> None:
     link, arm, acted = linked(fault("actuator-off", joint=1))
     link.drive(HOLDING, 0.0)
-    given = arm._data.ctrl[arm._cell.actuators]
+    given = arm._data.ctrl[arm.cell.actuators]
     assert given[1] == 0.0
     assert given[2] == HOLDING[2]
     assert arm.torque[1] == HOLDING[1]  # nobody tells the servo level
     assert acted == [0]
     link.inject([])
     link.drive(HOLDING, 0.0)
-    assert arm._data.ctrl[arm._cell.actuators][1] == HOLDING[1]
+    assert arm._data.ctrl[arm.cell.actuators][1] == HOLDING[1]
 
 
 def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_not_at_fault() -> None:
     link, arm, acted = linked(fault("actuator-saturated", part=0.1, joint=-1))
     link.drive(HOLDING, 0.0)
-    limits = arm._cell.bounds.torque
-    assert (np.abs(arm._data.ctrl[arm._cell.actuators]) <= 0.1 * limits + 1e-12).all()
+    limits = arm.cell.bounds.torque
+    assert (np.abs(arm._data.ctrl[arm.cell.actuators]) <= 0.1 * limits + 1e-12).all()
     acted.clear()
     link.drive(0.05 * limits, 0.0)
     assert acted == []

@@ -76,7 +76,7 @@ def test_a_limit_that_the_arm_itself_breaks_is_a_violation_with_or_without_a_blo
     rig = under_fire(FOREARM, -0.85, 4.0)
     rig.run(200, stand)
     arm = rig.servo.arm
-    arm._data.qvel[arm._cell.dof[1]] = 3.0  # type: ignore[attr-defined]
+    arm._data.qvel[arm.cell.dof[1]] = 3.0
     rig.run(1, stand)
     assert rig.status.violations > 0
     assert rig.status.pushed == 0

@@ -20,7 +20,7 @@ class Dash:
     """A motion that brings one joint of an arm to its highest planned speed, from second 1.5 on."""
 
     def __init__(self, rig: ServoRig, name: str, joint: int, side: float) -> None:
-        robot, bounds = config(name)[0], rig.servo.arm._cell.bounds  # type: ignore[attr-defined]
+        robot, bounds = config(name)[0], rig.servo.arm.cell.bounds
         self._home, self._joint, self._side = np.array(robot.home), joint, side
         self.speed, self._hardest = 0.95 * bounds.velocity[joint], 0.9 * robot.acceleration[joint]
         self.way = self.speed**2 / self._hardest + 0.3
