@@ -3,7 +3,7 @@
 - Write a level: `Executor`, `Planner`, with `Input`, `Ports`, `Reading`, `Verdict`, `LevelContext`, `Pace`.
 - Declare messages: `MessageType`, `Field`, `command`, `status`, `Message`, `State`; the default levels' messages are in
   `rack.levels.messages`, and their error codes in `Error`.
-- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`; tables of arm and cell: `RobotConfig`, `SceneConfig`.
+- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`; arm and cell: `RobotConfig`, `SceneConfig`.
 - Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OPERATOR_COMMAND`, `ANSWER`, `RESTS_ON`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
 - Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.

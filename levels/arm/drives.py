@@ -14,12 +14,12 @@ Array = NDArray[np.float64]
 
 STANDSTILL = 0.01
 """Joint speed, rad/s, below which a joint holds its position."""
-SPEED_USED = 0.99
+SPEED_PART = 0.99
 """Part of a velocity limit that the gate lets a joint reach; what its model leaves out in a cycle fits in the rest."""
 RANGE_KEPT_RAD = 0.002
-"""What the gate keeps from the ends of a joint's range, for the same reason."""
+"""Distance that the gate keeps from the ends of a joint's range, for the same reason."""
 HARD, SOFT = 0, 8
-"""Kinds of constraints of the solver."""
+"""Kinds of the solver's constraints."""
 
 
 class Brake:
@@ -44,17 +44,16 @@ class Brake:
 
 
 class LimitGate:
-    """Cuts torques so that the next cycle ends within limits, from which the arm can still be stopped.
+    """Cuts torques so that the next cycle ends within limits, at a state from which the arm can still be stopped.
 
-    A joint may be as fast as it can brake, with `braking` (joints,), rad/s2, before the end of its range. The
-    velocities that follow from torques are predicted with the arm's equation of motion. Torques that lead too far give
-    way to the nearest ones, in acceleration, that do not: a small quadratic program, in which the torque limits are the
-    last word.
+    A joint may be only so fast that it can brake, with `braking` (joints,), rad/s2, before the end of its range. The
+    arm's equation of motion predicts the velocities. Torques that lead too far are replaced by the nearest ones, in
+    acceleration, that do not: a small quadratic program, in which torque limits take precedence.
     """
 
     def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
         self._torque = bounds.torque
-        self._fastest = SPEED_USED * bounds.velocity
+        self._fastest = SPEED_PART * bounds.velocity
         self._low = bounds.position[:, 0] + RANGE_KEPT_RAD
         self._high = bounds.position[:, 1] - RANGE_KEPT_RAD
         self._braking = braking
@@ -74,14 +73,14 @@ class LimitGate:
         least = -self._speed_towards(q - self._low, -qd) - qd
         most = self._speed_towards(self._high - q, qd) - qd
         gain = np.clip(self._gain(passed, q, qd), least, most)
-        # Light joints change speed so much within a cycle that only its middle tells where it ends.
+        # Light joints change speed so much within a cycle that only its middle predicts where it ends.
         gain = self._gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
         if (gain < least).any() or (gain > most).any():
             passed = self._nearest(gain, least, most)
         return passed, not np.array_equal(passed, torque)
 
     def _gain(self, torque: Array, q: Array, qd: Array) -> Array:
-        """Return what torques add to the velocities in one cycle, rad/s, as the state `q`, `qd` has it."""
+        """Return the change in velocity, rad/s, that torques cause in one cycle at state `q`, `qd`."""
         self._inertia, bias = self._dynamics.terms(q, qd)
         self._resisting = bias + self._dynamics.friction(qd)
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
@@ -101,8 +100,8 @@ class LimitGate:
     def _speed_towards(self, distance: Array, speed: Array) -> Array:
         """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.
 
-        With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and from there must stop within what
-        is left: v'^2 / 2 a <= distance - (v + v') T / 2.
+        With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop within the rest:
+        v'^2 / 2 a <= distance - (v + v') T / 2.
         """
         half = 0.5 * self._braking * self._period_s
         left = np.maximum(distance - 0.5 * speed * self._period_s, 0.0)
@@ -114,7 +113,7 @@ class CoarseSensors:
     """Samples positions and velocities of the joints: noise on the truth, then the nearest step of the encoder.
 
     Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as positions over
-    `EDGE_TIMING_S`. The noise of a tick is always the same: a board that starts anew, and a second look, see it again.
+    `EDGE_TIMING_S`. The noise of a tick is always the same, also for a restarted board and a second look.
     """
 
     def __init__(self, encoders: Encoders, seed: int) -> None:

@@ -11,22 +11,20 @@ from rack.levels.robot.lookup import geom_name
 
 Array = NDArray[np.float64]
 
-WHAT = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
+QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
 
 
 class LimitMonitor:
-    """Records position, velocity and torque, of motor and brake together, step by step; judges once a tick.
+    """Records position, velocity and torque, of motor and brake together, in every step; judges once a tick.
 
-    `count` is the number of steps that broke a limit; `first` says which one the first of them broke. Steps in which
-    a blow pushes joints beyond limits of position or velocity, and no torque is beyond its own, are counted in
-    `pushed`: no drive can prevent them.
+    It shares nothing with the limit gate, which keeps the limits.
     """
 
     def __init__(self, cell: Cell, data: mujoco.MjData, substeps: int) -> None:
-        """Watch `data`, of which a tick takes `substeps` steps."""
+        """Watch `data`; a tick takes `substeps` steps."""
         model, bounds = cell.model, cell.bounds
         self._names = [model.joint(int(joint)).name for joint in model.dof_jntid[cell.dof]]
-        # Whole rows are recorded, at no more cost than the arm's part of them; what is not the arm's has no limits.
+        # Whole rows are recorded, at no more cost than the arm's part of them; other entries have no limits.
         self._live = data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied
         ends = np.cumsum([model.nq, model.nv, model.nv])
         self._seen = np.zeros((substeps, ends[-1]))
@@ -35,9 +33,9 @@ class LimitMonitor:
         self._low, self._high = np.full(ends[-1], -np.inf), np.full(ends[-1], np.inf)
         self._low[self._columns] = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
         self._high[self._columns] = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
-        self.count = 0
-        self.pushed = 0
-        self.first = ""
+        self.count = 0  # steps in which the drives broke a limit
+        self.pushed = 0  # steps in which a blow did, of position or velocity, and no torque: no drive can prevent it
+        self.first = ""  # the first broken limit, readable
 
     def look(self, substep: int) -> None:
         """Record the step that has just been made, number `substep` of its tick."""
@@ -48,11 +46,11 @@ class LimitMonitor:
         np.add(motors, brakes, out=torque)
 
     def judge(self, time_s: float, struck: bool) -> bool:
-        """Judge the steps of one tick that began at simulated `time_s`; say whether one broke a limit.
+        """Judge the steps of one tick that began at simulated `time_s`; return whether one broke a limit.
 
-        `struck`: the arm has been struck, and moves on from that.
+        `struck`: the motion is still that of a blow.
         """
-        # What is no number is not within limits either. (To count is five times as fast as to ask for all.)
+        # NaN is not within limits either. (Counting is five times as fast as `all`.)
         within = np.count_nonzero(self._seen >= self._low) + np.count_nonzero(self._seen <= self._high)
         if within == 2 * self._seen.size:
             return False
@@ -74,18 +72,14 @@ class LimitMonitor:
         substep = int(steps.argmax())
         part, joint = (int(at[0]) for at in np.nonzero(wrong[substep, self._columns]))
         column = self._columns[part, joint]
-        what, unit = WHAT[part]
+        what, unit = QUANTITIES[part]
         where = f"joint '{self._names[joint]}' at {time_s:.4f} s, step {substep}"
         permitted = f"{self._low[column]:g} to {self._high[column]:g} is permitted"
         self.first = f"{what} {self._seen[substep, column]:.6g} {unit} of {where}; {permitted}"
 
 
 class ContactMonitor:
-    """Looks at a cell's contacts after every step of the simulation.
-
-    `count` is the number of unmeant contacts, summed over the steps; `first` names the first one and says when.
-    `struck`: the geoms of the newest one of the arm, or of what it holds, since this was last set to None.
-    """
+    """Counts the unintended contacts of a cell after every step of the simulation."""
 
     def __init__(self, cell: Cell) -> None:
         self._model = cell.model
@@ -93,12 +87,12 @@ class ContactMonitor:
         self._arm, self._gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
         self._arm[cell.arm_geoms] = self._gripper[cell.gripper_geoms] = True
         self._root = cell.model.body_rootid[cell.model.geom_bodyid]
-        self.count = 0
-        self.first = ""
-        self.struck: tuple[int, int] | None = None
+        self.count = 0  # unintended contacts, summed over the steps
+        self.first = ""  # the first one, readable: which geoms, and when
+        self.struck: tuple[int, int] | None = None  # geoms of the newest one of arm or load since this was set to None
 
     def look(self, data: mujoco.MjData, time_s: float) -> None:
-        """Count the unmeant contacts of one step at simulated `time_s`."""
+        """Count the unintended contacts of one step at simulated `time_s`."""
         if data.ncon == 0:
             return
         pairs = unintended_contacts(data, self._touch)
@@ -112,17 +106,17 @@ class ContactMonitor:
             self.struck = int(ours[0, 0]), int(ours[0, 1])
 
     def holds(self, data: mujoco.MjData) -> bool:
-        """Say whether the gripper touches a free body."""
+        """Return whether the gripper touches a free body."""
         return bool(self._held(data).any())
 
     def leans(self, data: mujoco.MjData) -> bool:
-        """Say whether the arm, or what it holds, touches anything else."""
+        """Return whether the arm, or its load, touches anything else."""
         ours = self._arm | self._held(data)
         one_sided = ours[data.contact.geom].sum(axis=1) == 1
         return bool((one_sided & (data.contact.dist < 0.0)).any())
 
     def named(self, pair: tuple[int, int] | NDArray[np.int32]) -> str:
-        """Return what touches what."""
+        """Return a pair in words."""
         first, second = (geom_name(self._model, geom) for geom in pair)
         return f"'{first}' touches '{second}'"
 

@@ -168,7 +168,7 @@ class SimulatedArm(Arm):
         return self.tick * self._clock_ns * 1e-9
 
     def _give(self) -> None:
-        """Pass the command to the motors, or the brakes' torque to the joints, through the limit gate."""
+        """Apply the command to the motors, or the brakes' torque to the joints, through the limit gate."""
         d, cell = self._data, self.cell
         q, qd = self._state()
         braked = self.braked
@@ -202,7 +202,7 @@ class SimulatedArm(Arm):
             mujoco.mj_setState(m, d, self._sound, STATE)
 
     def _broken(self) -> str:
-        """Return what is wrong with the simulation; empty: nothing."""
+        """Return the fault of the simulation; empty: none."""
         d = self._data
         warned = np.flatnonzero(d.warning.number)
         if warned.size:
@@ -213,10 +213,10 @@ class SimulatedArm(Arm):
 
 
 class ObstacleMotion:
-    """The moves of one obstacle, one after the other; a move that starts before the last has ended cuts that off."""
+    """The moves of one obstacle; a move that starts before the last has ended cuts that short."""
 
     def __init__(self, start: Array, moves: tuple[MotionConfig, ...]) -> None:
-        """Take the place `start` (3,), m, and the obstacle's moves."""
+        """Start at the place `start`, (3,), m."""
         self._start = np.array(start)
         self._moves = tuple(sorted(moves, key=lambda move: move.at))
         self._ends = (*(later.at for _, later in pairwise(self._moves)), np.inf)

@@ -1,6 +1,6 @@
 """The arm's equation of motion, as a controller knows it: torque = M(q) qdd + bias(q, qd) + friction.
 
-Evaluated on data of its own, with contacts and constraints off: a pure function of its arguments, not of a simulation.
+Evaluated on separate data, with contacts and constraints off: a pure function of its arguments, not of a simulation.
 (`qfrc_bias` of a simulation belongs to the state before its last step.)
 """
 
@@ -26,20 +26,17 @@ OFF = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAI
 
 
 class Payload(NamedTuple):
-    """A mass in the gripper, kg, and its centre in the frame of the tool, (3,), m."""
+    """A mass in the gripper."""
 
-    mass: float
-    offset: Array
+    mass: float  # kg
+    offset: Array  # (3,), m: its centre in the tool's frame
 
 
 class Terms(NamedTuple):
-    """The equation at one state: `inertia` (joints, joints), kg m2, and `bias` (joints,), N m.
+    """The equation at one state; dry friction is separate."""
 
-    The bias holds gravity, Coriolis and centrifugal torques, springs and viscous friction; dry friction is apart.
-    """
-
-    inertia: Array
-    bias: Array
+    inertia: Array  # (joints, joints), kg m2
+    bias: Array  # (joints,), N m: gravity, Coriolis and centrifugal torques, springs, viscous friction
 
 
 class Dynamics:

@@ -1,4 +1,4 @@
-"""Limits of an arm's joints, from config and model: what motion is planned within, and what is never exceeded."""
+"""Limits of an arm's joints, from config and model, and the resolution of their encoders."""
 
 from __future__ import annotations
 
@@ -12,69 +12,58 @@ from rack.levels.errors import RobotError
 from rack.levels.tables import RobotConfig
 
 VELOCITY_ROOM = 0.05
-"""Part of a velocity limit that planned motion leaves free, so that tracking it does not run into the limit gate."""
+"""Part of a velocity limit that planned motion leaves free, so that tracking stays clear of the limit gate."""
 POSITION_ROOM_RAD = 0.005
-"""What planned motion keeps from the ends of a joint's range, for the same reason."""
+"""Distance that planned motion keeps from the ends of a joint's range, for the same reason."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the arm never exceeds, fault or not: the limits as config and model give them.
+    """Limits that the arm never exceeds, fault or not: as config and model give them.
 
     Slides have m and N where hinges have rad and N m.
-
-    - `position`: (joints, 2), low and high, rad; -inf and inf for a joint without.
-    - `velocity`: (joints,), both ways, rad/s. `torque`: (joints,), both ways, N m.
     """
 
-    position: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    torque: NDArray[np.float64]
+    position: NDArray[np.float64]  # (joints, 2), rad: low and high; -inf and inf for a joint without
+    velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
+    torque: NDArray[np.float64]  # (joints,), N m, both ways
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What motion is planned within: the bounds, less some room to track it, and the config's smoothness.
+    """Limits of planned motion: the bounds, less some room for tracking, and the config's smoothness."""
 
-    `position` (joints, 2), rad; `velocity`, `acceleration`, `jerk` (joints,), both ways, rad/s, rad/s2, rad/s3;
-    `torque` (joints,), N m.
-    """
-
-    position: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
-    jerk: NDArray[np.float64]
-    torque: NDArray[np.float64]
+    position: NDArray[np.float64]  # (joints, 2), rad: low and high
+    velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
+    acceleration: NDArray[np.float64]  # (joints,), rad/s2, both ways
+    jerk: NDArray[np.float64]  # (joints,), rad/s3, both ways
+    torque: NDArray[np.float64]  # (joints,), N m, both ways
 
 
 EDGE_TIMING_S = 0.1
 """A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
-the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and without the lag of a filter behind one."""
+the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no filter's lag."""
 PRESSING = 0.2
-"""Part of a torque limit that a contact takes at most where a task means one, as when a part is set down: a third more
-than tasks show."""
+"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a third more than seen in
+tasks."""
 RESTING = 0.1
-"""The same while an arm that holds a part hardly moves: dry friction may hide the push at all joints but one."""
+"""The same for an arm that holds a part and hardly moves: dry friction may hide the push at all joints but one."""
 TURNING_JOINTS = 2
-"""Joints that turn, at which a push shows: fewer, and the arm hardly moves."""
+"""Fewest turning joints at which an arm moves enough for a push to show."""
 SIGMAS = 6.0
-"""Standard deviations of noise that a monitor allows for: less than one sample in a billion is farther off."""
+"""Standard deviations of noise that a monitor allows for: fewer than one sample in a billion is farther off."""
 
 
 @dataclass(frozen=True)
 class Encoders:
-    """What the joints' sensors resolve, (joints,) each: `resolution` and `noise` of positions, rad.
+    """Resolution and noise of the joints' sensors; of velocities, rad/s, they are these over `EDGE_TIMING_S`."""
 
-    Of velocities, rad/s, they are these over `EDGE_TIMING_S`. `off` and `speed_off`: how far from the truth a good
-    sample may be, rad and rad/s.
-    """
-
-    resolution: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    resolution: NDArray[np.float64]  # (joints,), rad: step of a position
+    noise: NDArray[np.float64]  # (joints,), rad: standard deviation of a position
 
     @classmethod
     def of(cls, robot: RobotConfig) -> Encoders:
-        """Return those of a `[robot]` table."""
+        """Return the encoders of a `[robot]` table."""
         joints, sensors = len(robot.joints), robot.sensors
         return cls(np.broadcast_to(sensors.resolution, joints), np.broadcast_to(sensors.noise, joints))
 
@@ -97,9 +86,9 @@ class Encoders:
 def joint_bounds(
     model: mujoco.MjModel, joints: NDArray[np.int_], robot: RobotConfig, torque: NDArray[np.float64]
 ) -> Bounds:
-    """Return the bounds; of a position range in both config and model the tighter end holds.
+    """Return the bounds; of a position range in both config and model the tighter end applies.
 
-    Raises `RobotError` for a range that is empty.
+    Raises `RobotError` for an empty range.
     """
     ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf])
     if robot.position is not None:

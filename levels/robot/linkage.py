@@ -1,10 +1,9 @@
 """The linkage of a gripper: one joint is driven, the others that the arm carries follow it by the model's equalities.
 
-MuJoCo writes every equality, be it a gear, a loop closed by `connect` or `weld`, or a coupled tendon, as rows of
-residual and Jacobian, and every joint stop that is passed as well. Gauss-Newton over them, with the springs of the
-joints as weak rows, finds where the linkage settles. It is solved once for a number of openings; a pose in between is
-interpolated, so that it costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order: equal models
-give equal poses.
+MuJoCo writes every equality (a gear, a loop closed by `connect` or `weld`, a coupled tendon), and every joint stop
+that is exceeded, as rows of residual and Jacobian. Gauss-Newton over them, with the joints' springs as weak rows,
+finds where the linkage settles. It is solved once for a number of openings; a pose in between is interpolated, which
+costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order: equal models give equal poses.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ Array = NDArray[np.float64]
 OPENINGS = 33
 """Openings at which the linkage is solved, evenly from one end to the other."""
 APPROACH_STEPS = 8
-"""Steps from the model's reference pose to the nearest of them: a loop must not flip over on the way."""
+"""Steps from the model's reference pose to the nearest opening: a loop must not flip over on the way."""
 ITERATIONS = 60
 STEP_TOLERANCE = 1e-10
 SPRING_PART = 1e-6
 """Weight of the stiffest spring against an equality."""
 DAMPING = 1e-9
-"""Weight of staying in place: for joints that nothing determines."""
+"""Weight of staying in place, for joints that nothing determines."""
 FREE_PART = 0.01
 """Share of staying in place, among all that holds a joint, above which the joint is free."""
 RESIDUAL = 1e-3
@@ -40,15 +39,12 @@ SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 @dataclass(frozen=True)
 class Linkage:
-    """Where the joints of a gripper are, by its opening.
+    """Positions of a gripper's joints, by its opening."""
 
-    `openings` (k,), rising, m or rad; `joints` (n,), addresses in qpos of those that follow; `positions` (n, k).
-    """
-
-    driven: int
-    openings: Array
-    joints: NDArray[np.int_]
-    positions: Array
+    driven: int  # address of the driven joint in qpos
+    openings: Array  # (k,), rising, m or rad
+    joints: NDArray[np.int_]  # (n,), addresses in qpos of the joints that follow
+    positions: Array  # (n, k), m or rad
 
     def set(self, qpos: Array, opening: float) -> None:
         """Set the driven joint in `qpos` to `opening`, m or rad, and all that follow it."""
@@ -60,8 +56,8 @@ class Linkage:
 def solve_linkage(model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_], ends: tuple[float, float]) -> Linkage:
     """Return the linkage driven by `joint` in the bodies `hand` (nbody,), between the openings `ends`.
 
-    Joints that have a motor of their own do not follow. Raises `RobotError` with the equality that cannot be kept, or
-    the joint that nothing determines.
+    Joints with their own motor do not follow. Raises `RobotError` with the equality that cannot be kept, or the joint
+    that nothing determines.
     """
     solver = _Solver(model, joint, hand)
     openings = np.linspace(min(ends), max(ends), OPENINGS)
@@ -104,7 +100,7 @@ class _Solver:
         self._weights = np.diag(self._springs + DAMPING)
 
     def settle(self, start: Array, opening: float) -> Array:
-        """Return qpos with the linkage at `opening`, looked for from `start`."""
+        """Return qpos with the linkage settled at `opening`, searched from `start`."""
         data, count = self._data, len(self.joints)
         data.qpos[:] = start
         data.qpos[self.driven] = opening
@@ -121,13 +117,13 @@ class _Solver:
             if float(np.max(np.abs(step))) < STEP_TOLERANCE:
                 break
         for k in np.flatnonzero(self._loose):
-            # Where a joint is free to move, staying in place is all that resists.
+            # If a joint is free to move, only staying in place resists.
             mujoco.mju_cholSolve(step, matrix, DAMPING * np.eye(count)[k])
             self._loose[k] = step[k] > FREE_PART
         return np.array(data.qpos)
 
     def check(self, opening: float) -> None:
-        """Raise `RobotError` where the pose found last leaves an equality open."""
+        """Raise `RobotError` where the last pose leaves an equality open."""
         self._evaluate()
         data, jacobian = self._data, self._jacobian()
         ours = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
@@ -144,7 +140,7 @@ class _Solver:
             )
 
     def check_all_follow(self) -> None:
-        """Raise `RobotError` for a joint that neither an equality nor a spring determines: nobody knows where it is."""
+        """Raise `RobotError` for a joint that neither an equality nor a spring determines."""
         for joint in (*self._others, *self._follow[self._loose]):
             name = (
                 self._model.joint(int(joint)).name or f"of body {self._model.body(self._model.jnt_bodyid[joint]).name}"
@@ -154,7 +150,7 @@ class _Solver:
             )
 
     def _rows(self) -> tuple[Array, Array]:
-        """Return residuals (rows,) and their Jacobian (rows, joints): equalities, and joint stops that are passed."""
+        """Return residuals (rows,) and their Jacobian (rows, joints): equalities, and joint stops that are exceeded."""
         self._evaluate()
         data, jacobian = self._data, self._jacobian()[:, self._dof]
         counts = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) | (data.efc_pos < 0.0)

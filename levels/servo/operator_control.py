@@ -1,4 +1,4 @@
-"""What an operator has the servo level do: hold, or bring the joints to a set point; and then back the way it came."""
+"""An operator's commands to the servo level: hold, or bring the joints to a set point; then back the same way."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ Array = NDArray[np.float64]
 
 
 class OperatorControl:
-    """Follows the operator. `stands`: the level follows the operator, and not the level above.
+    """Follows the operator.
 
-    To resume, the arm goes back by the places from which it set out: the level above finds it on its path, and what
-    was free on the way out is free on the way back. A restarted board does not know the way: there the level above
-    goes on from where the arm is.
+    To resume, the arm returns through the places from which it set out: the level above finds it on its path, and the
+    way out was free. A restarted board has forgotten the way: the level above then continues from where the arm is.
     """
 
     def __init__(self, commands: Commands, joints: Sequence[str], ranges: Array) -> None:
         """Permit set points within `ranges` (joints, 2), rad."""
         self.orders = Orders(commands)
-        self.stands = False
+        self.stands = False  # the level follows the operator, not the level above
         self._joints, self._ranges = joints, ranges
-        self._goal: Array | None = None
-        self._way: list[Array] = []
+        self._goal: Array | None = None  # (joints,), rad
+        self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
 
     def take(self, operator: Reading) -> None:
-        """Take up what is new."""
+        """Take up new commands."""
         if not self.orders.take(operator, self._judge):
             return
         if self.orders.standing is Operation.NONE and self._way:
@@ -42,13 +41,13 @@ class OperatorControl:
 
     @property
     def reason(self) -> str:
-        """Say for whom the arm does not follow the level above; empty: it does."""
+        """Why the arm does not follow the level above; empty: it does."""
         if not self.stands:
             return ""
         if self.orders.standing is Operation.NONE:
-            return "goes back to where the operator took over, then follows the level above"
+            return "returning to where the operator took over, then follows the level above"
         what = "held" if self.orders.standing is Operation.HOLD else f"at the {self.orders.standing.name.lower()}"
-        return f"{what} by the operator; `resume` goes on"
+        return f"{what} by the operator; `resume` releases it"
 
     def _judge(self, command: Message) -> None:
         """Take the goal of a set point, or refuse it."""
@@ -72,13 +71,13 @@ class OperatorControl:
         return motion
 
     def _aim(self) -> Array | None:
-        """Return where the joints are to go; None: nowhere."""
+        """Return where the joints are to go, (joints,), rad; None: nowhere."""
         if self.orders.standing is Operation.SETPOINT:
             return self._goal
         return self._way[-1] if self.orders.standing is Operation.NONE and self._way else None
 
     def _arrive(self) -> None:
-        """Take in that the arm rests where it should."""
+        """React to the arm resting where it should."""
         if self.orders.standing is Operation.NONE and self._way:
             self._way.pop()
         if self.orders.standing is not Operation.NONE or not self._way:

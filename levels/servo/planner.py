@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class ServoPlanner(Planner):
-    """Plans the inertia at the set point that is due next, with what the gripper holds, every time it is released."""
+    """Plans the inertia at the set point due next, with the object held, at every release."""
 
     inputs = {
         "command": Input(JOINT_SET_POINT, "above.command"),
@@ -38,7 +38,7 @@ class ServoPlanner(Planner):
         self._rest = np.zeros(len(cell.home))
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Always: the arm is always somewhere else."""
+        """Return True: the arm is always somewhere else."""
         return True
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
