@@ -13,7 +13,7 @@ from rack.backplane.message import Message
 from rack.levels.messages import SCENE
 from rack.levels.world import WorldModel
 from tests.levels.arms import config
-from tests.levels.disturbances import lose_some
+from tests.levels.box import lose_some
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
 Array = NDArray[np.float64]

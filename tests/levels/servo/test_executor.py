@@ -14,7 +14,7 @@ from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config, pendulum
-from tests.levels.servo_rig import PERIOD, TICK_S, Course, ServoRig
+from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
 
 Array = NDArray[np.float64]
 

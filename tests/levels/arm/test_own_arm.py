@@ -19,7 +19,7 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
 from tests.levels.arms import pendulum
-from tests.levels.servo_rig import Course, ServoRig
+from tests.levels.servo.rig import Course, ServoRig
 
 Array = NDArray[np.float64]
 START, GOAL = np.array([0.0, 0.5]), np.array([0.6, -0.4])
@@ -78,7 +78,7 @@ class HalfAnArm(Arm):
 
 @pytest.fixture
 def rig(tmp_path: Path) -> ServoRig:
-    return ServoRig(pendulum(tmp_path), SceneConfig(), arm="tests.levels.test_own_arm:IdealArm")
+    return ServoRig(pendulum(tmp_path), SceneConfig(), arm="tests.levels.arm.test_own_arm:IdealArm")
 
 
 def test_an_arm_named_in_the_config_is_driven_and_follows_its_set_points(rig: ServoRig) -> None:
@@ -121,9 +121,9 @@ def test_a_torque_that_is_nan_is_refused_by_every_arm(rig: ServoRig) -> None:
     ("reference", "why"),
     [
         ("nobody:Arm", "cannot import 'nobody': ModuleNotFoundError: No module named 'nobody'"),
-        ("tests.levels.test_own_arm:Missing", "module 'tests.levels.test_own_arm' has no class 'Missing'"),
+        ("tests.levels.arm.test_own_arm:Missing", "module 'tests.levels.arm.test_own_arm' has no class 'Missing'"),
         ("rack.levels.arm:Sensed", "'Sensed' is not a subclass of rack.levels.arm.Arm"),
-        ("tests.levels.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, drive, step"),
+        ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, drive, step"),
     ],
 )
 def test_a_class_that_is_no_arm_is_refused_before_launch(reference: str, why: str) -> None:

@@ -15,7 +15,7 @@ from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import RobotConfig, SensorConfig
 from tests.levels.arms import CLOCK_NS, config, pendulum
-from tests.levels.servo_rig import Course, ServoRig
+from tests.levels.servo.rig import Course, ServoRig
 from tests.levels.whole_rack import WholeRack
 
 GOAL = np.array([0.6, 1.0, -2.6, 0.4, -1.2, 0.5])

@@ -14,7 +14,7 @@ from rack.backplane.words import Demand
 from rack.levels.level import Fault
 from rack.levels.messages import Error
 from tests.levels.arms import config
-from tests.levels.servo_rig import ServoRig
+from tests.levels.servo.rig import ServoRig
 from tests.levels.whole_rack import WholeRack
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rack.backplane.alarms import Alarm
 from tests.levels.arms import config
-from tests.levels.servo_rig import Course, ServoRig
+from tests.levels.servo.rig import Course, ServoRig
 
 Array = NDArray[np.float64]
 

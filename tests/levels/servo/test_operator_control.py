@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from rack.backplane.words import Demand
 from rack.levels.operator import Answer, Operation
 from tests.levels.arms import cell, config
-from tests.levels.operators import Operator
-from tests.levels.servo_rig import TICK_S, Course, ServoRig
+from tests.levels.lockstep import Operator
+from tests.levels.servo.rig import TICK_S, Course, ServoRig
 
 Array = NDArray[np.float64]
 HOME = cell("puma560").home
