@@ -1,4 +1,4 @@
-"""The simulated arm: exact time, exact restarts, limits at every step, and contacts that no task means."""
+"""The simulated arm: exact time, exact restarts, limits at every step, and unintended contacts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The servo level when its sensors lie: found in bounded cycles, braked, and taken over again where the arm stands."""
+"""The servo level with faulty sensors: found in bounded cycles, braked, and resumed from where the arm stands."""
 
 from __future__ import annotations
 
