@@ -1,7 +1,7 @@
 """A level: an executor every cycle and a planner in the background (fig. 1), and what its author must know.
 
 The author writes `process` and `plan`. Pinning, timing, tracing, mailboxes and injected faults belong to the board that
-runs the level. The duties besides, each with its reason:
+runs the level. The other duties, each with its reason:
 
 Every level
 - `process` takes bounded time: it never waits, logs or prints. The cycle has a deadline.
@@ -159,8 +159,8 @@ class Executor(ABC):
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
-        # Besides the ports, these pass between board and level. The board sets `demand` before each `process`, and
-        # reports and clears `findings` and `acted` after it. It calls `inject` when the set of active faults changes.
+        # In addition to the ports, these pass between board and level. The board sets `demand` before each `process`,
+        # and reports and clears `findings` and `acted` after it. It calls `inject` when the active faults change.
         self.demand = Demand.NONE  # stop that the rack's safety demands of the arm in this cycle
         self.findings: list[Finding] = []  # faults found in this cycle, once an episode: the board raises an alarm each
         self.acted: list[int] = []  # indices, in the injected sequence, of the faults that acted in this cycle
@@ -182,7 +182,7 @@ class Executor(ABC):
 class Planner(ABC):
     """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
 
-    It is an object of its own, in a process of its own: it shares nothing with the executor but mailboxes. Its one
+    It runs in a separate process and shares nothing with the executor but mailboxes. Its one
     output is its mailbox `<board>.plan`.
     """
 

@@ -232,7 +232,7 @@ SERVO_PLAN = MessageType(
     "servo_plan",
     1,
     (
-        Field("inertia", "f8", "kg m2", "joint-space inertia, what is held included", ("joints", "joints")),
+        Field("inertia", "f8", "kg m2", "joint-space inertia, the object held included", ("joints", "joints")),
         Field("held", "i2", "1", "object included; -1: none"),
         Field("payload_mass", "f8", "kg", "mass in the gripper"),
         Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),

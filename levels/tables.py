@@ -112,7 +112,7 @@ class MotionConfig(Table):
 
 
 class SceneConfig(Table):
-    """`[scene]`: what stands in the cell besides the arm, by its names in the MJCF."""
+    """`[scene]`: objects and obstacles in the cell, by their names in the MJCF."""
 
     objects: tuple[str, ...] = Field((), description="free bodies that tasks may move")
     obstacles: tuple[str, ...] = Field((), description="mocap bodies that may move by themselves")

@@ -15,6 +15,18 @@ VELOCITY_ROOM = 0.05
 """Part of a velocity limit that planned motion leaves free, so that tracking stays clear of the limit gate."""
 POSITION_ROOM_RAD = 0.005
 """Distance that planned motion keeps from the ends of a joint's range, for the same reason."""
+EDGE_TIMING_S = 0.1
+"""A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
+the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no filter's lag."""
+MAX_CONTACT_PART = 0.2
+"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a third more than seen in
+tasks."""
+MAX_RESTING_CONTACT_PART = 0.1
+"""The same for an arm that holds a part and hardly moves: dry friction may hide the push at all joints but one."""
+MIN_TURNING_JOINTS = 2
+"""Fewest turning joints at which an arm moves enough for a push to show."""
+SIGMAS = 6.0
+"""Standard deviations of noise that a monitor allows for: fewer than one sample in a billion is farther off."""
 
 
 @dataclass(frozen=True)
@@ -38,20 +50,6 @@ class Limits:
     acceleration: NDArray[np.float64]  # (joints,), rad/s2, both ways
     jerk: NDArray[np.float64]  # (joints,), rad/s3, both ways
     torque: NDArray[np.float64]  # (joints,), N m, both ways
-
-
-EDGE_TIMING_S = 0.1
-"""A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
-the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no filter's lag."""
-PRESSING = 0.2
-"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a third more than seen in
-tasks."""
-RESTING = 0.1
-"""The same for an arm that holds a part and hardly moves: dry friction may hide the push at all joints but one."""
-TURNING_JOINTS = 2
-"""Fewest turning joints at which an arm moves enough for a push to show."""
-SIGMAS = 6.0
-"""Standard deviations of noise that a monitor allows for: fewer than one sample in a billion is farther off."""
 
 
 @dataclass(frozen=True)

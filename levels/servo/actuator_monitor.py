@@ -12,7 +12,7 @@ from rack.levels.algebra import each, mat_vec
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
-from rack.levels.robot.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
 Array = NDArray[np.float64]
 
@@ -36,9 +36,9 @@ class ActuatorMonitor:
     """Compares the torques that a motion took with the torques commanded for it.
 
     A difference is explained by motors that gave less than commanded, or by something outside that pushes: then, until
-    the difference is gone, only a motor that lacks more than `PRESSING` is at fault. A pulling load looks like a motor
-    that lacks torque for a cycle or two; but under load, a motor commanded more gives more. A motor has failed, too,
-    when the arm strays from its set points by more than `following`, rad.
+    the difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` is at fault. A pulling load looks like a
+    motor that lacks torque for a cycle or two; but under load, a motor commanded more gives more. A motor has failed,
+    too, when the arm strays from its set points by more than `following`, rad.
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
@@ -59,7 +59,7 @@ class ActuatorMonitor:
         self._begun = False
         self._pushed = False  # motors do not explain the difference
         self._cycles, self._joint = 0, -1  # for which a motor has lacked torque, and which
-        self._told = self._gave = self._most = 0.0  # N m: commanded and given at first, most given since
+        self._commanded = self._given = self._most = 0.0  # N m: commanded and given at first, most given since
         self._alone = True  # it is the only motor that lacks torque
 
     def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
@@ -117,15 +117,15 @@ class ActuatorMonitor:
 
     def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
         """Follow cycles in which motors that lack torque explain the difference, until it is certain."""
-        told = np.abs(self._torque)
+        commanded = np.abs(self._torque)
         lacks = left * np.sign(self._torque)
-        explained = (lacks >= -self._noise) & (lacks <= told + self._noise)
+        explained = (lacks >= -self._noise) & (lacks <= commanded + self._noise)
         if not self._pushed and not explained.all():
             self._pushed, self._cycles = True, 0
         share = np.where(explained, lacks / self._limits, 0.0)
         # While a joint turns, its dry friction is known, and any push shows.
-        rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < TURNING_JOINTS
-        part = PRESSING if self._pushed else RESTING if rests and holds else LACKING_PART
+        rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < MIN_TURNING_JOINTS
+        part = MAX_CONTACT_PART if self._pushed else MAX_RESTING_CONTACT_PART if rests and holds else LACKING_PART
         least = np.maximum(part, self._noise / self._limits)
         joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
         if share[joint] <= least[joint]:
@@ -133,17 +133,18 @@ class ActuatorMonitor:
             return None
         if self._cycles == 0 or joint != self._joint:
             self._joint, self._cycles = joint, 0
-            self._told, self._gave, self._most, self._alone = told[joint], told[joint] - lacks[joint], 0.0, True
+            self._commanded, self._given = commanded[joint], commanded[joint] - lacks[joint]
+            self._most, self._alone = 0.0, True
         self._cycles += 1
-        self._most = max(self._most, abs(told[joint] - lacks[joint]))
+        self._most = max(self._most, abs(commanded[joint] - lacks[joint]))
         self._alone &= not rests and np.count_nonzero(np.abs(left) > self._noise) == 1
         ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
-        if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
+        if (ahead > self._fastest).any() or self._sure(joint, commanded[joint], lacks[joint]):
             self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
         return None
 
-    def _sure(self, joint: int, told: float, lacks: float) -> bool:
+    def _sure(self, joint: int, commanded: float, lacks: float) -> bool:
         """Return whether the motor surely gives nothing, or no more when commanded more, or less than a push may take.
 
         A dead motor may seem to give what dry friction does: twice its value, where that changes sign.
@@ -152,7 +153,7 @@ class ActuatorMonitor:
             return False
         if self._pushed:
             return True
-        more, rise = told - self._told, told - lacks - self._gave
+        more, rise = commanded - self._commanded, commanded - lacks - self._given
         certain = 2.0 * self._noise[joint]
-        hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD_PART * told else 0.0
+        hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD_PART * commanded else 0.0
         return bool(self._most <= certain + hidden or (more > certain and rise < RISE_PART * more))

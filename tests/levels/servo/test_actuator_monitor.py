@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rack.backplane.alarms import Alarm
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.robot.limits import PRESSING
+from rack.levels.robot.limits import MAX_CONTACT_PART
 from rack.levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
 from tests.levels.arms import cell, config
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
@@ -229,7 +229,7 @@ def test_a_part_that_is_pressed_on_its_support_is_no_motor_at_fault() -> None:
 def test_a_motor_that_lacks_more_than_a_contact_takes_is_found_while_a_part_presses() -> None:
     bench = Bench()
     bench.leave(10, j2=-2.5, j3=-1.4, j5=2.2)
-    much = (PRESSING + 0.01) * CELL.bounds.torque[1]
+    much = (MAX_CONTACT_PART + 0.01) * CELL.bounds.torque[1]
     found = bench.leave(SURE_CYCLES, j2=much, j3=-9.8, j5=0.4)
     assert [finding.subject for finding in found] == [1]
 
