@@ -36,7 +36,7 @@ class ActuatorMonitor:
     """Compares the torques that a motion took with the torques commanded for it.
 
     A difference is explained by motors that gave less than commanded, or by something outside that pushes: then, until
-    the difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` is at fault. A pulling load looks like a
+    the difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` has failed. A pulling load looks like a
     motor that lacks torque for a cycle or two; but under load, a motor commanded more gives more. A motor has failed,
     too, when the arm strays from its set points by more than `following`, rad.
     """
