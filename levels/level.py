@@ -24,21 +24,23 @@ Messages
   Reader and writer of a mailbox must name the same message type and version.
 
 Operator: a level that takes commands reads `Input(OPERATOR_COMMAND, "own.operator")`, lists them in `commands`, follows
-with `rack.levels.operator.Orders`, has `*ANSWER` in its status and `RESTS_ON` in its command. Without `RESTS_ON` the
-response of the system to an operator cannot be measured.
+with `rack.levels.operator.Orders`, has `*ANSWER` in its status (`orders.report`) and `RESTS_ON` in its command
+(`command.operator = orders.rests_on(...)`). A level that takes none passes `operator` on, down and into its status:
+without it the response of the system to an operator cannot be measured.
 
 Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check` then reports every
 mistake before the launch. Executor and planner of a board share one table.
 
-A servo level of your own also owes the primitive level, which waits with a reason while one of these is missing:
-- `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0` until the first set point
-  (`command.due` is 0), and again when set points stop: motion begins from that `target`. Four primitive cycles after
-  set points began, `holding` must be 0.
-- `stopped = 1` while set points are not followed, and HOLDING with a `reason`. A status every primitive cycle.
-- `position` within the primitive's `following` of `target`; else motion holds, then fails.
-- It obeys `demand`: the emergency stop and lost boards act through nothing else. It shows it in `status.demand`.
-- It lets the arm's time pass, saves its state and shows its scene: `rack.levels.arm.arm` says how. Without a `scene`
-  the world model is stale, and motion holds.
+A servo level of your own
+- reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0` until the first set
+  point (while `command.due` is 0), and again when set points stop: the primitive level waits for this, and motion
+  begins at that `target`. Four primitive cycles after set points began, `holding` must be 0; else it starts over.
+- reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the primitive level waits.
+- writes a status in every primitive cycle, with `position` near `target`: the primitive level holds motion when
+  statuses are missing, or when a joint is farther off than its `following`.
+- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm through nothing else.
+- lets the arm's time pass, saves its state, and shows its scene, without which the world model is stale and motion
+  holds: `rack.levels.arm.arm` says how.
 
 A primitive level of your own writes set points due two of its cycles later (`due = tick + 2 * every`): one brings them
 to the servo, over the second the servo interpolates. It reports `done`, `current`, `resting` and `blocked` of segments.
