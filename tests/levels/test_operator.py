@@ -32,7 +32,7 @@ def report(orders: Orders, above: int = 0, message: Message | None = None) -> Me
     return message
 
 
-def test_what_was_said_stands_until_resume() -> None:
+def test_a_command_stays_in_force_until_resume() -> None:
     orders = Orders(TAKES)
     assert orders.take(said(3, Operation.HOLD))
     assert not orders.take(said(3, Operation.HOLD, verdict=Verdict.OLD))
@@ -52,7 +52,7 @@ def test_a_command_given_twice_is_taken_up_once() -> None:
 @pytest.mark.parametrize(
     ("what", "goal"), [(Operation.SETPOINT, Goal.JOINTS), (Operation.GOTO, Goal.POSE), (Operation.HOLD, Goal.HOME)]
 )
-def test_what_the_level_does_not_take_is_refused_and_changes_nothing(what: Operation, goal: Goal) -> None:
+def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(what: Operation, goal: Goal) -> None:
     orders = Orders(TAKES)
     orders.take(said(1, Operation.HOLD))
     assert not orders.take(said(2, what, goal))
@@ -64,7 +64,7 @@ def test_what_the_level_does_not_take_is_refused_and_changes_nothing(what: Opera
     assert told.operator == 1
 
 
-def test_a_number_that_means_nothing_is_refused() -> None:
+def test_an_unknown_number_is_refused() -> None:
     orders = Orders(TAKES)
     reading = said(1, Operation.NONE)
     reading.value.what = 99
@@ -80,7 +80,7 @@ def test_a_status_rests_on_the_newest_of_here_and_above() -> None:
     assert report(orders, above=8).operator == 8
 
 
-def test_what_was_given_up_holds() -> None:
+def test_a_command_given_up_holds() -> None:
     orders = Orders(TAKES)
     orders.take(said(5, Operation.GOTO, Goal.HOME))
     orders.fail("out of reach")
@@ -91,7 +91,7 @@ def test_what_was_given_up_holds() -> None:
     assert report(orders, message=told).answer == Answer.REFUSED
 
 
-def test_only_what_is_under_way_comes_to_be_done() -> None:
+def test_only_a_command_under_way_becomes_done() -> None:
     orders = Orders(TAKES)
     orders.done()
     assert report(orders).answer == Answer.NONE
@@ -147,7 +147,7 @@ def answers(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bo
 
 
 @pytest.mark.parametrize("level", LEVELS)
-def test_a_level_that_was_held_in_motion_goes_on_to_the_end_of_the_task(level: str) -> None:
+def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> None:
     rack = WholeRack(actions=[REACH, HOME])
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
@@ -186,7 +186,7 @@ def test_a_restarted_board_holds_on(level: str) -> None:
     assert rack.run_to_end(30.0).state == State.DONE
 
 
-def test_a_goto_leaves_a_free_motion_and_the_program_goes_on_behind_it() -> None:
+def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
@@ -233,7 +233,7 @@ def test_what_is_done_with_an_object_is_done_before_a_goto() -> None:
     assert np.abs(rack.read("world.model").position[0] - TRANSFER["to"]).max() < 0.01
 
 
-def test_a_goto_that_cannot_be_is_refused_and_the_task_goes_on_behind_it() -> None:
+def test_an_impossible_goto_is_refused_and_the_task_continues() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
@@ -245,7 +245,7 @@ def test_a_goto_that_cannot_be_is_refused_and_the_task_goes_on_behind_it() -> No
     assert rack.run_to_end(40.0).state == State.DONE
 
 
-def test_a_goto_goes_on_when_the_board_of_the_task_level_has_died() -> None:
+def test_a_goto_continues_after_the_task_board_has_died() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)

@@ -76,7 +76,7 @@ def test_a_command_opens_the_brakes() -> None:
     assert arm.torque.any()
 
 
-def test_an_arm_restored_with_closed_brakes_goes_on_bit_for_bit() -> None:
+def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
     arm, made, _ = moving()
     arm.brake()
     arm.step(30)

@@ -56,7 +56,7 @@ def test_noise_is_the_same_again_with_the_same_seed_and_tick_and_has_its_size() 
     assert np.std(draws[0]) == pytest.approx(0.01, rel=0.1)
 
 
-def test_a_stuck_sensor_stays_and_acts_from_where_it_can_be_told_from_the_truth() -> None:
+def test_a_stuck_sensor_counts_as_acting_once_it_differs_from_the_truth() -> None:
     link, arm, acted = linked(fault("sensor-stuck", joint=0))
     first = link.sense().position.copy()
     assert acted == []
@@ -79,7 +79,7 @@ def test_a_dropout_leaves_the_tick_of_the_last_sample() -> None:
     assert len(acted) == 3
 
 
-def test_a_motor_that_is_off_gives_nothing_and_the_others_what_they_are_told() -> None:
+def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -> None:
     link, arm, acted = linked(fault("actuator-off", joint=1))
     link.drive(HOLDING, 0.0)
     given = arm._data.ctrl[arm.cell.actuators]

@@ -88,7 +88,7 @@ def test_simulated_time_is_the_tick_times_the_period_exactly() -> None:
     assert arm.tick == 40
 
 
-def test_a_restored_arm_goes_on_bit_for_bit() -> None:
+def test_a_restored_arm_continues_bit_for_bit() -> None:
     arm, made = arm_of("puma560")
     torque, middle = wobble(made), Message(ARM_STATE.dtype(sizes(made)))
     for tick in range(200):
@@ -156,7 +156,7 @@ def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(watched: C
     assert extremes.beyond <= 0.0
 
 
-def test_drives_go_on_with_the_last_torque_for_a_while_then_brake_and_stand_still() -> None:
+def test_drives_keep_the_last_torque_for_a_while_then_brake_to_standstill() -> None:
     arm, made = arm_of("puma560")
     torque = wobble(made)
     for tick in range(100):
@@ -229,7 +229,7 @@ def test_obstacle_motion_is_a_function_of_time_and_moves_follow_each_other() -> 
         assert motion.position(time_s) == pytest.approx([expected[time_s], 0.0, 0.0])
 
 
-def test_a_move_that_is_cut_off_by_the_next_goes_on_from_where_it_was() -> None:
+def test_a_move_cut_short_by_the_next_continues_from_where_it_was() -> None:
     moves = (
         MotionConfig(body="post", at=0.0, to=(2.0, 0.0, 0.0), speed=0.5),
         MotionConfig(body="post", at=2.0, to=(1.0, 3.0, 0.0), speed=1.0),

@@ -107,7 +107,7 @@ def test_a_shoulder_that_loses_its_torque_at_rest_hardly_falls(kind: str, parame
     assert np.abs(rig.servo.arm.sense().position - home).max() < 0.01
 
 
-def test_a_motor_at_fault_is_tried_again_and_the_set_points_are_followed_once_it_is_sound() -> None:
+def test_a_failed_motor_is_retried_and_set_points_are_followed_once_it_works() -> None:
     rig, dash = dashing("puma560", 1, 1.0, retry=0.1)
     rig.inject("actuator-off", joint=1)
     rig.run(400, dash.at)
@@ -153,7 +153,7 @@ def test_a_motor_that_is_asked_for_nothing_is_not_missed() -> None:
 
 @pytest.mark.parametrize("kind", ["command-nan", "command-limit"])
 @pytest.mark.parametrize("cycles", [1, 120])
-def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torques_are_sound(
+def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torques_are_valid(
     kind: str, cycles: int
 ) -> None:
     rig, dash = dashing("puma560", 0, 1.0)
@@ -173,7 +173,7 @@ def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torqu
     assert rig.status.violations == 0
 
 
-def test_a_motor_off_is_found_where_dry_friction_turns_round_and_hides_what_it_gives() -> None:
+def test_a_dead_motor_is_found_where_dry_friction_changes_sign_and_hides_it() -> None:
     rig = ServoRig(*config("puma560"))
     home = np.array(config("puma560")[0].home)
     # The first joint comes to rest while the others go on.

@@ -58,7 +58,7 @@ def test_noise_is_that_of_its_tick_and_seed_and_has_its_size() -> None:
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
 @pytest.mark.parametrize("resolution", [1e-5, 1e-4, 3e-4, 1e-3])
-def test_a_move_with_coarse_encoders_finds_nothing_and_comes_to_its_goal(resolution: float, noise: float) -> None:
+def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(resolution: float, noise: float) -> None:
     robot, scene = config("puma560")
     rig = ServoRig(coarse(robot, resolution, noise), scene)
     rig.run(1000, move().at)
@@ -98,7 +98,7 @@ def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(
         ("actuator-off", {"joint": 1}, Error.MOTORS),
     ],
 )
-def test_a_fault_of_a_coarse_sensor_is_still_told_from_one_of_a_motor(
+def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
     kind: str, parameters: dict[str, float], error: Error
 ) -> None:
     robot, scene = config("puma560")

@@ -253,7 +253,7 @@ def grasping(tmp_path: Path) -> ServoRig:
     return rig
 
 
-def test_what_is_held_is_in_the_plan_and_does_not_pull_the_arm_down(grasping: ServoRig) -> None:
+def test_the_held_object_is_in_the_plan_and_does_not_pull_the_arm_down(grasping: ServoRig) -> None:
     home = np.array(config("puma560")[0].home)
     grasping.run(400, lambda _: (home, np.zeros(6)))
     plan, scene = grasping.rack.read("servo.plan"), grasping.rack.read("servo.scene")
@@ -268,7 +268,7 @@ def test_what_is_held_is_in_the_plan_and_does_not_pull_the_arm_down(grasping: Se
     assert grasping.status.torque[1] - bare[1] == pytest.approx(1.5 * 9.81 * 0.5, rel=0.05)
 
 
-def test_a_restart_does_not_drop_what_is_held(grasping: ServoRig) -> None:
+def test_a_restart_does_not_drop_the_held_object(grasping: ServoRig) -> None:
     home = np.array(config("puma560")[0].home)
     grasping.run(100, lambda _: (home, np.zeros(6)))
     grasping.miss(10_000)

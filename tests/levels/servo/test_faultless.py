@@ -42,7 +42,7 @@ def test_a_whole_task_finds_nothing_and_breaks_no_limit(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), [("nasrem", 1), ("k1607", 2)])
-def test_missed_cycles_and_boards_that_start_anew_are_no_faults_of_the_arm(name: str, seed: int) -> None:
+def test_missed_cycles_and_restarted_boards_are_not_faults_of_the_arm(name: str, seed: int) -> None:
     rack = WholeRack(name, motion=load(name).scene.motion)
     assert run(rack, 15.0, seed) == []
     assert rack.read("servo.status").violations == 0

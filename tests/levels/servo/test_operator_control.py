@@ -25,7 +25,7 @@ def rig() -> ServoRig:
     return ServoRig(*config("puma560"))
 
 
-def test_a_hold_ramps_to_rest_and_stays_whatever_comes_from_above(rig: ServoRig) -> None:
+def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     assert np.abs(rig.status.target_velocity).max() > 0.1
     serial = Operator(rig.rack).say("servo", Operation.HOLD)
@@ -46,7 +46,7 @@ def test_a_hold_brakes_no_joint_harder_than_planned_motion(rig: ServoRig) -> Non
     assert_within_limits(np.array(rig.targets[SECOND:]))
 
 
-def test_behind_a_hold_the_set_points_are_followed_again(rig: ServoRig) -> None:
+def test_after_a_hold_set_points_are_followed_again(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND, COURSE.at)
     operator.say("servo", Operation.HOLD)
@@ -78,7 +78,7 @@ def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
     assert_within_limits(np.array(rig.targets[SECOND:]))
 
 
-def test_from_its_set_points_the_arm_comes_back_the_way_it_went(rig: ServoRig) -> None:
+def test_from_its_set_points_the_arm_returns_the_same_way(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND // 2)
     second = AWAY + 0.1
@@ -107,7 +107,7 @@ def test_a_hold_on_the_way_to_a_set_point_stops_there(rig: ServoRig) -> None:
     assert_within_limits(np.array(rig.targets))
 
 
-def test_a_set_point_out_of_range_is_refused_and_what_stood_stands(rig: ServoRig) -> None:
+def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     operator.say("servo", Operation.HOLD)
     rig.run(SECOND // 2, COURSE.at)
@@ -120,7 +120,7 @@ def test_a_set_point_out_of_range_is_refused_and_what_stood_stands(rig: ServoRig
     assert np.abs(rig.status.position - HOME).max() < 1e-3
 
 
-def test_a_demand_comes_before_the_operator(rig: ServoRig) -> None:
+def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND // 2)
     operator.say("servo", Operation.SETPOINT, AWAY)
@@ -133,7 +133,7 @@ def test_a_demand_comes_before_the_operator(rig: ServoRig) -> None:
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
 
 
-def test_a_restarted_board_goes_on_with_what_stands(rig: ServoRig) -> None:
+def test_a_restarted_board_continues_with_the_command_in_force(rig: ServoRig) -> None:
     Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
     rig.run(2 * SECOND, COURSE.at)
     rig.restart()

@@ -114,7 +114,7 @@ def test_a_wait_names_its_cause_and_the_tick_at_which_it_ends() -> None:
     assert [f.tick for f in rig.found if f.finding.alarm is Alarm.LATCHED] == [begun + PATIENCE_TICKS - 1]
 
 
-def test_what_is_latched_stays_so_when_the_board_starts_anew() -> None:
+def test_a_latched_fault_outlasts_a_restart_of_the_board() -> None:
     rig = swinging()
     rig.inject("sensor-nan", joint=1)
     rig.run(2 * PATIENCE_TICKS, swing)
@@ -125,7 +125,7 @@ def test_what_is_latched_stays_so_when_the_board_starts_anew() -> None:
     assert (rig.status.state, rig.status.error, rig.status.reason) == (State.ERROR, Error.SENSORS, reason)
 
 
-def test_a_fault_that_comes_again_and_again_is_latched_as_well() -> None:
+def test_a_recurring_fault_is_latched_as_well() -> None:
     rig = swinging()
     for _ in range(12):
         rig.inject("sensor-dropout")
@@ -135,7 +135,7 @@ def test_a_fault_that_comes_again_and_again_is_latched_as_well() -> None:
     assert rig.status.error == Error.SENSORS
 
 
-def test_a_demand_on_the_arm_uses_up_no_patience_and_is_what_the_level_waits_for() -> None:
+def test_a_demand_on_the_arm_uses_up_no_patience_and_is_the_reason() -> None:
     rig = swinging()
     rig.inject("sensor-nan", joint=1)
     rig.rack.demand = Demand.BRAKE
@@ -147,7 +147,7 @@ def test_a_demand_on_the_arm_uses_up_no_patience_and_is_what_the_level_waits_for
     assert follows(rig)
 
 
-def test_sensors_taken_over_again_tell_the_offset_found() -> None:
+def test_sensors_trusted_again_report_the_offset_found() -> None:
     rig = swinging()
     rig.inject("sensor-stuck", joint=-1)
     rig.run(40, swing)
@@ -163,7 +163,7 @@ def test_sensors_taken_over_again_tell_the_offset_found() -> None:
 
 
 @pytest.mark.timeout(200)
-def test_nasrem_goes_on_after_all_sensors_were_stuck_for_half_a_second() -> None:
+def test_nasrem_continues_after_all_sensors_were_stuck_for_half_a_second() -> None:
     rack = WholeRack("nasrem")
     rack.run(4659 * 0.0025)
     servo = rack.tasks["servo"].level

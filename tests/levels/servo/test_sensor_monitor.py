@@ -38,7 +38,7 @@ def rig_under_way(**params: float | str) -> ServoRig:
 
 
 @pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
-def test_sensor_fault_is_found_in_time_and_the_arm_is_braked_and_taken_over_again(
+def test_sensor_fault_is_found_in_time_the_arm_braked_and_motion_resumed(
     kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
 ) -> None:
     rig = rig_under_way()
@@ -61,7 +61,7 @@ def test_sensor_fault_is_found_in_time_and_the_arm_is_braked_and_taken_over_agai
 
 
 @pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
-def test_what_the_status_says_meanwhile_is_near_the_truth(
+def test_the_status_stays_near_the_truth_meanwhile(
     kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
 ) -> None:
     rig = rig_under_way()
@@ -171,7 +171,7 @@ def test_noise_on_a_joint_that_was_in_doubt_is_not_taken_for_where_it_is() -> No
     assert rig.status.stopped == 0
 
 
-def test_a_bias_at_rest_is_no_new_place_because_another_sensor_has_lied_before() -> None:
+def test_a_bias_at_rest_is_not_accepted_because_another_sensor_was_faulty_before() -> None:
     rig, home = ServoRig(*config("puma560")), move().start
     rig.run(200, lambda _: (home, np.zeros(6)))
     for joint in (0, 4):
@@ -184,7 +184,7 @@ def test_a_bias_at_rest_is_no_new_place_because_another_sensor_has_lied_before()
     assert Alarm.RE_REFERENCED not in rig.alarms()
 
 
-def test_an_offset_too_small_to_matter_is_taken_over_at_rest() -> None:
+def test_an_offset_too_small_to_matter_is_accepted_at_rest() -> None:
     rig, slow = ServoRig(*config("puma560")), Course(move().start, GOAL, 30.0)
     rig.run(400, slow.at)
     rig.inject("sensor-bias", size=3e-4, joint=0)

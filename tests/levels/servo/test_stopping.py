@@ -64,7 +64,7 @@ def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_br
     assert [f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES] == [Alarm.COLLISION]
 
 
-def test_a_contact_that_stays_is_latched_with_what_touches_what() -> None:
+def test_a_lasting_contact_is_latched_with_the_names_of_both_geoms() -> None:
     rig = under_fire(HAND, 0.2, 4.0)
     rig.run(1200, turn)
     assert (rig.status.state, rig.status.error, rig.status.braked) == (State.ERROR, Error.TOUCHED, 1)
@@ -93,7 +93,7 @@ def rig_under_way() -> tuple[ServoRig, Course]:
     return rig, move
 
 
-def test_brake_closes_the_brakes_in_its_own_cycle() -> None:
+def test_a_brake_demand_engages_the_brakes_in_its_own_cycle() -> None:
     rig, move = rig_under_way()
     rig.rack.demand = Demand.BRAKE
     rig.run(1, move.at)
@@ -129,7 +129,7 @@ def test_stop_ramps_to_rest_within_the_acceleration_limits_and_then_brakes() -> 
 
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 @pytest.mark.parametrize("ticks", [1, 30, 300])
-def test_afterwards_the_arm_is_taken_over_where_it_stands_and_joins_the_set_points(demand: Demand, ticks: int) -> None:
+def test_afterwards_motion_starts_where_the_arm_stands_and_joins_the_set_points(demand: Demand, ticks: int) -> None:
     rig, move = rig_under_way()
     limits = np.array(config("puma560")[0].acceleration)
     rig.rack.demand = demand
@@ -149,7 +149,7 @@ def test_afterwards_the_arm_is_taken_over_where_it_stands_and_joins_the_set_poin
     assert set(rig.alarms()) <= {Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED}
 
 
-def test_an_arm_that_is_braked_from_the_start_stays_where_it_is_and_rings_nothing() -> None:
+def test_an_arm_braked_from_the_start_stays_where_it_is_without_an_alarm() -> None:
     rig = ServoRig(*config("puma560"))
     rig.rack.demand = Demand.BRAKE
     rig.run(100, lambda _: (GOAL, np.zeros(6)))
@@ -158,9 +158,7 @@ def test_an_arm_that_is_braked_from_the_start_stays_where_it_is_and_rings_nothin
 
 
 @pytest.mark.parametrize(("missed", "told"), [(1, None), (2, 2), (40, 40)])
-def test_brakes_that_closed_because_cycles_were_missed_are_told_once_the_servo_runs_again(
-    missed: int, told: int | None
-) -> None:
+def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(missed: int, told: int | None) -> None:
     rig, move = rig_under_way()
     rig.miss(missed)
     rig.run(100, move.at)
@@ -169,7 +167,7 @@ def test_brakes_that_closed_because_cycles_were_missed_are_told_once_the_servo_r
     assert rig.status.stopped == 0
 
 
-def test_a_restarted_servo_tells_how_long_the_arm_was_without_torque() -> None:
+def test_a_restarted_servo_reports_how_long_the_arm_was_without_torque() -> None:
     rig, move = rig_under_way()
     rig.miss(10_000)
     for _ in range(50):
