@@ -1,6 +1,6 @@
 """The tables of a rack's config: every field with its unit, range and meaning.
 
-`[robot]` and `[scene]` are of `rack.levels.robot` and `rack.levels.scene`; `[task]` is the task level's.
+`[robot]` and `[scene]` are defined in `rack.levels.tables`; `[task]` is the task level's.
 """
 
 from __future__ import annotations
