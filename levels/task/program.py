@@ -1,4 +1,4 @@
-"""The `[task]` table: a program of actions."""
+"""The task in a config: the `[task]` table, a program of actions, and the parameters of the level."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from rack.levels.scene import SceneConfig
 
 Vector = tuple[Finite, Finite, Finite]
 
-
 VERBS = ("transfer", "goto", "home")
 
 
 class Action(Table):
-    """What every action has."""
+    """Base of all actions."""
 
     by: Positive | None = Field(None, description="simulated time by which the action must be done, s")
 
 
 class Transfer(Action):
-    """Take an object to another place."""
+    """Move an object to another place."""
 
     do: Literal["transfer"] = "transfer"
     object: str = Field(description="object of the scene")
@@ -37,7 +36,7 @@ class Transfer(Action):
 
 
 class Goto(Action):
-    """Bring the tool to a pose, or the joints to positions."""
+    """Move the tool to a pose, or the joints to positions."""
 
     do: Literal["goto"] = "goto"
     position: Vector | None = Field(None, description="of the tool, m")
@@ -63,7 +62,7 @@ class Goto(Action):
 
 
 class Home(Action):
-    """Bring the arm back to where it starts."""
+    """Move the arm back to its start."""
 
     do: Literal["home"] = "home"
 
@@ -72,17 +71,33 @@ class Home(Action):
 
 
 class TaskConfig(Table):
-    """A program: actions, done in their order."""
+    """A program: actions in their order."""
 
     action: tuple[Annotated[Transfer | Goto | Home, Field(discriminator="do")], ...] = Field(
         (), description="actions, done in their order"
     )
 
 
-def read_program(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> TaskConfig:
-    """Return the program that the `[task]` table holds.
+class TaskParams(Table):
+    """Times that the levels below need at most, for the promise of a time, and how long they may make no progress.
 
-    Raises `ProgramError`, a line a mistake: its place, its value and what is valid.
+    In `[board.<name>.params]`; s of simulated time.
+    """
+
+    beginning: Positive = Field(0.1, description="from a segment's arrival in the primitive level to motion, s")
+    settling: Positive = Field(0.2, description="from the end of a motion to the report that it is done, s")
+    gripping: Positive = Field(0.6, description="time that the gripper takes to open or close and to settle, s")
+    stalled_s: Positive = Field(
+        90.0,
+        description="time without any progress after which the task ends, unless an operator holds it; longer than "
+        "the patience of the level below, s",
+    )
+
+
+def read_program(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> TaskConfig:
+    """Return the program in the `[task]` table.
+
+    Raises `ProgramError` with one line per mistake: place, value and what is valid.
     """
     try:
         program = TaskConfig(**table)
@@ -95,7 +110,7 @@ def read_program(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfi
 
 
 def _line(mistake: Any) -> str:
-    # pydantic puts the chosen kind of action into the place: the user did not write it there.
+    # pydantic adds the chosen kind of action to the place; the user did not write it there.
     path = [str(part) for k, part in enumerate(mistake["loc"]) if not (k == 2 and part in VERBS)]
     kind, value = mistake["type"], f" = {mistake['input']!r}"
     text = mistake["msg"].removeprefix("Value error, ")
@@ -109,7 +124,7 @@ def _line(mistake: Any) -> str:
 
 
 def _misfits(k: int, action: Action, robot: RobotConfig, scene: SceneConfig) -> list[str]:
-    """Return what of an action the robot or the scene does not have."""
+    """Return mistakes for what an action needs and robot or scene lack."""
     place, found = f"task.action.{k}", []
     if isinstance(action, Transfer):
         if action.object not in scene.objects:
@@ -118,5 +133,5 @@ def _misfits(k: int, action: Action, robot: RobotConfig, scene: SceneConfig) -> 
         if robot.gripper is None:
             found.append(f"{place}.do = 'transfer': the robot has no gripper; valid: goto, home")
     if isinstance(action, Goto) and action.joints is not None and len(action.joints) != len(robot.joints):
-        found.append(f"{place}.joints: {len(action.joints)} values; valid: {len(robot.joints)}, one a joint")
+        found.append(f"{place}.joints: {len(action.joints)} values; valid: {len(robot.joints)}, one per joint")
     return found

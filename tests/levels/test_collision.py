@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rack.levels.cell import Cell, build_cell
-from rack.levels.planning.collision import HELD_DEPTH_M, CollisionChecker
+from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.robot import RobotConfig
@@ -130,7 +130,7 @@ def test_held_block_may_touch_the_table_only_where_it_is_meant_and_not_sink_into
     assert not checker.free(on_table)
     checker.permit(BLOCK1)
     assert checker.free(on_table)
-    assert not checker.free(at(ik, puma, 0.5, -0.2, 0.475 - HELD_DEPTH_M - 0.002))
+    assert not checker.free(at(ik, puma, 0.5, -0.2, 0.475 - MAX_HELD_DEPTH_M - 0.002))
 
 
 def test_objects_are_where_they_are_placed(puma: Cell, ik: InverseKinematics, checker: CollisionChecker) -> None:

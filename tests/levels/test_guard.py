@@ -11,10 +11,10 @@ import pytest
 from rack.backplane.message import Message, State
 from rack.levels.cell import Cell
 from rack.levels.messages import WORLD_MODEL, SegmentKind
+from rack.levels.motion.path import BlendedPath
+from rack.levels.motion.trajectory import make_trajectory
 from rack.levels.primitive.guard import Guard
-from rack.levels.primitive.path import BlendedPath
-from rack.levels.primitive.segment import Segment
-from rack.levels.primitive.trajectory import make_trajectory
+from rack.levels.primitive.segment import MotionSegment
 from rack.levels.scene import MotionConfig
 from tests.levels import arms
 from tests.levels.primitive_rack import PrimitiveRack, path
@@ -126,7 +126,7 @@ class Watched:
             self.world.quaternion[row] = start.xquat[body]
         self.path = BlendedPath(waypoints, np.zeros(len(waypoints)))
         self.trajectory = make_trajectory(self.path, self.cell.limits)
-        self.segment = Segment(1, SegmentKind.PATH, held, touch, waypoints, np.zeros(2), 0.0, 0.0, 0.0)
+        self.segment = MotionSegment(1, SegmentKind.PATH, held, touch, waypoints, np.zeros(2), 0.0, 0.0, 0.0)
 
     def watch(self) -> None:
         self.guard.watch(self.segment, self.path, 0.04, self.world)

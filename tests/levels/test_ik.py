@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.levels.planning.ik import LIMIT_MARGIN_RAD, InverseKinematics
-from rack.levels.planning.line import STRAY_M, straight_line
+from rack.levels.motion.path import BlendedPath
+from rack.levels.planning.ik import LIMIT_MARGIN_RAD, InverseKinematics, sampling_range
+from rack.levels.planning.motion_planner import MAX_STRAY_M, straight_line
+from rack.levels.planning.path_planner import lever_arms
 from rack.levels.planning.pose import Pose, pointing, pose
-from rack.levels.planning.reach import lever_arms, sampling_range
-from rack.levels.primitive.path import BlendedPath
 from tests.levels.arms import cell
 
 SEED = 7
@@ -93,7 +93,7 @@ def test_tool_follows_a_straight_line(name: str, way: tuple[float, float, float]
         tool = ik.tool_at(q)
         off = tool.position - begin.position
         along = off @ np.array(way) / length
-        assert np.linalg.norm(off - along * np.array(way) / length) < 1.5 * STRAY_M
+        assert np.linalg.norm(off - along * np.array(way) / length) < 1.5 * MAX_STRAY_M
         assert tool.angle_to(begin) < 0.02
 
 

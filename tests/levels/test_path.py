@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.levels.primitive.path import BlendedPath
+from rack.levels.motion.path import BlendedPath
 
 CORNERED = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, -0.3], [1.2, 1.0, 0.1], [0.4, 1.1, 0.9]])
 BLEND = np.array([0.0, 0.3, 0.25, 0.0])

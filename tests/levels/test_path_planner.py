@@ -7,12 +7,11 @@ import pytest
 
 from rack.levels.cell import Cell
 from rack.levels.messages import WAYPOINTS
+from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.path import Path
 from rack.levels.planning.path_planner import PathPlanner
 from rack.levels.planning.pose import pointing, pose
-from rack.levels.primitive.path import BlendedPath
 from tests.levels.arms import cell, config
 
 SEED = 3

@@ -10,11 +10,10 @@ import pytest
 from rack.levels.cell import Cell, build_cell
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
-from rack.levels.planning.motion import MotionPlanner
-from rack.levels.planning.move import Move
+from rack.levels.planning.motion_planner import MotionPlanner
+from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.payload import Payloads
 from rack.levels.planning.pose import Pose, pose
-from rack.levels.planning.situation import Situation
 from rack.levels.task import read_program
 from rack.levels.task.actions import rehearse
 from rack.levels.task.grasps import grasps

@@ -8,9 +8,9 @@ import pytest
 from rack.backplane.message import State
 from rack.levels.level import Demand
 from rack.levels.messages import Error
-from rack.levels.primitive.path import BlendedPath
+from rack.levels.motion.path import BlendedPath
+from rack.levels.motion.speed import BrakingLimits
 from rack.levels.primitive.path_motion import PathMotion
-from rack.levels.primitive.speed import BrakingLimits
 from tests.levels.disturbances import Shown, mute
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive_rack import PrimitiveRack, gripper, path

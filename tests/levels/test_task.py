@@ -13,14 +13,13 @@ import pytest
 from rack.backplane.message import REASON_BYTES, Message, State
 from rack.levels.errors import Refused
 from rack.levels.messages import MOVE_STATUS, TASK_PLAN, WINDOW, Error, Verb
-from rack.levels.planning.motion import MotionPlanner
+from rack.levels.planning.motion_planner import MotionPlanner
+from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose
-from rack.levels.planning.situation import Situation
 from rack.levels.task import TaskExecutor, read_program
 from rack.levels.task.actions import rehearse
-from rack.levels.task.finish import Cycles, Rehearsed, finish_times
-from rack.levels.task.params import TaskParams
-from rack.levels.task.rehearsal import Rehearsal
+from rack.levels.task.program import TaskParams
+from rack.levels.task.rehearsal import PipelinePeriods, Rehearsal, Rehearsed, finish_times
 from tests.levels.arms import cell, config
 from tests.levels.disturbances import lose_some
 from tests.levels.lockstep import BoardSpec, Lockstep
@@ -28,7 +27,7 @@ from tests.levels.whole_rack import WholeRack
 
 ROBOT, SCENE = config("puma560")
 BLOCK1, BLOCK2 = 0, 1
-CYCLES = Cycles(own_s=1.0, below_s=0.25, planning_s=1.0)
+CYCLES = PipelinePeriods(own_s=1.0, below_s=0.25, planning_s=1.0)
 TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 REACH = {"do": "goto", "position": [0.45, 0.10, 0.95]}
 HOME = {"do": "home"}

@@ -63,7 +63,7 @@ def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> Non
         ({"do": "home", "by": 0}, "task.action.0.by = 0: input should be greater than 0"),
         ({"do": "home", "speed": 2}, "task.action.0.speed = 2: extra inputs are not permitted"),
         ({"do": "goto"}, "task.action.0: a goto has either position or joints"),
-        ({"do": "goto", "joints": [0, 0]}, "task.action.0.joints: 2 values; valid: 6, one a joint"),
+        ({"do": "goto", "joints": [0, 0]}, "task.action.0.joints: 2 values; valid: 6, one per joint"),
         (
             {"do": "goto", "position": [0, 0, 1], "direction": [0, 0, 0]},
             "task.action.0: direction is all zero; its length must not be zero",

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from rack.levels.messages import SECTIONS, WAYPOINTS
-from rack.levels.primitive.path import BlendedPath
-from rack.levels.primitive.speed import SpeedLimits, boundary_speeds, braking_limits, reachable_speed, speed_limits
-from rack.levels.primitive.stop import make_stop
-from rack.levels.primitive.trajectory import Motion, Trajectory, duration, make_trajectory
+from rack.levels.motion.path import BlendedPath, PathBounds
+from rack.levels.motion.speed import SpeedLimits, boundary_speeds, braking_limits, reachable_speed, speed_limits
+from rack.levels.motion.trajectory import PathState, Trajectory, duration, make_stop, make_trajectory
 from tests.levels.arms import cell
 
 EXACT = 1e-6
@@ -154,9 +153,9 @@ def test_speeds_at_boundaries_can_be_reached_from_both_sides() -> None:
 
 
 def test_curve_without_acceleration_to_spare_is_gone_at_constant_speed() -> None:
-    first, second, third = np.full(6, 0.4), np.full(6, 1.0), np.full(6, 1.0)
-    whole = speed_limits(first, second, third, ARM, share=1.0)
-    part = speed_limits(first, second, third, ARM, share=0.75)
+    bend = PathBounds(np.full(6, 0.4), np.full(6, 1.0), np.full(6, 1.0))
+    whole = speed_limits(bend, ARM, share=1.0)
+    part = speed_limits(bend, ARM, share=0.75)
     assert whole.acceleration == 0.0
     assert part.acceleration > 0.0
     assert part.speed < whole.speed
@@ -202,6 +201,6 @@ def test_motion_on_a_straight_line_can_be_stopped_at_any_time() -> None:
 
 
 def test_stop_from_rest_stays_where_it_is() -> None:
-    stop = make_stop(random_path(15, 1), ARM, Motion(0.25, 0.0, 0.0))
+    stop = make_stop(random_path(15, 1), ARM, PathState(0.25, 0.0, 0.0))
     assert stop is not None
     assert (stop.begin, stop.end, stop.duration) == (0.25, 0.25, 0.0)

@@ -1,4 +1,4 @@
-"""Limits of a path's parameter: joint limits seen along one dimension, and the speeds that they let it reach."""
+"""Limits of a path's parameter s: joint limits seen along the path, and the speeds that they permit."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.motion.path import PathBounds
+
 Array = NDArray[np.float64]
 
-NEVER_AT_EDGE = 1.0 - 1e-7
-"""Part of a reachable change of speed that is used: at the very edge rounding decides whether it is reachable."""
+REACHABLE_PART = 1.0 - 1e-7
+"""Part of a reachable change of speed that is used: at the edge itself, rounding decides whether it is reachable."""
+MIN_ACCELERATION_PART = 1e-6
+"""Acceleration or jerk below this part of the speed, in 1/s or 1/s2, counts as none."""
+SMALLEST_LINEAR_TERM = 1e-12
+"""A cubic with a smaller linear coefficient is solved without it."""
 
 
 class JointLimits(Protocol):
@@ -27,7 +33,7 @@ class JointLimits(Protocol):
 
 
 class BrakingLimits(NamedTuple):
-    """Limits of a hold, as `JointLimits`."""
+    """`JointLimits` of a hold: (joints,) each, rad/s, rad/s2, rad/s3."""
 
     velocity: Array
     acceleration: Array
@@ -47,12 +53,13 @@ class SpeedLimits(NamedTuple):
     jerk: float
 
 
-def speed_limits(first: Array, second: Array, third: Array, limits: JointLimits, share: float) -> SpeedLimits:
-    """Return limits of s that keep every joint within `limits` where |q'|, |q''|, |q'''| are bounded as given.
+def speed_limits(piece: PathBounds, limits: JointLimits, share: float) -> SpeedLimits:
+    """Return limits of s that keep every joint within `limits` on a piece with the given bounds, (joints,) each.
 
     The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds. `share` (0 to 1) is the
-    part used of the highest speed that the bend of a curve permits: the less, the more is left to accelerate with.
+    part used of the highest speed that the bend of a curve permits: a smaller share leaves more to accelerate with.
     """
+    first, second, third = piece
     velocity, acceleration, jerk = limits.velocity, limits.acceleration, limits.jerk
     curved = bool(second.any())
     speed = _least(velocity, first)
@@ -64,7 +71,7 @@ def speed_limits(first: Array, second: Array, third: Array, limits: JointLimits,
     if curved:
         most = min(most, 0.5 * _least(left_jerk, 3.0 * second * speed))
     change = _least(np.maximum(left_jerk - 3.0 * second * speed * most, 0.0), first)
-    if most < 1e-6 * speed or change < 1e-6 * speed:
+    if min(most, change) < MIN_ACCELERATION_PART * speed:
         return SpeedLimits(speed, 0.0, 0.0)
     return SpeedLimits(speed, most, change)
 
@@ -75,7 +82,7 @@ def acceleration_room(first: Array, limits: JointLimits) -> tuple[float, float]:
 
 
 def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
-    """Return the highest speed that `length` rad reach from speed `start`, both without acceleration, in rad/s.
+    """Return the highest speed reachable from speed `start` over `length` rad, both without acceleration, in rad/s.
 
     By symmetry it is also the highest speed from which `start` can still be reached.
     """
@@ -87,7 +94,7 @@ def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
         # (2 start + change) / 2 * (change / a + a / j) = length
         linear, constant = 2.0 * start + a * a / j, 2.0 * a * (start * a / j - length)
         change = 0.5 * (-linear + math.sqrt(linear * linear - 4.0 * constant))
-    return min(start + change * NEVER_AT_EDGE, limits.speed)
+    return min(start + change * REACHABLE_PART, limits.speed)
 
 
 def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
@@ -108,7 +115,7 @@ def _least(room: Array, rate: Array) -> float:
 
 def _root_of_cubic(p: float, q: float) -> float:
     """Return the real root of x^3 + p x = q for p, q >= 0 (hyperbolic form of Cardano's)."""
-    if p < 1e-12:
+    if p < SMALLEST_LINEAR_TERM:
         return math.cbrt(q)
     r = math.sqrt(p / 3.0)
     return 2.0 * r * math.sinh(math.asinh(q / (2.0 * r**3)) / 3.0)
