@@ -65,7 +65,8 @@ class MotionPlanner:
         if move.touches:
             path = self._line(move, start, goal)
         else:
-            path = self._path_to(move, start, self.goal(move, start) if goal is None else goal, attempt, searches)
+            goal = self.goal(move, start) if goal is None else goal
+            path = self._path_to(move, start, goal, attempt=attempt, searches=searches)
         if situation.held is not None and situation.grip is not None:
             along = BlendedPath(*path).sample(LOAD_STEP_RAD)
             self.payloads.check_motors(situation.held, situation.grip, along)
@@ -100,7 +101,7 @@ class MotionPlanner:
         clearance = AHEAD_PART * self.clearance
         return self.paths.is_free(path, lambda q: self.checker.free(q, clearance))
 
-    def _path_to(self, move: Move, start: Array, goal: Array, attempt: int, searches: int) -> Path:
+    def _path_to(self, move: Move, start: Array, goal: Array, *, attempt: int, searches: int) -> Path:
         clearance = self._clearance_at(start)
         path = self.paths.plan(
             start, goal, lambda q: self.checker.free(q, clearance), attempt=attempt, searches=searches
@@ -157,7 +158,7 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
     """
     begin = ik.tool_at(start)
     for lines in LINES:
-        points = _points_on(ik, begin, target, [start], lines)
+        points = _points_on(ik, [start], (begin, target), lines)
         if points is not None:
             path = _smooth(points)
             if _stray(ik, path, begin, target) < MAX_STRAY_M:
@@ -165,7 +166,9 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
     return None
 
 
-def _points_on(ik: InverseKinematics, begin: Pose, target: Pose, points: list[Array], lines: int) -> Array | None:
+def _points_on(ik: InverseKinematics, points: list[Array], way: tuple[Pose, Pose], lines: int) -> Array | None:
+    """Return `points` continued along `way` on one branch, (lines + 1, joints), rad; None: it leaves the branch."""
+    begin, target = way
     for k in range(1, lines + 1):
         q = ik.nearby(begin.towards(target, k / lines), points[-1])
         if q is None:

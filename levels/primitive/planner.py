@@ -106,7 +106,7 @@ class Plans:
             self._trajectories[serial] = Trajectory(message.sections[: message.count].copy(), message.duration)
             self._refusals.pop(serial, None)
 
-    def trajectory(self, serial: int, begin: float = 0.0) -> Trajectory | None:
+    def trajectory(self, serial: int, begin: float) -> Trajectory | None:
         """Return the trajectory of a segment from path parameter `begin`; None: not there yet."""
         trajectory = self._trajectories.get(serial)
         return trajectory if trajectory is not None and trajectory.begin == begin else None

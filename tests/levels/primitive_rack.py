@@ -18,6 +18,10 @@ from tests.levels.lockstep import BoardSpec, Lockstep
 
 Segment = Mapping[str, Any]
 
+TURN = np.array([0.6, -0.1, 0.2, 0.0, 0.1, 0.3])
+BEND = np.array([0.3, 0.0, 0.0, 0.4, 0.0, -0.3])
+"""Two ways from home, rad."""
+
 
 class PrimitiveRack(Lockstep):
     """The primitive level above the real servo and the simulated cell; `seen` and `set_points`: what it wrote."""
@@ -87,6 +91,12 @@ def path(serial: int, waypoints: ArrayLike, blend: ArrayLike | None = None, **fi
     blends = np.zeros(len(points)) if blend is None else blend
     segment = {"id": serial, "kind": SegmentKind.PATH, "object": -1, "count": len(points)}
     return segment | {"waypoints": points, "blend": blends} | fields
+
+
+def two_paths(rack: PrimitiveRack) -> tuple[Segment, Segment]:
+    """Return a straight path and one back home around a corner."""
+    a, b = rack.home + TURN, rack.home + BEND
+    return path(1, [rack.home, a]), path(2, [a, b, rack.home], [0.0, 0.2, 0.0])
 
 
 def gripper(serial: int, opening: float, held: int = -1, force: float = 30.0) -> Segment:

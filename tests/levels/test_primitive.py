@@ -8,15 +8,7 @@ import pytest
 from rack.backplane.message import State
 from rack.levels.messages import Error
 from tests.levels.arms import cell
-from tests.levels.primitive_rack import PrimitiveRack, gripper, path
-
-TURN = np.array([0.6, -0.1, 0.2, 0.0, 0.1, 0.3])
-BEND = np.array([0.3, 0.0, 0.0, 0.4, 0.0, -0.3])
-
-
-def two_paths(rack: PrimitiveRack) -> tuple:
-    a, b = rack.home + TURN, rack.home + BEND
-    return path(1, [rack.home, a]), path(2, [a, b, rack.home], [0.0, 0.2, 0.0])
+from tests.levels.primitive_rack import BEND, TURN, PrimitiveRack, gripper, path, two_paths
 
 
 def positions(rack: PrimitiveRack) -> np.ndarray:
@@ -28,21 +20,26 @@ def first(rack: PrimitiveRack, **wanted: int) -> int:
     return next(k for k, s in enumerate(rack.seen) if all(s[name] == value for name, value in wanted.items()))
 
 
-def test_arm_goes_along_both_paths_and_settles_at_their_end() -> None:
+@pytest.fixture(scope="module")
+def finished() -> PrimitiveRack:
+    """A rack that has done both paths; its tests only look at it."""
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     assert rack.run_until_done(2)
-    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
-    assert rack.status.state == State.DONE
-    assert rack.servo.clipped == rack.servo.touches == 0
+    return rack
 
 
-def test_set_points_keep_velocity_and_acceleration_limits_and_agree_with_their_derivatives() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run_until_done(2)
+def test_arm_goes_along_both_paths_and_settles_at_their_end(finished: PrimitiveRack) -> None:
+    assert np.abs(finished.servo.position - finished.home).max() < 1e-3
+    assert finished.status.state == State.DONE
+    assert finished.servo.clipped == finished.servo.touches == 0
+
+
+def test_set_points_keep_their_limits_and_agree_with_their_derivatives(
+    finished: PrimitiveRack,
+) -> None:
     limits = cell("puma560").limits
-    made = [p for p in rack.set_points if p["due"]]
+    made = [p for p in finished.set_points if p["due"]]
     q, qd, qdd = (np.array([p[name] for p in made]) for name in ("position", "velocity", "acceleration"))
     assert (np.abs(qd) <= limits.velocity * (1 + 1e-6)).all()
     assert (np.abs(qdd) <= limits.acceleration * (1 + 1e-6)).all()
@@ -52,43 +49,31 @@ def test_set_points_keep_velocity_and_acceleration_limits_and_agree_with_their_d
     assert np.abs((qd[2:] - qd[:-2]) / (2 * step) - qdd[1:-1]).max() < 1.0
 
 
-def test_set_point_is_due_two_cycles_after_the_release_that_made_it() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run(0.5)
-    dues = [int(p["due"]) for p in rack.set_points]
+def test_set_point_is_due_two_cycles_after_the_release_that_made_it(finished: PrimitiveRack) -> None:
+    dues = [int(p["due"]) for p in finished.set_points]
     moving = [(8 * (k + 1), due) for k, due in enumerate(dues) if due]
     assert moving
     assert all(due - visible_at == 8 for visible_at, due in moving)
 
 
-def test_next_path_is_planned_while_the_arm_moves_so_that_it_does_not_wait() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run_until_done(2)
-    begun = first(rack, current=2)
-    assert not rack.seen[begun]["resting"]
-    assert rack.seen[begun]["done"] == 1
-    assert rack.seen[first(rack, current=1, resting=0) + 4]["wants"] == 0
+def test_next_path_is_planned_while_the_arm_moves_so_that_it_does_not_wait(finished: PrimitiveRack) -> None:
+    begun = first(finished, current=2)
+    assert not finished.seen[begun]["resting"]
+    assert finished.seen[begun]["done"] == 1
+    assert finished.seen[first(finished, current=1, resting=0) + 4]["wants"] == 0
 
 
-def test_every_status_echoes_the_command_and_reports_progress() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run_until_done(2)
-    under_way = [s for s in rack.seen if s["current"] == 2]
+def test_every_status_echoes_the_command_and_reports_progress(finished: PrimitiveRack) -> None:
+    under_way = [s for s in finished.seen if s["current"] == 2]
     progress = [float(s["progress"]) for s in under_way]
     assert all(s["echo"] == 2 and s["state"] == State.EXECUTING for s in under_way)
     assert progress == sorted(progress)
     assert progress[-1] == 1.0
 
 
-def test_segment_is_done_no_later_than_the_level_said_it_would_be() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run_until_done(2)
-    said = rack.seen[first(rack, current=2, resting=0)]["ends"]
-    done = (first(rack, done=2) + 1) * 8 * 0.0025
+def test_segment_is_done_no_later_than_the_level_said_it_would_be(finished: PrimitiveRack) -> None:
+    said = finished.seen[first(finished, current=2, resting=0)]["ends"]
+    done = (first(finished, done=2) + 1) * 8 * 0.0025
     assert done <= said <= done + 0.2
 
 
@@ -215,14 +200,11 @@ def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() 
     assert rack.run_until_error().reason == "segment 2: the arm has no gripper; only paths are valid"
 
 
-def test_two_equal_runs_write_equal_set_points() -> None:
-    runs = []
-    for _ in range(2):
-        rack = PrimitiveRack()
-        rack.command(*two_paths(rack))
-        rack.run_until_done(2)
-        runs.append(positions(rack).tobytes())
-    assert runs[0] == runs[1]
+def test_two_equal_runs_write_equal_set_points(finished: PrimitiveRack) -> None:
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    rack.run_until_done(2)
+    assert positions(rack).tobytes() == positions(finished).tobytes()
 
 
 def test_unknown_parameter_is_refused_with_the_valid_ones() -> None:

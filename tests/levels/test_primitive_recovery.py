@@ -13,15 +13,7 @@ from rack.levels.motion.speed import BrakingLimits
 from rack.levels.primitive.path_motion import PathMotion
 from tests.levels.disturbances import Shown, mute
 from tests.levels.lockstep import CLOCK_NS
-from tests.levels.primitive_rack import PrimitiveRack, gripper, path
-
-TURN = np.array([0.6, -0.1, 0.2, 0.0, 0.1, 0.3])
-BEND = np.array([0.3, 0.0, 0.0, 0.4, 0.0, -0.3])
-
-
-def two_paths(rack: PrimitiveRack) -> tuple:
-    a, b = rack.home + TURN, rack.home + BEND
-    return path(1, [rack.home, a]), path(2, [a, b, rack.home], [0.0, 0.2, 0.0])
+from tests.levels.primitive_rack import TURN, PrimitiveRack, gripper, path, two_paths
 
 
 def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
@@ -69,6 +61,20 @@ def test_planner_that_starts_anew_makes_the_plan_that_was_lost() -> None:
     assert rack.run_until_done(2)
 
 
+def test_path_whose_planner_is_lost_waits_with_a_reason() -> None:
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    rack.tasks["primitive.planner"].due = -1
+    rack.run(0.9)
+    assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
+    rack.run(0.4)
+    assert rack.status.state == State.HOLDING
+    assert rack.status.reason == "segment 1 waits for its trajectory from the planner"
+    rack.restart("primitive.planner")
+    rack.run(0.2)
+    assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
+
+
 def test_executor_that_skips_cycles_goes_on_along_the_path() -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
@@ -79,12 +85,12 @@ def test_executor_that_skips_cycles_goes_on_along_the_path() -> None:
 
 
 def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
-    rack = PrimitiveRack(params={"silent": 2.0})
+    rack = PrimitiveRack(params={"silent": 0.5})
     rack.command(*two_paths(rack))
     rack.run(0.3)
     servo = rack.tasks["servo"]
     servo.due = -1
-    rack.run(2.5)
+    rack.run(0.8)
     assert rack.status.error == Error.BELOW
     assert rack.set_points[-1]["due"] == 0
     servo.due = rack.tick
@@ -108,13 +114,31 @@ def test_error_of_the_servo_level_goes_up_with_its_reason() -> None:
     assert (rack.status.state, rack.status.error, rack.status.reason) == (State.ERROR, Error.SENSORS, "sensor of j2")
 
 
+def test_servo_that_never_reports_that_it_holds_is_waited_for_with_a_reason() -> None:
+    rack = PrimitiveRack()
+
+    def never_holding(visible_at: int, data: bytes) -> Shown:
+        status = rack.message("servo.status")
+        status.raw[:] = data
+        status.holding = 0
+        return ((visible_at, bytes(status.raw)),)
+
+    rack.disturb("servo.status", never_holding, seconds(2.0))
+    rack.command(*two_paths(rack))
+    rack.run(1.5)
+    assert rack.status.state == State.HOLDING
+    assert rack.status.reason == "waiting for servo: it does not report `holding` with a target at rest"
+    rack.run(0.8)
+    assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
+
+
 def seconds(time_s: float) -> int:
     """Return that time in ticks."""
     return round(time_s * 1e9 / CLOCK_NS)
 
 
 def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_goes_on_when_it_is_back() -> None:
-    rack = PrimitiveRack()
+    rack = PrimitiveRack(params={"settling": 0.5, "silent": 0.5})
     rack.command(*two_paths(rack))
     rack.run(0.4)
     rack.boxes["em.command"].lost = True
@@ -122,7 +146,7 @@ def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_goes_on_when_it
     assert rack.status.resting
     held_at = rack.status.progress
     assert 0.0 < held_at < 1.0
-    rack.run(3.0)
+    rack.run(1.0)
     assert (rack.status.progress, rack.status.error) == (held_at, 0)
     rack.boxes["em.command"].lost = False
     assert rack.run_until_done(2)
@@ -146,8 +170,8 @@ def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) ->
     rack = PrimitiveRack(params={"silent": 0.5, "settling": 0.5, "straying": 0.02, "astray": 0.05})
     rack.command(*two_paths(rack))
     rack.run(0.4)
-    rack.stop(demand, seconds(2.0))
-    rack.run(1.9)
+    rack.stop(demand, seconds(1.2))
+    rack.run(1.1)
     assert (rack.status.state, rack.status.error) == (State.HOLDING, 0)
     assert rack.status.reason.startswith("waiting for servo: ")
     assert rack.set_points[-1]["due"] == 0

@@ -12,11 +12,21 @@ import pytest
 
 from rack.backplane.message import REASON_BYTES, Message, State
 from rack.levels.errors import Refused
-from rack.levels.messages import MOVE_STATUS, TASK_PLAN, WINDOW, Error, Verb
+from rack.levels.level import Executor, Input, Ports
+from rack.levels.messages import (
+    MOVE_STATUS,
+    SERVO_STATUS,
+    TASK_COMMAND,
+    TASK_PLAN,
+    WINDOW,
+    WORLD_MODEL,
+    Error,
+    Verb,
+)
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose
-from rack.levels.task import TaskExecutor, read_program
+from rack.levels.task import TaskExecutor, TaskPlanner, read_program
 from rack.levels.task.actions import rehearse
 from rack.levels.task.program import TaskParams
 from rack.levels.task.rehearsal import PipelinePeriods, Rehearsal, Rehearsed, finish_times
@@ -27,7 +37,7 @@ from tests.levels.whole_rack import WholeRack
 
 ROBOT, SCENE = config("puma560")
 BLOCK1, BLOCK2 = 0, 1
-CYCLES = PipelinePeriods(own_s=1.0, below_s=0.25, planning_s=1.0)
+PERIODS = PipelinePeriods(own_s=1.0, below_s=0.25, planning_s=1.0)
 TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 REACH = {"do": "goto", "position": [0.45, 0.10, 0.95]}
 HOME = {"do": "home"}
@@ -134,7 +144,7 @@ def test_rehearsal_can_be_gone_back_to(start: Rehearsal) -> None:
 
 def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> None:
     moves = rehearsed(start, TRANSFER, HOME).moves
-    times = finish_times(moves, 4.0, CYCLES, TaskParams())
+    times = finish_times(moves, 4.0, PERIODS, TaskParams())
     assert times[0] > 4.0 + moves[0].duration_s
     for (before, after), (_, duration_s) in zip(itertools.pairwise(times), moves[1:], strict=True):
         assert after >= before + duration_s
@@ -143,7 +153,7 @@ def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> N
 def test_move_with_a_time_ends_no_sooner_and_holds_up_what_follows(start: Rehearsal) -> None:
     first, second = rehearsed(start, REACH, HOME).moves
     late = Rehearsed(first.move._replace(by_s=50.0), first.duration_s)
-    times = finish_times([late, second], 4.0, CYCLES, TaskParams())
+    times = finish_times([late, second], 4.0, PERIODS, TaskParams())
     assert times[0] == pytest.approx(51.0)
     assert times[1] > 50.0 + second.duration_s
 
@@ -173,10 +183,10 @@ def test_earliest_time_that_was_told_can_be_met(refused_run: WholeRack) -> None:
 
 
 def test_arm_takes_the_time_that_it_is_given() -> None:
-    rack = WholeRack(actions=[{**REACH, "by": 14.0}])
-    assert rack.run_to_end(20.0).state == State.DONE
+    rack = WholeRack(actions=[{**REACH, "by": 10.0}])
+    assert rack.run_to_end(15.0).state == State.DONE
     # Done at the task level by then, and not a cycle of its own before.
-    assert 13.0 < rack.seconds <= 14.0 + 1.0
+    assert 9.0 < rack.seconds <= 10.0 + 1.0
 
 
 class Bench(Lockstep):
@@ -324,30 +334,68 @@ def test_level_without_a_program_is_idle() -> None:
     assert bench.status.state == State.IDLE
 
 
+class Obedient(Executor):
+    """A level below that does every move as soon as it is shown."""
+
+    inputs = {"command": Input(TASK_COMMAND, "above.command")}
+    outputs = {"status": MOVE_STATUS}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        write.status.done = read.command.value.id
+
+
+class PlannedBench(Lockstep):
+    """Executor and planner of the task level; the arm is at home, and resting objects are seen from tick `seen` on."""
+
+    def __init__(self, *actions: Mapping[str, Any], seen: int = 4) -> None:
+        outside = {"servo.status": SERVO_STATUS, "world.model": WORLD_MODEL}
+        boards = [
+            BoardSpec("task", 400, TaskExecutor, TaskPlanner, 2, below="elemental_move"),
+            BoardSpec("elemental_move", 100, Obedient, above="task"),
+        ]
+        super().__init__(boards, ROBOT, SCENE, {"action": list(actions)}, outside=outside)
+        servo = self.message("servo.status")
+        servo.target = np.array(ROBOT.home)
+        self.after(4, lambda: self.write("servo.status", servo))
+        self.after(seen, self._show)
+
+    def _show(self) -> None:
+        puma, world = cell("puma560"), self.message("world.model")
+        start = puma.start()
+        world.position, world.quaternion = start.xpos[puma.bodies], start.xquat[puma.bodies]
+        world.revision = 1
+        self.write("world.model", world)
+
+    def run_to_end(self) -> tuple[Message, int]:
+        """Run until the task is done or 20 s have passed; return its status, and how often a plan was published."""
+        self.run(20.0, until=lambda rack: rack.read("task.status").state == State.DONE)
+        return self.read("task.status"), self.boxes["task.plan"].at(self.tick)[0]
+
+
 @pytest.mark.parametrize(
     ("finished", "away_ticks", "published"),
     [(True, 40, 1), (True, 900, 1), (False, 40, 1)],
     ids=["plan on its way", "plan followed", "plan never made"],
 )
 def test_planner_that_is_lost_plans_again_only_what_was_lost(finished: bool, away_ticks: int, published: int) -> None:
-    rack = WholeRack(actions=[HOME])
-    rack.after(500, lambda: rack.lose("task.planner", away_ticks, finished))
-    assert rack.run_to_end(20.0).state == State.DONE
-    assert rack.boxes["task.plan"].at(rack.tick)[0] == published
+    bench = PlannedBench(HOME)
+    bench.after(500, lambda: bench.lose("task.planner", away_ticks, finished))
+    status, plans = bench.run_to_end()
+    assert (status.state, plans) == (State.DONE, published)
+    bench.run(5.0)
+    assert bench.boxes["task.plan"].at(bench.tick)[0] == published
 
 
 def test_world_of_which_nothing_was_seen_is_not_planned_with() -> None:
-    rack = WholeRack(actions=[HOME])
-    rack.after(4, lambda: rack.lose("world", 1000))
-    rack.run(2.4)
-    assert rack.read("world.model").revision == 0
-    assert rack.run_to_end(20.0).state == State.DONE
-    assert rack.read("task.plan").count == 1
-    assert rack.seconds > 5.0
+    bench = PlannedBench(HOME, seen=1004)
+    bench.run(3.0)
+    assert bench.boxes["task.plan"].at(bench.tick)[0] == 0
+    status, plans = bench.run_to_end()
+    assert (status.state, plans, bench.read("task.plan").count) == (State.DONE, 1, 1)
 
 
 def test_plan_that_is_lost_on_its_way_is_published_again() -> None:
-    rack = WholeRack(actions=[HOME])
-    rack.disturb("task.plan", lose_some(1.0, seed=1), 1000)
-    assert rack.run_to_end(20.0).state == State.DONE
-    assert rack.boxes["task.plan"].at(rack.tick)[0] == 2
+    bench = PlannedBench(HOME)
+    bench.disturb("task.plan", lose_some(1.0, seed=1), 1400)
+    status, plans = bench.run_to_end()
+    assert (status.state, plans) == (State.DONE, 2)
