@@ -116,7 +116,9 @@ class ElementalMoveExecutor(Executor):
             self._done, self._replans_of_move = int(taken["move"]), 0
             gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
             if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
-                self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm, without object")
+                self._fail(
+                    Error.GRASP_MISSED, f"the gripper has closed to {status.opening * 1e3:.1f} mm: it holds nothing"
+                )
 
     def _check_below(self, status: Message, segments: SegmentWindow) -> None:
         """Fail with the level below, and when the held object is gone."""
@@ -124,7 +126,9 @@ class ElementalMoveExecutor(Executor):
             self._fail(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
         if moving and status.held >= 0 and self._is_shut(status):
-            self._fail(Error.OBJECT_LOST, f"the gripper is shut to {status.opening * 1e3:.1f} mm: its object is gone")
+            self._fail(
+                Error.OBJECT_LOST, f"the gripper has closed to {status.opening * 1e3:.1f} mm: the object is lost"
+            )
 
     def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
         """Ask for another path where the arm rests because something is in its way; cancel when the way is free."""

@@ -1,4 +1,4 @@
-"""What passes through the level: plans that wait until their move is due, segments handed down; and its parameters."""
+"""The executor's stock: plans that wait until their move is due, and segments handed down. The level's parameters."""
 
 from __future__ import annotations
 

@@ -185,7 +185,7 @@ class PrimitiveExecutor(Executor):
 
     def _begin_gripper(self, segment: MotionSegment, memory: Memory) -> GripperWork:
         if self._gripper is None:
-            raise ValueError(f"segment {segment.id}: the arm has no gripper; only paths are valid")
+            raise ValueError(f"segment {segment.id}: the arm has no gripper; valid: paths")
         memory.opening, memory.force = segment.opening, segment.force
         return GripperWork(segment, self._gripper, self._rules)
 

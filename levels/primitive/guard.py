@@ -159,7 +159,7 @@ class Sight:
 
     @property
     def lacks(self) -> str:
-        """What must be seen before motion may continue; empty: nothing."""
+        """The reason why motion must wait for a new scene; empty: it need not."""
         if self._blind:
             return "world model is stale: waiting for a new scene"
         return "waiting for a scene that shows the held object" if self._waiting is not None else ""

@@ -70,7 +70,7 @@ class PrimitivePlanner(Planner):
         if len(outside):
             k, j = outside[0]
             place = f"waypoint {k}, joint '{self.context.robot.joints[j]}' at {path.waypoints[k, j]:.4f} rad"
-            raise ValueError(f"{place}; {low[j]:.4f} to {high[j]:.4f} is valid")
+            raise ValueError(f"{place}; valid: {low[j]:.4f} to {high[j]:.4f}")
         return path
 
     def _write(

@@ -1,4 +1,4 @@
-"""Segments of work from the window that the level above hands down, and what is known of them."""
+"""Segments of work from the window of the level above, and the executor's memory of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rack.levels.motion.path import BlendedPath
 
 
 class SegmentFault(NamedTuple):
-    """Why a segment cannot be done."""
+    """The reason why a segment cannot be done."""
 
     code: Error
     reason: str
@@ -80,7 +80,7 @@ def read_segment(command: Message, serial: int) -> MotionSegment:
 
 @dataclass
 class Memory:
-    """What the executor must remember to continue after its board has died; its own last messages hold it."""
+    """The state with which the executor continues after a restart of its board; its own last messages hold it."""
 
     done: int = 0  # newest segment done
     interrupted: int = 0  # segment that was interrupted; 0: none

@@ -103,4 +103,4 @@ class Straying:
         joint = int(away.argmax())
         self.place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
         if self._cycles > self._permitted_cycles:
-            self.fault = SegmentFault(Error.FOLLOWING, f"{self.place}; at most {self._permitted_rad} is valid")
+            self.fault = SegmentFault(Error.FOLLOWING, f"{self.place}; valid: at most {self._permitted_rad} rad")

@@ -27,9 +27,9 @@ from rack.levels.robot import GripperConfig, Positive, Table
 Array = NDArray[np.float64]
 
 ANSWER_CYCLES = 3
-"""Cycles from the end of a trajectory until its segment is reported done, besides those in which the arm settles: for
-the last set point, the servo's status and this level's.
-"""
+"""Cycles from the end of a trajectory until its segment is reported done, besides those in which the arm settles.
+
+They pass until the last set point is due, the servo's status shows it, and this level's status is visible."""
 
 
 class PrimitiveParams(Table):
@@ -134,7 +134,7 @@ class PathWork:
         distance = self.motion.rest_at(position)
         if distance > permitted:
             begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
-            self.fault = SegmentFault(Error.LIMIT, f"{begins}; at most {permitted} is valid")
+            self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
 
     def begin_near(self, position: Array, progress: float) -> None:
         """Prepare to continue from `position` (joints,), rad; blocked when that is off the path.
@@ -169,7 +169,7 @@ class PathWork:
         if self._quiet.overdue and not settled:
             joint, permitted = int(away.argmax()), self._rules.params.settled
             name = self._rules.joints[joint]
-            reason = f"joint '{name}' rests {away[joint]:.4f} rad from its goal; at most {permitted} is valid"
+            reason = f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most {permitted} rad"
             self.fault = SegmentFault(Error.FOLLOWING, reason)
         return settled
 
@@ -249,6 +249,6 @@ class GripperWork:
         speed, permitted = abs(status.opening_velocity), self._rules.params.settled_opening
         settled = self._quiet.settled(speed < permitted)
         if self._quiet.overdue and not settled:
-            reason = f"gripper still moves at {speed:.4f} m/s; below {permitted} counts as rest"
+            reason = f"gripper still moves at {speed:.4f} m/s; it must come below {permitted} m/s"
             self.fault = SegmentFault(Error.FOLLOWING, reason)
         return settled

@@ -8,7 +8,7 @@ import pytest
 from rack.backplane.message import State
 from rack.levels.messages import Error
 from tests.levels.arms import cell
-from tests.levels.primitive_rack import BEND, TURN, PrimitiveRack, gripper, path, two_paths
+from tests.levels.primitive.rack import BEND, TURN, PrimitiveRack, gripper, path, two_paths
 
 
 def positions(rack: PrimitiveRack) -> np.ndarray:
@@ -178,7 +178,7 @@ def test_waypoint_beyond_a_joint_range_names_joint_value_and_range() -> None:
     far = rack.home.copy()
     far[0] = 3.0
     rack.command(path(1, [rack.home, far]))
-    assert "waypoint 1, joint 'j1' at 3.0000 rad; -2.78" in rack.run_until_error().reason
+    assert "waypoint 1, joint 'j1' at 3.0000 rad; valid: -2.78" in rack.run_until_error().reason
 
 
 def test_path_that_begins_a_little_beside_the_arm_is_joined_smoothly() -> None:
@@ -197,7 +197,7 @@ def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() 
     assert rack.run_until_done(1)
     assert np.abs(rack.servo.position - corner + 0.3).max() < 1e-3
     rack.command(gripper(2, opening=0.0))
-    assert rack.run_until_error().reason == "segment 2: the arm has no gripper; only paths are valid"
+    assert rack.run_until_error().reason == "segment 2: the arm has no gripper; valid: paths"
 
 
 def test_two_equal_runs_write_equal_set_points(finished: PrimitiveRack) -> None:

@@ -18,7 +18,7 @@ from rack.levels.primitive.guard import Guard
 from rack.levels.primitive.segment import MotionSegment
 from rack.levels.scene import MotionConfig
 from tests.levels import arms
-from tests.levels.primitive_rack import PrimitiveRack, path
+from tests.levels.primitive.rack import PrimitiveRack, path
 
 CROSSING = "puma560_crossing"
 POST = "post"

@@ -13,7 +13,7 @@ from rack.levels.motion.speed import BrakingLimits
 from rack.levels.primitive.path_motion import PathMotion
 from tests.levels.disturbances import Shown, mute
 from tests.levels.lockstep import CLOCK_NS
-from tests.levels.primitive_rack import TURN, PrimitiveRack, gripper, path, two_paths
+from tests.levels.primitive.rack import TURN, PrimitiveRack, gripper, path, two_paths
 
 
 def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
