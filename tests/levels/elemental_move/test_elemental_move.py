@@ -24,7 +24,7 @@ def post_moves(*legs: tuple[float, tuple[float, float, float]], speed: float = 0
 
 @pytest.fixture(scope="module")
 def transferred() -> tuple[WholeRack, list[tuple[int, bool]]]:
-    """A rack that has transferred a block and gone home, and what moved when."""
+    """A rack that has transferred a block and moved home, and when segments were under way."""
     rack = WholeRack(actions=[TRANSFER, HOME])
     seen: list[tuple[int, bool]] = []
 
@@ -65,7 +65,7 @@ def test_another_path_is_taken_around_an_obstacle_that_comes_into_the_way() -> N
     assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.003)
 
 
-def test_task_waits_while_its_goal_is_blocked_and_goes_on_when_it_is_free() -> None:
+def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() -> None:
     motion = post_moves((2.5, (0.5, 0.30, 0.95)), (8.0, (0.5, 0.85, 0.95)))
     above_block = {"do": "goto", "position": [0.5, 0.3, 0.6]}
     rack = WholeRack(arm="puma560_crossing", actions=[above_block], motion=motion)
@@ -81,7 +81,7 @@ def test_task_waits_while_its_goal_is_blocked_and_goes_on_when_it_is_free() -> N
 def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
     motion = post_moves((2.5, (0.5, 0.30, 0.95)))
     rack = WholeRack(
-        arm="puma560_crossing", actions=[TRANSFER], motion=motion, params={"elemental_move": {"patience": 2.0}}
+        arm="puma560_crossing", actions=[TRANSFER], motion=motion, params={"elemental_move": {"patience": 0.5}}
     )
     status = rack.run_to_end(20.0)
     assert (status.state, status.error) == (State.ERROR, Error.NO_PATH)
@@ -89,7 +89,7 @@ def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
 
 
 @pytest.mark.parametrize("names", [("elemental_move",), ("elemental_move.planner", "task")])
-def test_task_goes_on_when_boards_are_restarted_again_and_again(names: tuple[str, ...]) -> None:
+def test_task_continues_when_boards_are_restarted_repeatedly(names: tuple[str, ...]) -> None:
     rack = WholeRack(actions=[TRANSFER])
     for _ in range(12):
         if rack.run(2.3, lambda _: rack.task.state in (State.DONE, State.ERROR)):

@@ -141,7 +141,7 @@ def test_grasp_that_shuts_on_nothing_stops_everything() -> None:
     assert bench.command.hold == 1
 
 
-def test_grasp_that_holds_something_goes_on() -> None:
+def test_move_continues_after_a_grasp_that_holds_something() -> None:
     bench = planned_bench()
     bench.cycle(2, done=2)
     bench.cycle(2, done=3, opening=0.022, held=BLOCK)
@@ -193,7 +193,7 @@ def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> No
 
 
 def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_is_there() -> None:
-    # As where the guard sees a collision that the planner does not: every path is free, and none can be gone.
+    # As where the guard sees a collision that the planner does not: every path is free, and none can be followed.
     bench, why = planned_bench(replans=3), "blocked: 'pad_left' and 'block1' are -7.1 mm apart; valid: 0.0 mm"
     for _ in range(3):
         serial = bench.segments()[0][0]
@@ -289,7 +289,7 @@ def test_another_program_begins_once_the_arm_rests() -> None:
     assert bench.segments() == [(3, 40)]
 
 
-def test_restarted_executor_goes_on_with_its_own_last_messages() -> None:
+def test_restarted_executor_continues_from_its_own_last_messages() -> None:
     bench = planned_bench()
     bench.cycle(2, done=1)
     bench.restart("elemental_move")
@@ -302,7 +302,7 @@ def test_restarted_executor_goes_on_with_its_own_last_messages() -> None:
     assert bench.segments() == [(3, 3), (4, 4)]
 
 
-def test_after_a_restart_the_next_path_goes_on_from_the_one_that_replaced_what_was_blocked() -> None:
+def test_after_a_restart_the_next_path_continues_from_the_one_that_replaced_the_blocked_one() -> None:
     bench = planned_bench()
     bench.restart("elemental_move")
     bench.cycle(2, blocked=1, current=1)
@@ -362,7 +362,7 @@ def test_path_made_again_with_another_end_withdraws_what_was_planned_from_the_ol
     assert bench.status.end == pytest.approx(bench.ends[2] + 0.3)
 
 
-def test_answer_for_a_place_where_the_arm_is_no_more_is_asked_for_again() -> None:
+def test_answer_for_a_place_that_the_arm_has_left_is_requested_again() -> None:
     bench = planned_bench()
     bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
     asked = bench.status.replan

@@ -152,7 +152,7 @@ def test_speeds_at_boundaries_can_be_reached_from_both_sides() -> None:
     assert speeds[1] == speeds[2] == pytest.approx(reachable_speed(0.0, 0.05, limits[2]))
 
 
-def test_curve_without_acceleration_to_spare_is_gone_at_constant_speed() -> None:
+def test_curve_that_leaves_no_acceleration_is_followed_at_constant_speed() -> None:
     bend = PathBounds(np.full(6, 0.4), np.full(6, 1.0), np.full(6, 1.0))
     whole = speed_limits(bend, ARM, share=1.0)
     part = speed_limits(bend, ARM, share=0.75)

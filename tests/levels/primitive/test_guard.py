@@ -23,12 +23,12 @@ from tests.levels.primitive.rack import PrimitiveRack, path
 CROSSING = "puma560_crossing"
 POST = "post"
 NEAR = np.array([-0.9, 1.2, -3.1, 0.0, -1.24, 0.0])
-"""The arm reaches out beside the wall; turning about its base from here it sweeps over the table."""
+"""The arm reaches out next to the wall; turning about its base from here it sweeps over the table."""
 SWEEP = np.array([2.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def crossing(at: float, y: float = 0.0, leaves_at: float | None = None) -> list[MotionConfig]:
-    """The post waits beside the sweep, steps into it at `at`, and may leave again."""
+    """The post waits next to the sweep, steps into it at `at`, and may leave again."""
     beside, inside = (0.85, y, 0.8), (0.55, y, 0.8)
     moves = [(0.0, beside, 5.0), (at, inside, 0.25)] + ([(leaves_at, beside, 0.25)] if leaves_at else [])
     return [MotionConfig(body=POST, at=start, to=to, speed=speed) for start, to, speed in moves]
@@ -56,7 +56,7 @@ def test_arm_rests_before_an_obstacle_that_crosses_touches_it(at: float, y: floa
     assert rack.status.done == 1
 
 
-def test_motion_goes_on_by_itself_once_the_obstacle_has_left() -> None:
+def test_motion_continues_once_the_obstacle_has_left() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
     sweep(rack)
     assert rack.run_until_done(2, 12.0)
@@ -74,7 +74,7 @@ def test_arm_that_looks_ahead_too_little_touches_the_obstacle() -> None:
     assert rack.servo.touches > 0
 
 
-def test_obstacle_that_comes_behind_the_arm_does_not_hold_it() -> None:
+def test_obstacle_that_enters_the_path_after_the_arm_has_passed_does_not_hold_it() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(2.2))
     sweep(rack)
     assert rack.run_until_done(2, 4.0)
@@ -157,7 +157,7 @@ def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
         assert not watched.clear()
 
 
-def test_obstacle_behind_the_arm_does_not_matter() -> None:
+def test_obstacle_on_the_part_already_passed_does_not_matter() -> None:
     watched = Watched(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()
     watched.world.position[-1, :2] = watched.tool_at(NEAR + 0.2 * SWEEP)[:2]

@@ -77,7 +77,7 @@ def test_segment_is_done_no_later_than_the_level_said_it_would_be(finished: Prim
     assert done <= said <= done + 0.2
 
 
-def test_hold_ramps_to_rest_on_the_path_and_motion_goes_on_from_there() -> None:
+def test_hold_ramps_to_rest_on_the_path_and_motion_continues_from_there() -> None:
     rack = PrimitiveRack()
     segments = two_paths(rack)
     rack.command(*segments)
@@ -181,7 +181,7 @@ def test_waypoint_beyond_a_joint_range_names_joint_value_and_range() -> None:
     assert "waypoint 1, joint 'j1' at 3.0000 rad; valid: -2.78" in rack.run_until_error().reason
 
 
-def test_path_that_begins_a_little_beside_the_arm_is_joined_smoothly() -> None:
+def test_path_that_begins_slightly_off_the_arm_is_joined_smoothly() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home + 0.015, rack.home + TURN]))
     assert rack.run_until_done(1)

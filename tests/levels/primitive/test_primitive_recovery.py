@@ -75,7 +75,7 @@ def test_path_whose_planner_is_lost_waits_with_a_reason() -> None:
     assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
 
 
-def test_executor_that_skips_cycles_goes_on_along_the_path() -> None:
+def test_executor_that_skips_cycles_continues_along_the_path() -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     rack.run(0.3)
@@ -137,7 +137,7 @@ def seconds(time_s: float) -> int:
     return round(time_s * 1e9 / CLOCK_NS)
 
 
-def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_goes_on_when_it_is_back() -> None:
+def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_continues_when_it_is_back() -> None:
     rack = PrimitiveRack(params={"settling": 0.5, "silent": 0.5})
     rack.command(*two_paths(rack))
     rack.run(0.4)
@@ -191,7 +191,7 @@ def test_gripper_that_the_servo_left_alone_is_waited_for_anew() -> None:
     assert rack.servo.opening < 0.03
 
 
-def test_segment_that_is_withdrawn_and_wanted_again_goes_on_where_it_was() -> None:
+def test_segment_that_is_withdrawn_and_wanted_again_continues_where_it_was() -> None:
     rack = PrimitiveRack()
     first, second = two_paths(rack)
     rack.command(first)
@@ -205,7 +205,7 @@ def test_segment_that_is_withdrawn_and_wanted_again_goes_on_where_it_was() -> No
     assert np.abs(rack.servo.position - rack.home).max() < 1e-3
 
 
-def test_path_that_comes_back_to_itself_is_gone_on_with_on_the_way_back() -> None:
+def test_path_that_returns_to_itself_continues_on_the_way_back() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN, rack.home]))
     rack.run(6.0, until=lambda rack: rack.read("primitive.status").progress > 0.8)
@@ -215,7 +215,7 @@ def test_path_that_comes_back_to_itself_is_gone_on_with_on_the_way_back() -> Non
     assert rack.run_until_done(1)
 
 
-def test_arm_that_was_moved_while_nobody_drove_it_is_no_error_of_the_next_segment() -> None:
+def test_arm_moved_while_nobody_drove_it_does_not_fail_the_next_segment() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN]))
     assert rack.run_until_done(1)
@@ -226,7 +226,7 @@ def test_arm_that_was_moved_while_nobody_drove_it_is_no_error_of_the_next_segmen
     assert (rack.status.error, rack.status.current, rack.status.blocked) == (0, 2, 1)
 
 
-def test_arm_is_held_when_the_world_model_is_not_told_of_the_scene() -> None:
+def test_arm_is_held_when_the_world_model_receives_no_scene() -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     rack.run(0.4)

@@ -175,7 +175,7 @@ def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(refused_ru
     assert refused_run.read("servo.status").position == pytest.approx(ROBOT.home, abs=1e-3)
 
 
-def test_earliest_time_that_was_told_can_be_met(refused_run: WholeRack) -> None:
+def test_earliest_time_that_was_reported_can_be_met(refused_run: WholeRack) -> None:
     earliest = refused_run.read("task.plan").earliest
     rack = WholeRack(actions=[REACH, {**HOME, "by": earliest + 1e-6}])
     assert rack.run_to_end(earliest + 2.0).state == State.DONE

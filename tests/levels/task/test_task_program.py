@@ -78,7 +78,7 @@ def test_each_mistake_is_one_line_with_place_value_and_what_is_valid(action: dic
     assert mistake(action) == line
 
 
-def test_all_mistakes_are_told_at_once() -> None:
+def test_all_mistakes_are_reported_together() -> None:
     assert len(mistake({"do": "fly"}, {"do": "home", "by": -1}, {"do": "goto"}).splitlines()) == 3
 
 
