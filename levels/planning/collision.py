@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rack.levels.algebra import mat_vec
 from rack.levels.cell import Cell
-from rack.levels.planning.pose import Pose
+from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.scene import SceneConfig
 from rack.levels.touches import geom_name
 
@@ -27,6 +27,16 @@ it moves fast, and its support pushes it back as it is put down."""
 
 ANY_DISTANCE = -np.inf
 """Required distance of a pair that may overlap."""
+
+
+def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
+    """Place objects and obstacles in `data` at the world model's poses: (bodies, 3) in m, (bodies, 4) as w, x, y, z."""
+    for row, address in enumerate(cell.object_qpos):
+        data.qpos[address : address + 3] = positions[row]
+        data.qpos[address + 3 : address + 7] = quaternions[row]
+    for row, mocap in enumerate(cell.mocap, start=len(cell.object_qpos)):
+        data.mocap_pos[mocap] = positions[row]
+        data.mocap_quat[mocap] = quaternions[row]
 
 
 class CollisionChecker:
@@ -55,20 +65,13 @@ class CollisionChecker:
 
     def tool_at(self, q: Array) -> Pose:
         """Return the tool's pose at `q` (joints,), rad."""
-        data, quaternion = self._data, np.zeros(4)
-        data.qpos[self.cell.qpos] = q
-        mujoco.mj_kinematics(self._model, data)
-        mujoco.mju_mat2Quat(quaternion, data.site_xmat[self.cell.tool])
-        return Pose(data.site_xpos[self.cell.tool].copy(), quaternion)
+        self._data.qpos[self.cell.qpos] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        return site_pose(self._data, self.cell.tool)
 
     def place(self, positions: Array, quaternions: Array) -> None:
-        """Place objects and obstacles at the world model's poses: (bodies, 3) in m, (bodies, 4) as w, x, y, z."""
-        for row, address in enumerate(self.cell.object_qpos):
-            self._data.qpos[address : address + 3] = positions[row]
-            self._data.qpos[address + 3 : address + 7] = quaternions[row]
-        for row, mocap in enumerate(self.cell.mocap, start=len(self.cell.object_qpos)):
-            self._data.mocap_pos[mocap] = positions[row]
-            self._data.mocap_quat[mocap] = quaternions[row]
+        """Place objects and obstacles, as `place_bodies`."""
+        place_bodies(self.cell, self._data, positions, quaternions)
 
     def open_gripper(self, opening: float) -> None:
         """Set the gripper to `opening`, m or rad; initially it is at its widest."""

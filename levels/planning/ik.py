@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rack.levels.algebra import gram, norm, transposed_mat_vec
 from rack.levels.cell import Cell
-from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.pose import Pose, pose, site_pose
 
 Array = NDArray[np.float64]
 
@@ -59,10 +59,9 @@ class InverseKinematics:
 
     def tool_at(self, q: Array) -> Pose:
         """Return the tool's pose at `q` (joints,), rad."""
-        self._move_to(q)
-        tool, quaternion = self._cell.tool, np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, self._data.site_xmat[tool])
-        return pose(self._data.site_xpos[tool], quaternion)
+        self._data.qpos[self._cell.qpos] = q
+        mujoco.mj_kinematics(self._cell.model, self._data)
+        return pose(*site_pose(self._data, self._cell.tool))
 
     def reach(self, target: Pose, start: Array) -> Array | None:
         """Return the configuration (joints,) at `target` found by one descent from `start`, or None."""
@@ -138,10 +137,6 @@ class InverseKinematics:
         low, high = LIMIT_PART * (self._inner_low - q), LIMIT_PART * (self._inner_high - q)
         rank = mujoco.mju_boxQP(step, self._factor, None, hessian, gradient, low, high)
         return step if rank >= 0 else None
-
-    def _move_to(self, q: Array) -> None:
-        self._data.qpos[self._cell.qpos] = q
-        mujoco.mj_kinematics(self._cell.model, self._data)
 
 
 def sampling_range(cell: Cell) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from rack.levels.cell import Cell
 from rack.levels.dynamics import Dynamics, Payload
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
-from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.pose import Pose, pose, site_pose
 
 Array = NDArray[np.float64]
 
@@ -108,7 +108,8 @@ class Payloads:
         """Return how far the object reaches from the tool to either side, m; None: the line misses it."""
         cell, data = self._cell, self._data
         address = cell.object_qpos[row]
-        data.qpos[address : address + 7] = np.concatenate(self._tool() @ grip)
+        tool = pose(*site_pose(data, cell.tool))
+        data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
         found = []
         for side in SIDES:
@@ -155,11 +156,6 @@ class Payloads:
             if 0.0 <= distance < found[0]:
                 found = (float(distance), int(geom))
         return found
-
-    def _tool(self) -> Pose:
-        data, turned = self._data, np.zeros(4)
-        mujoco.mju_mat2Quat(turned, data.site_xmat[self._cell.tool])
-        return pose(data.site_xpos[self._cell.tool], turned)
 
 
 def _friction(model: mujoco.MjModel, one: int, other: int) -> float:

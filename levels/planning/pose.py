@@ -71,6 +71,13 @@ def pose(position: ArrayLike, quaternion: ArrayLike) -> Pose:
     return Pose(np.array(position, dtype=float), turned)
 
 
+def site_pose(data: mujoco.MjData, site: int) -> Pose:
+    """Return the pose of a site in simulation data."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, data.site_xmat[site])
+    return Pose(data.site_xpos[site].copy(), quaternion)
+
+
 def turned_about_z(yaw: float) -> Array:
     """Return the quaternion of a rotation by `yaw`, in rad, about z."""
     return np.array([math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rack.levels.cell import Cell
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
+from rack.levels.planning.collision import place_bodies
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 from rack.levels.task.program import Transfer
@@ -92,10 +93,7 @@ def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
 def _laid_out(cell: Cell, situation: Situation) -> mujoco.MjData:
     """Return data of the cell with the bodies as in `situation`."""
     data = cell.start()
-    for row, address in enumerate(cell.object_qpos):
-        data.qpos[address : address + 7] = np.concatenate(situation.object_pose(row))
-    for row, mocap in enumerate(cell.mocap, start=len(cell.object_qpos)):
-        data.mocap_pos[mocap], data.mocap_quat[mocap] = situation.object_pose(row)
+    place_bodies(cell, data, situation.positions, situation.quaternions)
     mujoco.mj_kinematics(cell.model, data)
     return data
 
