@@ -51,12 +51,12 @@ class ElementalMoveExecutor(Executor):
         self._plans = PlansAtHand()
         self._orders = Orders(self.commands)
         self._started = False
-        self._done = 0
-        self._handed_down = 0
-        self._request = 0
-        self._replans = 0
-        self._replans_of_move = 0
-        self._waiting_since: int | None = None
+        self._done = 0  # newest move done
+        self._handed_down = 0  # newest move handed down
+        self._request = 0  # open request for another path; 0: none
+        self._replans = 0  # other paths taken, by all moves
+        self._replans_of_move = 0  # and by the present one
+        self._waiting_since: int | None = None  # tick of the first refusal of the path that is awaited
         self._error = Error.NONE
         self._reason = ""
 

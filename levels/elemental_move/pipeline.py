@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 MAX_GAP_RAD = 0.005
 """Paths join if no joint is farther than this between the end of one and the start of the next."""
-CAPACITY = 2 * WINDOW
+MAX_PLANS = 2 * WINDOW
 """Plans kept: the planner is never farther ahead than its window, and moves just done leave with the next plan."""
 
 
@@ -63,7 +63,7 @@ class PlansAtHand:
         stays = known is not None and not (known.error or message.error) and is_same(end_of(known), end_of(message))
         for move in [m for m in self._by_move if m > message.move and not stays]:
             del self._by_move[move]
-        if len(self._by_move) < CAPACITY:
+        if len(self._by_move) < MAX_PLANS:
             self._by_move[message.move] = message
 
     def of(self, move: int) -> Message | None:

@@ -93,12 +93,12 @@ class ElementalMovePlanner(Planner):
         self._published: list[Published] = []
         self._job: PlanningJob | None = None
         self._window: list[Move] = []
-        self._grip: tuple[int, Pose] | None = None
-        self._revision = -1
-        self._refusal: Refusal | None = None
-        self._tries = 0
-        self._answered = 0
-        self._answer_due = 0
+        self._grip: tuple[int, Pose] | None = None  # row of the object that is, or will be, held and its pose
+        self._revision = -1  # of the world in which all published paths are free
+        self._refusal: Refusal | None = None  # of the job tried last
+        self._tries = 0  # of that job
+        self._answered = 0  # newest request answered
+        self._answer_due = 0  # tick by which the executor must have used the answer
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether a path is requested, has been blocked, or is not there yet."""

@@ -67,15 +67,14 @@ class PrimitiveExecutor(Executor):
         self._silent_cycles = self._rules.cycles(params.silent)
         self._plans = Plans()
         self._orders = Orders(self.commands)
-        self._memory: Memory | None = None
+        self._memory: Memory | None = None  # None until this level, in this life or before, first came into step
         self._work: Work | None = None
         self._fault: SegmentFault | None = None
-        self._faulty = 0
-        self._position = cell.home.copy()
+        self._begun = 0  # serial of the segment begun last
+        self._position = cell.home.copy()  # commanded last, (joints,), rad
         self._rest = JointSetPoint(self._position, *np.zeros((2, len(cell.home))))
-        self._tick: int | None = None
-        # True when the servo has been away since the last path: the arm may not be where that ended.
-        self._displaced = False
+        self._tick: int | None = None  # of the cycle before
+        self._displaced = False  # the servo has been away since the last path: the arm may not be where that ended
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read command, status, plan and world model; write the next set point and this level's status."""
@@ -153,7 +152,7 @@ class PrimitiveExecutor(Executor):
 
     def _withdraw(self, serials: list[int]) -> bool:
         """Drop work and fault that have left the window; return whether the work must come to rest first."""
-        serial = self._work.segment.id if self._work is not None else self._faulty
+        serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
             return False
         if isinstance(self._work, PathWork) and not self._work.motion.resting:
@@ -170,7 +169,7 @@ class PrimitiveExecutor(Executor):
         serial = next((s for s in serials if memory is not None and s > memory.done), 0)
         if not serial or memory is None:
             return
-        self._faulty = serial
+        self._begun = serial
         try:
             segment = read_segment(read.command.value, serial)
             if hold and segment.kind is SegmentKind.GRIPPER:

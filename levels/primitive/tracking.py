@@ -19,7 +19,7 @@ SEEN_CYCLES = 2
 """Cycles by which the world model lags behind the servo: a body that rests now has been seen at rest since then."""
 HANDOVER_CYCLES = 4
 """Cycles from the first set point until a status must show that the servo follows it."""
-MISSED_STATUSES = 3
+MAX_MISSED_STATUSES = 3
 """Consecutive cycles without a new status after which the servo is silent."""
 MAX_REST_RAD_S = 1e-3
 """A joint whose interpolated set point is slower than this rests."""
@@ -47,7 +47,7 @@ class Tracking:
         self._cycles_in_step += 1
         servo = status.value
         left_alone = bool(servo.holding) and self._cycles_in_step > HANDOVER_CYCLES
-        if self.silent_cycles > MISSED_STATUSES or left_alone or servo.stopped:
+        if self.silent_cycles > MAX_MISSED_STATUSES or left_alone or servo.stopped:
             self.in_step = False
         self._unexplained_cycles = 0 if self.in_step or servo.stopped else self._unexplained_cycles + 1
         if self.in_step or not heard or not servo.holding or servo.stopped:
@@ -60,7 +60,7 @@ class Tracking:
 
     def awaited(self, servo: Message) -> str:
         """Return what a level out of step waits for."""
-        if self.silent_cycles > MISSED_STATUSES:
+        if self.silent_cycles > MAX_MISSED_STATUSES:
             return f"waiting for servo: no status for {self.silent_cycles} cycles"
         if servo.state == State.HOLDING and servo.reason:
             return f"waiting for servo: {servo.reason}"

@@ -44,11 +44,11 @@ class TaskExecutor(Executor):
         self._window = ShownWindow()
         self._detour = Detour(context.robot, self._orders, self._window)
         self._started = False
-        self._done = 0
+        self._done = 0  # moves of the plan
         self._error = Error.NONE
         self._reason = ""
         self._progress: tuple[float, ...] = ()  # all that changes while anything moves
-        self._moved_at = 0
+        self._moved_at = 0  # tick of the last such change
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read what is done below, and the operator's commands; hand down what comes next."""

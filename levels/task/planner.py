@@ -45,9 +45,9 @@ class TaskPlanner(Planner):
         self._periods = pipeline_periods(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
-        self._plan: Message | None = None
-        self._visible_at = 0
-        self._since: int | None = None
+        self._plan: Message | None = None  # made by this process
+        self._visible_at = 0  # tick from which it is visible
+        self._since: int | None = None  # tick of the first cycle
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether the program is still to be planned and the world is known and at rest."""
