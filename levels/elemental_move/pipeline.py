@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.mailbox import Reading
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.messages import SEGMENTS, WINDOW, Error, SegmentKind, Verb
 from rack.levels.robot import Positive, Table
-
-Array = NDArray[np.float64]
 
 MAX_GAP_RAD = 0.005
 """Paths join if no joint is farther than this between the end of one and the start of the next."""

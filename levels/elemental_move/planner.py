@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.cell import build_cell
 from rack.levels.elemental_move.pipeline import ElementalMoveParams
 from rack.levels.errors import Refused
@@ -29,8 +29,6 @@ from rack.levels.motion.path import Path
 from rack.levels.params import read_params
 from rack.levels.planning.moves import Move, Situation, read_window
 from rack.levels.planning.pose import Pose, pose
-
-Array = NDArray[np.float64]
 
 ACKNOWLEDGED_CYCLES = 2
 """Cycles until the executor's status must show a plan that it has seen; else the plan is lost and made again."""

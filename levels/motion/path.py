@@ -6,11 +6,9 @@ from bisect import bisect_right
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rack.levels.algebra import norm
-
-Array = NDArray[np.float64]
+from rack.levels.algebra import Array, norm
 
 COINCIDENT_RAD = 1e-7
 """Waypoints closer than this count as one, and a shorter blend counts as none."""

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.motion.path import PathBounds
-
-Array = NDArray[np.float64]
 
 REACHABLE_PART = 1.0 - 1e-7
 """Part of a reachable change of speed that is used: at the edge itself, rounding decides whether it is reachable."""

@@ -10,13 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 import ruckig
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.messages import SECTIONS_A_LINE
 from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath, PathBounds
 from rack.levels.motion.speed import JointLimits, SpeedLimits, acceleration_room, boundary_speeds, speed_limits
-
-Array = NDArray[np.float64]
 
 SHARES = (1.0, 0.9, 0.75, 0.6)
 """Parts of a curve's highest speed that are tried; the fastest trajectory is taken."""

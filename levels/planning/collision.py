@@ -11,13 +11,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rack.levels.algebra import mat_vec
+from rack.levels.algebra import Array, mat_vec
 from rack.levels.cell import Cell
 from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.scene import SceneConfig
 from rack.levels.touches import geom_name
-
-Array = NDArray[np.float64]
 
 MAX_TOUCH_DEPTH_M = 0.003
 """Depth of an intended contact: simulated bodies are soft and sensed poses are not exact."""

@@ -10,13 +10,10 @@ from collections.abc import Callable, Iterable
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import gram, norm, transposed_mat_vec
+from rack.levels.algebra import Array, gram, norm, transposed_mat_vec
 from rack.levels.cell import Cell
 from rack.levels.planning.pose import Pose, pose, site_pose
-
-Array = NDArray[np.float64]
 
 MAX_RESTARTS = 60
 """Random starts for one pose: of 300 random poses of the K-1607, 40 starts missed one."""

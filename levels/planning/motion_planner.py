@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import mat_vec, norm
+from rack.levels.algebra import Array, mat_vec, norm
 from rack.levels.cell import Cell
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
@@ -17,8 +16,6 @@ from rack.levels.planning.path_planner import MAX_SEARCHES, PathPlanner
 from rack.levels.planning.payload import Payloads
 from rack.levels.planning.pose import Pose
 from rack.levels.scene import SceneConfig
-
-Array = NDArray[np.float64]
 
 CLOSE_PART = 0.9
 """Where the arm rests too close to something, the way out keeps this part of the remaining clearance."""

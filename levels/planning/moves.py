@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.messages import Verb
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.pose import Pose, pose
-
-Array = NDArray[np.float64]
 
 VERB_NAMES = {
     Verb.NONE: "rest",

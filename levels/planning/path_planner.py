@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base, geometric, util
 
-from rack.levels.algebra import norm
+from rack.levels.algebra import Array, norm
 from rack.levels.cell import Cell
 from rack.levels.messages import WAYPOINTS
 from rack.levels.motion.path import BlendedPath, Path
@@ -22,7 +21,6 @@ from rack.levels.motion.trajectory import duration
 from rack.levels.planning.ik import sampling_range
 from rack.levels.touches import below, geoms_of
 
-Array = NDArray[np.float64]
 Free = Callable[[Array], bool]
 
 MAX_CHECKS = 24_000

@@ -13,13 +13,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.cell import Cell
 from rack.levels.dynamics import Dynamics, Payload
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose, pose, site_pose
-
-Array = NDArray[np.float64]
 
 MIN_GRIP_FACTOR = 1.5
 """Grip required per weight of an object, to hold it while the arm accelerates: the PUMA loses one at 1.22."""

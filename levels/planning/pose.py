@@ -7,11 +7,9 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rack.levels.algebra import norm
-
-Array = NDArray[np.float64]
+from rack.levels.algebra import Array, norm
 
 MAX_DIFFERENCE = 1e-6
 """Poses closer than this, in m and in rad, count as equal."""

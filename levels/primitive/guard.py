@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.cell import Cell
 from rack.levels.level import Reading
 from rack.levels.motion.path import BlendedPath
@@ -14,8 +14,6 @@ from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.pose import Pose
 from rack.levels.primitive.segment import MotionSegment
 from rack.levels.scene import SceneConfig
-
-Array = NDArray[np.float64]
 
 NEAR_CHECKS = 9
 """Configurations checked per cycle within the look-ahead."""

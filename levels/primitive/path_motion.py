@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath
 from rack.levels.motion.speed import BrakingLimits
 from rack.levels.motion.trajectory import Trajectory, make_stop
-
-Array = NDArray[np.float64]
 
 NEAREST_STEP_RAD = 0.01
 """Spacing of the points among which the one nearest to the arm is searched."""

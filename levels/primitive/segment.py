@@ -7,9 +7,9 @@ from math import ceil
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.level import Ports
 from rack.levels.messages import Error, SegmentKind
 from rack.levels.motion.path import BlendedPath
@@ -31,8 +31,8 @@ class MotionSegment:
     kind: SegmentKind
     object: int | None
     touch: bool
-    waypoints: NDArray[np.float64]  # (count, joints)
-    blend: NDArray[np.float64]  # (count,)
+    waypoints: Array  # (count, joints)
+    blend: Array  # (count,)
     by: float
     opening: float
     force: float

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.speed import BrakingLimits, JointLimits, braking_limits
@@ -23,8 +23,6 @@ from rack.levels.primitive.path_motion import PathMotion
 from rack.levels.primitive.segment import MotionSegment, SegmentFault
 from rack.levels.primitive.tracking import HANDOVER_CYCLES
 from rack.levels.robot import GripperConfig, Positive, Table
-
-Array = NDArray[np.float64]
 
 ANSWER_CYCLES = 3
 """Cycles from the end of a trajectory until its segment is reported done, besides those in which the arm settles.

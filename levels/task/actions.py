@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
 from rack.levels.planning.motion_planner import MotionPlanner, in_metres
@@ -19,7 +19,6 @@ from rack.levels.task.grasps import DOWN, goals, grasps, standing
 from rack.levels.task.program import Goto, Home, TaskConfig, Transfer
 from rack.levels.task.rehearsal import Rehearsal
 
-Array = NDArray[np.float64]
 Option = TypeVar("Option")
 
 TURNS = 8

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.cell import Cell
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
@@ -16,8 +16,6 @@ from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 from rack.levels.task.program import Transfer
 from rack.levels.touches import below, geom_name, geoms_of
-
-Array = NDArray[np.float64]
 
 DOWN = (0.0, 0.0, -1.0)
 QUARTERS = (0, 1, -1, 2)

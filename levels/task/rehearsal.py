@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.messages import SEGMENTS, WINDOW, Verb
@@ -18,8 +16,6 @@ from rack.levels.task.program import TaskParams
 
 if TYPE_CHECKING:  # it brings OMPL, which only a planner's process needs
     from rack.levels.planning.motion_planner import MotionPlanner
-
-Array = NDArray[np.float64]
 
 
 class Rehearsed(NamedTuple):

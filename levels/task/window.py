@@ -7,9 +7,9 @@ the arm then is. Work on an object is completed first: approach, grasp, depart.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
 from rack.levels.messages import WINDOW, Verb
 from rack.levels.operator import Answer, Goal, What, told
 from rack.levels.orders import Orders, joints_of
@@ -173,7 +173,7 @@ class Detour:
         elif below.state == State.ERROR and below.done >= self._window.before:
             self._orders.fail(below.reason)
 
-    def _joints(self, goal: Message) -> NDArray[np.float64]:
+    def _joints(self, goal: Message) -> Array:
         names = self._robot.joints
         return joints_of(goal, names, np.tile((-MAX_JOINT_RAD, MAX_JOINT_RAD), (len(names), 1)))
 
