@@ -89,8 +89,8 @@ def check(
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     """Return a config with the budgets that a run has measured. Raises `Failure` for a run of another rack."""
     from rack.boards.config.timing import with_budgets
-    from rack.tools.recording import Recording
-    from rack.tools.timing.measured import measured_budgets
+    from rack.tools.runs.cycles import measured_budgets
+    from rack.tools.runs.recording import Recording
 
     recording = Recording(run)
     ran, asked = sorted({task.board for task in recording.layout.tasks}), sorted(config.board)

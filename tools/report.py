@@ -30,7 +30,7 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
       rack report runs/nasrem-20250101-120000
       rack report runs/a --against runs/b
     """
-    from rack.tools.reporting.report import write_report
+    from rack.tools.analysis.report import write_report
 
     data, text = write_report(run, against)
     print_report(data, text, as_json)
@@ -38,9 +38,9 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
 
 
 def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print a report: one JSON document; on a terminal as much as fits; elsewhere `text`, as for a run not recorded."""
+    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no recording, `text`."""
+    from rack.tools.analysis.report_markdown import show
     from rack.tools.live_table import console
-    from rack.tools.reporting.markdown import show
 
     if as_json:
         print_json(data)

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.charting.measured import Run
-from rack.tools.charting.panel import Panel
+from rack.tools.charts.measured import TracedRun
+from rack.tools.charts.panel import Panel
 from rack.tools.display import SilentDisplay
-from rack.tools.recording import Recording
 from rack.tools.running import run_rack
+from rack.tools.runs.recording import Recording
 
 SLOWER = 4
 """Times of these runs as multiples of the figures': what boards take for themselves, on a slow machine too, is little
@@ -36,15 +36,15 @@ def slowed(name: str) -> list[str]:
     return [f"clock.speed={1 / SLOWER}", *settings, *(f"board.level.budget.{key}={ms}" for key, ms in times.items())]
 
 
-def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Run:
+def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> TracedRun:
     """Run a rack of the figures under a name of its own, into `folder`, and return the run."""
     config = load(name, [f"name=test-{os.getpid()}-{name}", *settings])
     result = run_rack(config, seconds, folder, SilentDisplay())
     assert result.worked, result.failure()
-    return Run(Recording(folder))
+    return TracedRun(Recording(folder))
 
 
-def undisturbed(name: str, folder: Path, *settings: str) -> Run:
+def undisturbed(name: str, folder: Path, *settings: str) -> TracedRun:
     """Return a run in which nobody outside the rack had its cores for long: of several attempts the best one."""
     best, least = None, DISTURBED
     for attempt in range(ATTEMPTS):
@@ -58,7 +58,7 @@ def undisturbed(name: str, folder: Path, *settings: str) -> Run:
     return best
 
 
-def lost(found: Run) -> float:
+def lost(found: TracedRun) -> float:
     """Return the part of a run in which its tasks waited for a core, or were on one, and did not compute.
 
     An executor is ready at its release, a planner when its executor has let go of the core.
@@ -70,7 +70,7 @@ def lost(found: Run) -> float:
     return (waited + max(0, charted - computed)) / found.end_ns
 
 
-def whole(found: Run) -> Panel:
+def whole(found: TracedRun) -> Panel:
     """Return the panel of a whole run."""
     return found.panel(0, found.end_ns, lambda part: None)
 

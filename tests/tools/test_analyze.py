@@ -12,7 +12,7 @@ import pytest
 from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
-from rack.tools.analysis.text import text
+from rack.tools.analysis.tables import text
 from rack.tools.display import SilentDisplay
 from rack.tools.running import run_rack
 from tests.processes import RACK

@@ -8,10 +8,9 @@ import pytest
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, load
-from rack.tools.analysis.breaches import Breach, breaches
-from rack.tools.analysis.company import BEFORE
-from rack.tools.analysis.cycles import cycles_of
+from rack.tools.analysis.breaches import BEFORE, Breach, breaches
 from rack.tools.analysis.model import Model
+from rack.tools.runs.cycles import cycles_of
 from tests.tools.recordings import MS, Cycle, recorded
 
 PLANNED, MISSED, SKIPPED = int(Flag.PLANNED), int(Flag.MISSED), int(Flag.SKIPPED)
@@ -55,7 +54,7 @@ def test_a_cycle_that_computes_beyond_its_cycle_breaks_what_it_breaks(config: Ra
     assert sides["3.6"] == (0, "<", pytest.approx(-0.7 * MS))
     # Two context switches more.
     assert sides["3.9"] == (pytest.approx(3.4 * MS), "<", 2.5 * MS)
-    assert breach.company.text() == "computed 3.2 ms, usually 1.2 ms"
+    assert breach.sharing.text() == "computed 3.2 ms, usually 1.2 ms"
 
 
 def test_the_worst_come_first_and_the_start_up_is_told_apart(config: RackConfig, tmp_path: Path) -> None:
@@ -71,24 +70,24 @@ def test_a_level_that_others_kept_from_its_core_keeps_its_own_equations(config: 
     found = found_in(tmp_path / "run", config, {"upper": [upper], "lower": busy})
     (breach,) = [breach for breach in found if breach.task == "upper"]
     assert equations(breach) == ["response time"]
-    assert breach.company.own_ns <= 1.2 * MS
-    assert breach.company.others_ns["lower"] == pytest.approx(9 * 2.4 * MS, rel=0.01)
-    assert breach.company.text().startswith("lower had the core for 21.6 ms")
+    assert breach.sharing.own_ns <= 1.2 * MS
+    assert breach.sharing.others_ns["lower"] == pytest.approx(9 * 2.4 * MS, rel=0.01)
+    assert breach.sharing.text().startswith("lower had the core for 21.6 ms")
 
 
 def test_time_that_no_trace_accounts_for_is_nobodys(config: RackConfig, tmp_path: Path) -> None:
     trace = [*lower(), Cycle(SETTLED + 8, PLAIN, late=9.0, flags=MISSED)]
     (breach,) = found_in(tmp_path / "run", config, {"lower": trace})
     assert equations(breach) == ["response time"]
-    assert breach.company.nobody_ns == 9 * MS
-    assert breach.company.text() == "nobody of the rack for 9 ms"
+    assert breach.sharing.nobody_ns == 9 * MS
+    assert breach.sharing.text() == "no task of the rack had the core for 9 ms"
 
 
 def test_a_cycle_that_is_late_since_the_one_before_still_lasted_says_so(config: RackConfig, tmp_path: Path) -> None:
     long, late = Cycle(SETTLED + 8, (0.0, 0.1, 4.0, 0.1)), Cycle(SETTLED + 9, PLAIN, late=1.7)
     found = {b.tick: b for b in found_in(tmp_path / "run", config, {"lower": [*lower(), long, late]})}
     assert equations(found[SETTLED + 9]) == ["response time"]
-    assert found[SETTLED + 9].company.others_ns == {BEFORE: 1.7 * MS}
+    assert found[SETTLED + 9].sharing.others_ns == {BEFORE: 1.7 * MS}
 
 
 def test_skipped_releases_are_steps_off_the_grid(config: RackConfig, tmp_path: Path) -> None:
@@ -98,7 +97,7 @@ def test_skipped_releases_are_steps_off_the_grid(config: RackConfig, tmp_path: P
     # The last one stands behind rows that were lost: no cycle was.
     assert (breach.tick, equations(breach)) == (SETTLED + 11, ["3.7"])
     assert (breach.broken[0].left, breach.broken[0].right) == (10 * MS, 2.5 * MS)
-    assert breach.company.lasted_ns == (3 * 2.5 + 0.2 + 1.2) * MS
+    assert breach.sharing.lasted_ns == (3 * 2.5 + 0.2 + 1.2) * MS
 
 
 def test_a_plan_is_held_against_what_its_own_cycles_left(config: RackConfig, tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ import pytest
 from rack.backplane.trace import Flag
 from rack.boards.config import budgets, load, wire
 from rack.levels.timing.tasks import Unit
-from rack.tools.charting.measured import Run
-from rack.tools.charting.panel import Panel
-from rack.tools.charting.scheduled import Schedule
+from rack.tools.charts.measured import TracedRun
+from rack.tools.charts.panel import Panel
+from rack.tools.charts.scheduled import Schedule
 from rack.tools.timing.verdicts import verdicts
 from tests.machine import needs_fifo, needs_two_cores
 from tests.tools.figure_runs import SLOWER, run, slowed, undisturbed, usual, whole
@@ -27,7 +27,7 @@ ENOUGH = 5
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TracedRun]:
     # An executor that is overloaded waits for itself: there is nothing to tell others by.
     folders = {name: tmp_path_factory.mktemp("runs") for name in FIGURES}
     found = {name: undisturbed(name, folders[name]) for name in FIGURES[:3]}
@@ -36,7 +36,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
 
 
 @pytest.fixture(scope="module")
-def panels(runs: dict[str, Run]) -> dict[str, Panel]:
+def panels(runs: dict[str, TracedRun]) -> dict[str, Panel]:
     return {name: whole(found) for name, found in runs.items()}
 
 
@@ -95,7 +95,7 @@ def test_the_run_has_the_patterns_of_its_schedule(name: str, panels: dict[str, P
                 assert usual(measured) == usual(expected)
 
 
-def updates_met(found: Run) -> tuple[int, int]:
+def updates_met(found: TracedRun) -> tuple[int, int]:
     """Return how many plan updates their executor was released in, and how many of them it cut in two.
 
     Who begins later than an update takes began behind it.

@@ -11,7 +11,7 @@ import pytest
 
 from rack.boards.config import load
 from tests.processes import RACK
-from tests.tools.traces import cycle, recorded
+from tests.tools.recordings import cycle, recorded
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 50
@@ -104,7 +104,7 @@ def test_a_run_in_lockstep_has_its_schedule_alone_and_says_why(tmp_path: Path) -
     recorded(tmp_path / "run", load("fig2", ["clock.mode=lockstep"]), {"level": [cycle(0, 2000, 0, 0, 0, 0, 1000)]})
     shown = rack(tmp_path / "run")
     assert "fig2: schedule, 0 to 32 ms" in shown.stdout
-    assert "ran in lockstep, and time stood still" in shown.stdout
+    assert "ran in lockstep: time stood still" in shown.stdout
     assert "measured" not in shown.stdout
 
 
@@ -123,7 +123,7 @@ def test_any_rack_has_a_schedule_where_it_has_budgets(tmp_path: Path) -> None:
 def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
     shown = rack("nasrem", "--figure", 5, "--out", tmp_path)
     assert (shown.returncode, shown.stderr) == (0, "")
-    assert "task, 1 s: multitasking: coupled tightly, as the figure has it" in shown.stdout
+    assert "task, 1 s: multitasking: coupled tightly, as in the figure" in shown.stdout
     assert (tmp_path / "figure5.png").read_bytes().startswith(b"\x89PNG")
     assert ElementTree.parse(tmp_path / "figure5.svg").getroot().tag.endswith("svg")
 
@@ -138,7 +138,7 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
         (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),
         (["fig2", "--process", "arm=3"], "--process arm: no board of that name has a budget; boards: level"),
         (["fig2", "--from-ms", "5", "--to-ms", "5"], "5 to 5 ms: --to-ms must be later than --from-ms"),
-        (["fig2", "--out", "README.md"], "README.md: no place for pictures: File exists"),
+        (["fig2", "--out", "README.md"], "--out README.md: no folder for pictures: File exists"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(words: list[str], told: str) -> None:
@@ -160,7 +160,7 @@ def test_a_rack_without_budgets_has_no_schedule(tmp_path: Path) -> None:
 
 def test_a_run_cannot_be_asked_for_what_it_does_not_have(run: Path) -> None:
     assert "outside the run, which lasts from 0 to 160 ms" in rack(run, "--from-ms", 500).stderr
-    assert "is a run, and its config is what it was" in rack(run, "--set", "clock.speed=2").stderr
+    assert "the config of a run cannot be changed" in rack(run, "--set", "clock.speed=2").stderr
 
 
 def test_a_schedule_without_end_is_refused_in_one_line() -> None:

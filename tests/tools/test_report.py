@@ -14,14 +14,13 @@ from rich.console import Console
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import RECORD
-from rack.boards.config import load, loads
+from rack.boards.config import load
+from rack.tools.analysis.report import report_of, task_times, write_report
+from rack.tools.analysis.report_markdown import markdown, show
 from rack.tools.display import SilentDisplay
-from rack.tools.recording import Recording
-from rack.tools.reporting.markdown import markdown, show
-from rack.tools.reporting.report import report_of, write_report
-from rack.tools.reporting.response import system_response
-from rack.tools.reporting.timing import plan_age_ms, task_times
 from rack.tools.running import run_rack
+from rack.tools.runs.recording import Recording
+from rack.tools.runs.system_response import system_response
 from rack.tools.timing.prediction import response_ticks
 from tests.boards.told_racks import TOLD, commands
 from tests.conftest import SMALL
@@ -60,13 +59,6 @@ def test_a_task_that_never_ran_has_no_times() -> None:
     times = task_times(TASK, np.empty(0, RECORD), 10 * MS)
     assert times["execution_ms"] is None
     assert times["alpha_ms"] is None
-
-
-def test_a_plan_ages_until_the_next_one_can_be_read() -> None:
-    executor, made, visible_at = np.arange(20), np.array([0, 8]), np.array([4, 12])
-    ages = plan_age_ms(executor, made, visible_at, 2.5)
-    # Plan 0 is read in ticks 4 to 11, plan 8 in 12 to 19.
-    assert (ages["min"], ages["max"]) == (4 * 2.5, 11 * 2.5)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +123,7 @@ def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(fol
 def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path) -> None:
     recording = Silent(folder)
     recording.ended["faults"] = [{"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}]
-    response = system_response(recording, loads(recording.config), recording.layout)
+    response = system_response(recording)
     assert response is not None
     (beyond,) = response["command"]["beyond"]
     assert response["command"]["holds"] is False

@@ -17,7 +17,6 @@ from rack.boards.operating.config import CommandConfig
 from rack.tools.answer import Failure
 from rack.tools.bench.response import Bench
 from rack.tools.progress import Silent
-from rack.tools.recording import Recording
 from rack.tools.responding.course import Course, courses
 from rack.tools.responding.plot import plot
 from rack.tools.responding.response import Response, response_of
@@ -25,6 +24,7 @@ from rack.tools.responding.schedule import RUN_S, draw
 from rack.tools.responding.shown import show
 from rack.tools.responding.trial import run
 from rack.tools.responding.twin import candidates, compare, first_difference
+from rack.tools.runs.recording import Recording
 from tests.boards.told_racks import TOLD
 
 MakeConfig = Callable[..., RackConfig]

@@ -14,12 +14,12 @@ from rack.boards.config import load, wire
 from rack.boards.operating.config import CommandConfig
 from rack.tools.answer import Failure
 from rack.tools.progress import Progress
-from rack.tools.recording import Recording
 from rack.tools.responding.course import courses
 from rack.tools.responding.response import Response, response_of
 from rack.tools.responding.schedule import BREATH_S, RUN_S, draw
 from rack.tools.responding.trial import run
 from rack.tools.responding.twin import Twin, candidates, compare
+from rack.tools.runs.recording import Recording
 
 LOCKSTEP_RUN_S = 20.0
 """What a run in lockstep takes, about."""

@@ -12,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from rack.levels.operator import Answer, What
-from rack.tools.recording import Recording
 from rack.tools.responding.course import Course, acting, courses
+from rack.tools.runs.recording import Recording
 from rack.tools.text_table import table
 
 Fate = Literal["acted on", "refused", "overtaken", "run over"]

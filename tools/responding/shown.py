@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rack.tools.answer import Failure, print_json
 from rack.tools.live_table import print_wrapped, terminal_width
-from rack.tools.recording import Recording
 from rack.tools.responding.plot import plot
 from rack.tools.responding.response import response_of
+from rack.tools.runs.recording import Recording
 
 
 def show(recording: Recording, folder: Path, as_json: bool) -> bool:

@@ -9,7 +9,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.operating.config import CommandConfig
 from rack.boards.rack import Rack
 from rack.tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
-from rack.tools.recording import Recording
+from rack.tools.runs.recording import Recording
 
 
 def run(config: RackConfig, commands: Sequence[CommandConfig], folder: Path, seconds: float) -> Recording:

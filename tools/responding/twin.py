@@ -14,9 +14,9 @@ import numpy as np
 
 from rack.boards.config.schema import RackConfig
 from rack.boards.operating.config import CommandConfig
-from rack.tools.recording import Recording
 from rack.tools.responding.response import Answered, Response
 from rack.tools.responding.trial import run
+from rack.tools.runs.recording import Recording
 
 BEHIND_TICKS = 40
 """Ticks behind the predicted one up to which the twin runs."""
