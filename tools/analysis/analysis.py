@@ -13,8 +13,8 @@ from rack.tools.analysis.breaches import Breach, breaches
 from rack.tools.analysis.model import Model, response_ns, steps_ns
 from rack.tools.answer import Failure
 from rack.tools.runs.cycles import WORST, Cycles, budgets_of, cycles_of, worst_of
+from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
-from rack.tools.runs.system_response import system_response
 from rack.tools.timing.level_timing import LevelTiming, level_timings
 from rack.tools.timing.verdict import Verdict
 from rack.tools.timing.verdicts import BEYOND, EQUATIONS, LOAD, RESPONSE_TIME, SYSTEM, verdicts

@@ -15,7 +15,7 @@ from rack.tools.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.analysis.breaches import Breach
 from rack.tools.analysis.model import Model
 from rack.tools.runs.cycles import START_UP_S, Cycles, restarts
-from rack.tools.runs.system_response import system_response
+from rack.tools.runs.measured_response import system_response
 from rack.tools.timing.level_timing import LevelTiming
 from rack.tools.timing.verdict import Verdict
 
