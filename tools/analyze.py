@@ -50,7 +50,7 @@ def analyze(
 
     folder = run if out is None else out
     if response:
-        from rack.tools.responding.shown import show
+        from rack.tools.timing.operator_response import show
 
         sys.exit(0 if show(Recording(run), folder, as_json) else 1)
     progress = reading_progress(silent=as_json)

@@ -60,29 +60,31 @@ def check(
 
     Examples: rack check fig3; rack check fig3 --fix > fits.toml; rack check nasrem --from runs/nasrem-20250101-120000
     """
-    from rack.boards.config import budgets, load, shared_out
+    from rack.boards.config import load, shared_out
+    from rack.levels.timing.forecast import Forecast
     from rack.tools.inventory import Inventory
     from rack.tools.live_table import print_wrapped, terminal_width
-    from rack.tools.timing.forecast import Forecast
+    from rack.tools.timing.judged_config import JudgedConfig
     from rack.tools.timing.repair import repair
-    from rack.tools.timing.trial import Trial
+    from rack.tools.timing.tables import forecast_lines
 
     found = load(config, settings, faults)
     if run is not None:
         found = _measured(found, run, percentile)
-    trial = Trial.of(found, budgets(found))
-    if trial.failing and sys.stderr.isatty():
+    judged = JudgedConfig.of(found)
+    if judged.failing and sys.stderr.isatty():
         print("something fails; looking for what would do", file=sys.stderr)
-    fitting = repair(trial)
+    fitting = repair(judged)
     if fix:
         _print_fixed(fitting, as_json)
         sys.exit(1 if fitting.left else 0)
-    inventory, forecast = Inventory.of(found, trial.layout, shared_out(found)), Forecast.of(trial)
+    lacking = shared_out(found)
+    inventory, forecast = Inventory.of(found, judged.layout, lacking), Forecast.of(judged.timing, not lacking)
     if as_json:
         print_json(inventory.document() | {"timing": forecast.document() | {"repair": fitting.document()}})
     else:
         width = terminal_width()
-        print_wrapped("\n".join([*inventory.lines(width), *forecast.lines(width), "", *fitting.lines()]))
+        print_wrapped("\n".join([*inventory.lines(width), *forecast_lines(forecast, width), "", *fitting.lines()]))
     sys.exit(0 if forecast.holds else 1)
 
 

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
-from rack.boards.config import RackConfig, load
+from rack.boards.config import RackConfig, load, rack_timing
 from rack.tools.analysis.breaches import BEFORE, Breach, breaches
-from rack.tools.analysis.model import Model
 from rack.tools.runs.cycles import cycles_of
 from tests.tools.recordings import MS, Cycle, recorded
 
@@ -27,7 +26,7 @@ def config(small: Path) -> RackConfig:
 
 def found_in(folder: Path, config: RackConfig, traces: dict[str, list[Cycle]]) -> list[Breach]:
     recording = recorded(folder, config, traces)
-    return breaches(cycles_of(recording), Model.of(config, recording.layout))
+    return breaches(cycles_of(recording), rack_timing(config, recording.layout))
 
 
 def equations(breach: Breach) -> list[str]:

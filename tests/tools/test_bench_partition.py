@@ -9,8 +9,7 @@ import pytest
 from rack.boards.config import load, loads
 from rack.boards.errors import ConfigError
 from rack.tools.answer import Failure
-from rack.tools.bench.partition import compare, lines_of
-from rack.tools.bench.partitions import PARTITIONS, Partition
+from rack.tools.bench.partition import PARTITIONS, Partition, compare, lines_of
 from rack.tools.progress import Silent
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rack.boards.config import load
-from rack.levels.timing.chart import Chart
+from rack.levels.timing.schedule import Chart
 from rack.tools.answer import Failure
 from rack.tools.charts.measured import TracedRun
 from rack.tools.charts.panel import union, without

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import budgets, load
+from rack.levels.timing.forecast import Forecast
 from rack.tools.inventory import Inventory
-from rack.tools.timing.forecast import Forecast
-from rack.tools.timing.trial import Trial
+from rack.tools.timing.judged_config import JudgedConfig
+from rack.tools.timing.tables import forecast_lines
 from tests.tools.test_commands import rack
 
 FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
@@ -66,8 +67,8 @@ def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
 @pytest.mark.parametrize("width", [80, 120])
 def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
     found = load("nasrem")
-    trial = Trial.of(found, budgets(found))
-    lines = [*Inventory.of(found, trial.layout, []).lines(width), *Forecast.of(trial).lines(width)]
+    judged = JudgedConfig.of(found)
+    lines = [*Inventory.of(found, judged.layout, []).lines(width), *forecast_lines(Forecast.of(judged.timing), width)]
     # Text that is no table is wrapped as it is printed.
     rows = [line for line in lines if "  " in line.strip()]
     assert len(rows) > 50
@@ -106,7 +107,7 @@ def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
     fixed.write_text(done.stdout)
     config = load(fixed)
     assert config.board["lower"].within_cycles == 7
-    assert Trial.of(config, budgets(config)).failing == ()
+    assert JudgedConfig.of(config).failing == ()
     assert rack("check", fixed).returncode == 0
 
 

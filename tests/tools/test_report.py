@@ -15,13 +15,13 @@ from rich.console import Console
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import RECORD
 from rack.boards.config import load
+from rack.levels.timing.equations import response_ticks
 from rack.tools.analysis.report import report_of, task_times, write_report
 from rack.tools.analysis.report_markdown import markdown, show
 from rack.tools.display import SilentDisplay
 from rack.tools.running import run_rack
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
-from rack.tools.timing.prediction import response_ticks
 from tests.boards.told_racks import TOLD, commands
 from tests.conftest import SMALL
 

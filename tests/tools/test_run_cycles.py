@@ -11,7 +11,7 @@ import pytest
 
 from rack.backplane.trace import Flag
 from rack.boards.config import RackConfig, load
-from rack.levels.timing.budget import Budget
+from rack.levels.timing.tasks import Budget
 from rack.tools.answer import Failure
 from rack.tools.display import SilentDisplay
 from rack.tools.running import run_rack

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import Occupation
-from rack.tools.analysis.model import Model, Rule, response_ns, rules_for, steps_ns
+from rack.tools.analysis.rules import Rule, cycle_ns, response_ns, rules_for, slice_ns, steps_ns
 from rack.tools.runs.cycles import Cycles
 
 MENTIONED = 0.1
@@ -77,21 +78,21 @@ class Breach:
     sharing: CoreSharing
 
 
-def breaches(found: Mapping[str, Cycles], model: Model) -> list[Breach]:
+def breaches(found: Mapping[str, Cycles], rack: RackTiming) -> list[Breach]:
     """Return the cycles that broke an equation by their own numbers, the worst first."""
-    all_of_them = [breach for name in found for breach in _breaches_of(name, found, model)]
+    all_of_them = [breach for name in found for breach in _breaches_of(name, found, rack)]
     return sorted(all_of_them, key=lambda breach: (-breach.excess, breach.tick))
 
 
-def _breaches_of(name: str, found: Mapping[str, Cycles], model: Model) -> Iterator[Breach]:
+def _breaches_of(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Breach]:
     cycles = found[name]
-    count, rules = len(cycles.rows), rules_for(name, found, model)
+    count, rules = len(cycles.rows), rules_for(name, found, rack)
     if not rules:
         return
     fails = np.array([~np.broadcast_to(rule.relation.holds, count) for rule in rules])
     at = np.flatnonzero(fails.any(axis=0))
-    excess = _excess(cycles, model)
-    for row, sharing in zip(at, _sharing(name, at, found, model), strict=True):
+    excess = _excess(cycles, rack)
+    for row, sharing in zip(at, _sharing(name, at, found, rack), strict=True):
         yield Breach(
             task=name,
             tick=int(cycles.rows["tick"][row]),
@@ -110,31 +111,31 @@ def _broken(rule: Rule, row: int, count: int) -> Broken:
     return Broken(rule.equation, left, sign, right, rule.unit)
 
 
-def _due_ns(cycles: Cycles, model: Model) -> np.ndarray:
+def _due_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
     """Return the time from which on each cycle was due: its release, or the first that was skipped before it."""
     release = cycles.rows["release_ns"]
-    if model.is_lockstep or cycles.task.role == "planner":
+    if rack.is_lockstep or cycles.task.role == "planner":
         return np.asarray(release)
-    return np.asarray(release + model.cycle_ns(cycles.task) - steps_ns(cycles, model))
+    return np.asarray(release + cycle_ns(rack, cycles.task) - steps_ns(cycles, rack))
 
 
-def _excess(cycles: Cycles, model: Model) -> np.ndarray:
-    slice_ns = model.slice_ns(cycles.task)
-    excess = cycles.used_ns / slice_ns
-    if model.is_lockstep:
+def _excess(cycles: Cycles, rack: RackTiming) -> np.ndarray:
+    available_ns = slice_ns(rack, cycles.task)
+    excess = cycles.used_ns / available_ns
+    if rack.is_lockstep:
         return excess
-    excess = np.maximum(excess, response_ns(cycles, model) / slice_ns)
-    return np.maximum(excess, steps_ns(cycles, model) / slice_ns) if cycles.task.role == "executor" else excess
+    excess = np.maximum(excess, response_ns(cycles, rack) / available_ns)
+    return np.maximum(excess, steps_ns(cycles, rack) / available_ns) if cycles.task.role == "executor" else excess
 
 
-def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], model: Model) -> list[CoreSharing]:
+def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackTiming) -> list[CoreSharing]:
     """Return the use of the core in the cycles of a task at the places `at`, shape (n,)."""
     cycles = found[name]
     rows = cycles.rows[at]
-    starts, ends = _due_ns(cycles, model)[at], rows["end_ns"]
+    starts, ends = _due_ns(cycles, rack)[at], rows["end_ns"]
     rivals = {other: Occupation.of(rival.rows) for other, rival in found.items() if _may_preempt(rival, cycles)}
     # A plan update that is a critical section keeps the executor waiting.
-    if cycles.task.board in model.critical and (planner := found.get(f"{name}.planner")) is not None:
+    if rack.boards[cycles.task.board].is_critical and (planner := found.get(f"{name}.planner")) is not None:
         rivals[planner.task.name] = Occupation(planner.rows["process_ns"], planner.rows["end_ns"])
     kept = {other: occupied.within(starts, ends) for other, occupied in rivals.items()}
     together = Occupation.union(list(rivals.values())).within(starts, ends)

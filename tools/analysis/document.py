@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from rack.levels.timing.equations import plan_cycles_tight, residual_deviation_ns
+from rack.levels.timing.rack import LevelTiming, RackTiming
 from rack.levels.timing.trace_times import counts, distribution, gaps_ns, lateness_ns, response_ns
+from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.analysis.breaches import Breach
-from rack.tools.analysis.model import Model
+from rack.tools.analysis.rules import slice_ns
 from rack.tools.runs.cycles import START_UP_S, Cycles, restarts
-from rack.tools.runs.measured_response import system_response
-from rack.tools.timing.level_timing import LevelTiming
-from rack.tools.timing.verdict import Verdict
 
 Document = dict[str, Any]
 MS = 1e-6
@@ -27,7 +26,7 @@ UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "pla
 
 def document(analysis: Analysis) -> Document:
     """Return everything as plain data; infinite numbers are null."""
-    recording, config, model = analysis.recording, analysis.config, analysis.model
+    recording, config = analysis.recording, analysis.config
     return {
         "rack": config.name,
         "folder": str(recording.folder),
@@ -40,7 +39,7 @@ def document(analysis: Analysis) -> Document:
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
         "holds": analysis.holds,
         "levels": {name: _level(analysis, name) for name in config.board},
-        "tasks": {name: task_document(cycles, model) for name, cycles in analysis.cycles.items()},
+        "tasks": {name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()},
         "core_loads": {f"core {core}": load for core, load in analysis.loads.items()},
         "restarts": restarts(recording),
         "equations": [_pair(pair) for pair in analysis.pairs],
@@ -48,13 +47,13 @@ def document(analysis: Analysis) -> Document:
             "percentile": MOSTLY,
             "failed": [{"equation": p.equation, "subject": p.subject} for p in analysis.mostly if p.fails],
         },
-        "system_response": system_response(recording),
+        "system_response": analysis.response,
         "breaches": [_breach(breach, recording.layout.clock_ns) for breach in analysis.breaches],
     }
 
 
 def _level(analysis: Analysis, board: str) -> Document:
-    sides = {"predicted": analysis.predicted.get(board), "measured": analysis.measured.get(board)}
+    sides = {"predicted": analysis.predicted.levels.get(board), "measured": analysis.measured.levels.get(board)}
     timings = {side: None if timing is None else timing.document() for side, timing in sides.items()}
     return {"summary": summary(analysis, board), **timings}
 
@@ -69,7 +68,7 @@ def _pair(pair: Pair) -> Document:
     }
 
 
-def _verdict(verdict: Verdict | None) -> Document | None:
+def _verdict(verdict: EquationVerdict | None) -> Document | None:
     if verdict is None:
         return None
     found = asdict(verdict) | {"margin": verdict.margin}
@@ -88,9 +87,9 @@ def _breach(breach: Breach, clock_ns: int) -> Document:
     }
 
 
-def task_document(cycles: Cycles, model: Model) -> Document:
+def task_document(cycles: Cycles, rack: RackTiming) -> Document:
     """Return the times of one task without its start-up, ms; lateness and response are None in lockstep."""
-    judged, is_lockstep = cycles.is_judged, model.is_lockstep
+    judged, is_lockstep = cycles.is_judged, rack.is_lockstep
     rows, gaps = cycles.rows[judged], gaps_ns(cycles.rows[judged])
     missed, skipped = counts(rows)
     return {
@@ -108,7 +107,7 @@ def task_document(cycles: Cycles, model: Model) -> Document:
         "beside_ms": round(cycles.overhead_ns * MS, 6),
         "lateness_ms": None if is_lockstep else distribution(lateness_ns(rows) * MS),
         "response_ms": None if is_lockstep else distribution(response_ns(rows) * MS),
-        "slice_ms": model.slice_ns(cycles.task) * MS,
+        "slice_ms": slice_ns(rack, cycles.task) * MS,
         "largest_gap_ms": None if is_lockstep or not len(gaps) else round(float(gaps.max()) * MS, 6),
     }
 
@@ -121,7 +120,7 @@ def deviation_ns(cycles: Cycles) -> float:
 
 def summary(analysis: Analysis, board: str) -> str:
     """Return in one line the use of a level's cycle, whether its planner fits, and where it exceeds its budget."""
-    timing = analysis.measured.get(board)
+    timing = analysis.measured.levels.get(board)
     if timing is None:
         return "never ran"
     return "; ".join(_clauses(analysis, timing))
@@ -138,15 +137,15 @@ def _clauses(analysis: Analysis, timing: LevelTiming) -> Iterator[str]:
     when = worst_words(analysis.percentile)
     yield f"{_ms(used_ns)} of {_ms(timing.cycle_ns)} ms used {when}, {_ms(usual_ns)} usually"
     if timing.planning_ns is not None:
-        yield _planner(timing, analysis.model.switch_ns)
+        yield _planner(timing, analysis.measured.context_switch_ns)
     elif timing.coupling != "none":
         yield "its planner made no plan"
-    budget = analysis.predicted.get(timing.board)
+    budget = analysis.predicted.levels.get(timing.board)
     if over := [] if budget is None else list(_over(timing, budget)):
         yield f"over its budget: {', '.join(over)}"
 
 
-def _planner(timing: LevelTiming, switch_ns: float) -> str:
+def _planner(timing: LevelTiming, switch_ns: int) -> str:
     planning_ns, permitted = timing.planning_ns or 0, timing.within_cycles
     if timing.coupling == "loose":
         needed: int | None = max(1, ceil(planning_ns / timing.cycle_ns))

@@ -28,7 +28,7 @@ MS = 1e-6
 
 def plot(analysis: Analysis, path: Path) -> None:
     """Draw the part of R_i that the cycles of each level used into `path`.png and `path`.svg."""
-    levels = [name for name in analysis.config.board if name in analysis.measured]
+    levels = [name for name in analysis.config.board if name in analysis.measured.levels]
     height = ROW_IN * len(levels) + EDGES_IN
     figure = Figure(figsize=(WIDTH_IN, height))
     axes = figure.add_subplot()
@@ -66,7 +66,7 @@ def _scale(axes: Axes, low: float, high: float) -> None:
 def _legend(figure: Figure, analysis: Analysis) -> None:
     """Explain the marks."""
     marks = [("v", MEASURED, f"longest t_exec + longest t_comm, {worst_words(analysis.percentile)}; from there: alpha")]
-    if analysis.predicted:
+    if analysis.predicted.levels:
         marks.append(("^", PREDICTED, "the same by the budgets"))
     handles: list[Artist] = [Patch(color=CYCLES, label="cycles (number: logarithmic)")]
     handles += [
@@ -80,21 +80,21 @@ def _title(analysis: Analysis) -> str:
 
 
 def _span(analysis: Analysis, levels: list[str]) -> tuple[float, float]:
-    parts = [analysis.cycles[name].used_ns / analysis.measured[name].cycle_ns for name in levels]
+    parts = [analysis.cycles[name].used_ns / analysis.measured.levels[name].cycle_ns for name in levels]
     least, most = min(float(each.min()) for each in parts), max(float(each.max()) for each in parts)
     return max(least, 1e-6) / 1.5, max(most, 1.0) * 1.5
 
 
 def _level(axes: Axes, analysis: Analysis, name: str, row: int, edges: np.ndarray) -> None:
     """Draw one level: the histogram of its used time, so scaled that a single cycle shows; its marks and numbers."""
-    cycles, timing = analysis.cycles[name], analysis.measured[name]
+    cycles, timing = analysis.cycles[name], analysis.measured.levels[name]
     used = cycles.used_ns[cycles.is_judged] / timing.cycle_ns
     counts, _ = np.histogram(used, edges)
     heights = 0.72 * np.log1p(counts) / np.log1p(max(counts.max(), 1))
     axes.fill_between(edges[:-1], row, row + heights, step="post", color=CYCLES, linewidth=0)
     axes.axhline(row, color="#bbbbbb", linewidth=0.6)
     _mark(axes, (timing.execution_ns + timing.communication_ns) / timing.cycle_ns, row, MEASURED, "v")
-    predicted = analysis.predicted.get(name)
+    predicted = analysis.predicted.levels.get(name)
     if predicted is not None:
         _mark(axes, (predicted.execution_ns + predicted.communication_ns) / predicted.cycle_ns, row, PREDICTED, "^")
     usual_ms = (timing.cycle_ns - float(np.median(cycles.used_ns[cycles.is_judged]))) * MS

@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
+from rack.levels.timing.rack import LevelTiming
+from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.analysis.breaches import Breach, Broken
 from rack.tools.analysis.document import summary, task_document, worst_words
 from rack.tools.runs.cycles import START_UP_S, Cycles, restarts
 from rack.tools.text_table import table
-from rack.tools.timing.level_timing import LevelTiming
-from rack.tools.timing.verdict import Verdict
 
 SHOWN = 10
 """Most cycles in the list of those that broke an equation; the document has them all."""
@@ -49,7 +49,7 @@ def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
     )
     rows = [_task_row(name, cycles, analysis) for name, cycles in analysis.cycles.items()]
     # In lockstep there is no lateness and no deadline.
-    shown = len(TASKS) - len(BY_THE_CLOCK) if analysis.model.is_lockstep else len(TASKS)
+    shown = len(TASKS) - len(BY_THE_CLOCK) if analysis.predicted.is_lockstep else len(TASKS)
     yield from table(TASKS[:shown], [row[:shown] for row in rows], width, TASKS_DROPPED)
     yield from ("", "Equations, in ms, predicted from the budgets and measured:")
     yield from table(EQUATIONS, list(map(_pair_row, analysis.pairs)), width, EQUATIONS_DROPPED)
@@ -67,9 +67,9 @@ def _head(analysis: Analysis) -> Iterator[str]:
             yield f"failed in more than 1 of 100 cycles: {_named(mostly) if mostly else 'none'}"
     if differing := [pair for pair in pairs if pair.disagrees]:
         yield f"not as predicted: {_named(differing)}"
-    if not analysis.predicted:
+    if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
-    if analysis.model.is_lockstep:
+    if analysis.predicted.is_lockstep:
         yield "lockstep: no deadlines, no lateness; processor times are real"
     if restarted := restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
@@ -86,9 +86,9 @@ def _named(pairs: list[Pair]) -> str:
 
 def _level_rows(analysis: Analysis) -> Iterator[list[str]]:
     for name in analysis.config.board:
-        if (predicted := analysis.predicted.get(name)) is not None:
+        if (predicted := analysis.predicted.levels.get(name)) is not None:
             yield _level_row(name, "predicted", predicted)
-        if (measured := analysis.measured.get(name)) is not None:
+        if (measured := analysis.measured.levels.get(name)) is not None:
             yield _level_row(name, "measured", measured)
 
 
@@ -100,7 +100,7 @@ def _level_row(name: str, side: str, timing: LevelTiming) -> list[str]:
 
 
 def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
-    found = task_document(cycles, analysis.model)
+    found = task_document(cycles, analysis.predicted)
     late, response, gap = found["lateness_ms"], found["response_ms"], found["largest_gap_ms"]
     return [
         name,
@@ -129,13 +129,13 @@ def _pair_row(pair: Pair) -> list[str]:
     ]
 
 
-def _sides(verdict: Verdict | None) -> tuple[str, str]:
+def _sides(verdict: EquationVerdict | None) -> tuple[str, str]:
     if verdict is None:
         return "-", ""
     return _relation(verdict), "ok" if verdict.holds else "FAILS"
 
 
-def _relation(relation: Verdict | Broken) -> str:
+def _relation(relation: EquationVerdict | Broken) -> str:
     return f"{_number(relation.left, relation.unit)} {relation.sign} {_number(relation.right, relation.unit)}"
 
 

@@ -124,18 +124,18 @@ def response(
     must come at the predicted tick; and without it, in a twin of the run, the torque must differ from that tick on.
     Exit status 1 where one does not, or is beyond a bound.
     """
-    from rack.tools.bench.response import Bench
+    from rack.tools.bench.response import ResponseRuns
     from rack.tools.live_table import print_wrapped, terminal_width
     from rack.tools.progress import progress_for
 
     with progress_for(as_json) as progress:
-        measured = Bench(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)
+        measured = ResponseRuns(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)
     if as_json:
         print_json(measured.document())
     else:
         print_wrapped("\n".join(measured.lines(terminal_width())))
     if out is not None:
-        from rack.tools.responding.plot import plot
+        from rack.tools.timing.operator_response import plot
 
         out.mkdir(parents=True, exist_ok=True)
         paths = plot(measured.response, out)

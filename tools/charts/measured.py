@@ -9,11 +9,10 @@ from functools import cached_property
 
 import numpy as np
 
-from rack.boards.config import RackConfig, timed_tasks
+from rack.boards.config import RackConfig, rack_timing
 from rack.boards.config.timing import tick_ns
-from rack.levels.timing.budget import Budget
-from rack.levels.timing.chart import Chart, Job, Span
-from rack.levels.timing.tasks import TimedTask, Unit
+from rack.levels.timing.schedule import Chart, Job, Span
+from rack.levels.timing.tasks import Budget, TimedTask, Unit
 from rack.levels.timing.trace_times import UNITS, plans, response_ns, skipped, waking_ns
 from rack.tools.charts.panel import Count, Panel, Stretch, union, without
 from rack.tools.charts.patterns import Detail, Lane, Patterns, lanes_of, patterns
@@ -34,7 +33,7 @@ class TracedRun:
         recording.need_all_columns()
         self.config: RackConfig = recording.rack_config
         layout = recording.layout
-        known = timed_tasks(self.config, layout, dict.fromkeys(self.config.board, Budget()))
+        known = rack_timing(self.config, layout, dict.fromkeys(self.config.board, Budget())).tasks
         # The cores that the run obtained; the clock leaves no trace.
         self.tasks = tuple(replace(t, core=layout.task(t.name).core) for t in known if t.role != "clock")
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rack.levels.timing.chart import Chart, Job
+from rack.levels.timing.schedule import Chart, Job
 from rack.tools.charts.patterns import Lane, Patterns
 
 NS_PER_MS = 1_000_000

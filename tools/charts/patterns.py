@@ -12,7 +12,7 @@ from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
 
-from rack.levels.timing.chart import Chart, Span
+from rack.levels.timing.schedule import Chart, Span
 from rack.levels.timing.tasks import TimedTask, Unit
 
 IDLE = "-"

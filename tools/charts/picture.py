@@ -18,7 +18,7 @@ from rack.tools.charts.patterns import IDLE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from rack.levels.timing.chart import Chart, Job
+    from rack.levels.timing.schedule import Chart, Job
     from rack.tools.charts.patterns import Lane
 
 COLOURS = {

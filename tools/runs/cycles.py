@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import TaskSpec
-from rack.levels.timing.budget import Budget
+from rack.levels.timing.tasks import Budget
 from rack.levels.timing.trace_times import Occupation, overhead_ns, plans, unit_times
 from rack.tools.runs.recording import Recording
 

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from rack.boards.config import rack_timing
+from rack.levels.timing.system_response import predict
 from rack.levels.timing.trace_times import counts, distribution
 from rack.tools.runs.recording import Recording
-from rack.tools.timing.prediction import hierarchy, predict
 
 LOSSES = ("died", "hang")
 """Codes of the events of a lost board."""
@@ -25,11 +26,10 @@ def system_response(recording: Recording) -> dict[str, Any] | None:
     `beyond` are the responses longer than their bound, each with the delays that the run shows; `unseen`
     counts those that cannot be measured because the recording lacks messages.
     """
-    config = recording.rack_config
-    levels = list(hierarchy(config))
+    predicted = predict(rack_timing(recording.rack_config, recording.layout))
+    levels = list(predicted.levels)
     if len(levels) < 2:
         return None
-    predicted = predict(config, recording.layout)
     return {
         "levels": levels,
         "bound_eq_3_2_ms": predicted.bound_eq_3_2_ms,
