@@ -9,8 +9,14 @@ from typing import Annotated
 
 import typer
 
+from rack.tools.analysis.analysis import Analysis
+from rack.tools.analysis.document import document
+from rack.tools.analysis.tables import text
 from rack.tools.answer import Json, print_json
+from rack.tools.live_table import print_wrapped, terminal_width
 from rack.tools.report import RunFolder
+from rack.tools.runs.recording import Recording, reading_progress
+from rack.tools.timing.operator_response import show
 
 Percentile = Annotated[
     float,
@@ -41,17 +47,10 @@ def analyze(
     Lists the cycles that broke an equation, and the tasks that had their core meanwhile. Writes analysis.json,
     residuals.png and residuals.svg. Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
     """
-    from rack.tools.analysis.analysis import Analysis
-    from rack.tools.analysis.document import document
-    from rack.tools.analysis.residuals import plot
-    from rack.tools.analysis.tables import text
-    from rack.tools.live_table import print_wrapped, terminal_width
-    from rack.tools.runs.recording import Recording, reading_progress
+    from rack.tools.analysis.residuals import plot  # matplotlib takes a second to import
 
     folder = run if out is None else out
     if response:
-        from rack.tools.timing.operator_response import show
-
         sys.exit(0 if show(Recording(run), folder, as_json) else 1)
     progress = reading_progress(silent=as_json)
     analysis = Analysis.of(Recording(run), percentile, progress)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from rack.tools.answer import Failure, Json, Settings, print_json
-
-if TYPE_CHECKING:
-    from rack.tools.charts.gantt import Subject
+from rack.tools.charts import figure5
+from rack.tools.charts.gantt import Subject, gantt_of, subject_of
+from rack.tools.charts.window import times_of, wanted
+from rack.tools.runs.recording import reading_progress
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000
@@ -61,10 +62,6 @@ def gantt(
 
     Figures 2 to 4 of the paper are racks: rack gantt fig2, fig3, fig4, fig4-overload.
     """
-    from rack.tools.charts.gantt import gantt_of, subject_of
-    from rack.tools.charts.window import times_of, wanted
-    from rack.tools.runs.recording import reading_progress
-
     found = subject_of(subject, settings, out)
     if figure is not None:
         _figure_5(found, figure, as_json)
@@ -77,8 +74,6 @@ def gantt(
 
 
 def _figure_5(found: Subject, figure: int, as_json: bool) -> None:
-    from rack.tools.charts import figure5
-
     if figure != 5:
         raise Failure(f"--figure {figure}: permitted: 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2)
     paths = figure5.save(found.config, _made(found.folder) / "figure5")

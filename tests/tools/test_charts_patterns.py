@@ -24,7 +24,7 @@ PLANNER = task("a.planner", "P600 U100", 800, 2, priority=0)
 def counted(tasks: list[TimedTask], lane: str, end: int, detail: Detail | None = None) -> Patterns:
     chart = simulate(tasks, 2 * end)
     found = next(found for found in lanes_of(tasks) if found.name == lane)
-    return patterns(chart, found, 0, end, detail or Detail())
+    return patterns(chart, found, (0, end), detail or Detail())
 
 
 def test_a_plan_has_one_pattern_over_all_its_cycles() -> None:
@@ -45,7 +45,7 @@ def test_cycles_in_which_no_plan_is_under_way_are_counted_apart() -> None:
     # Of five plans the last three are taken away, jobs and spans.
     kept = tuple(job for job in chart.jobs if job.task == "a" or job.release_ns < 3200)
     spans = tuple(span for span in chart.spans if span.task == "a" or span.release_ns < 3200)
-    found = patterns(Chart(0, 8000, spans, kept), lanes_of([EXECUTOR, PLANNER])[0], 0, 6400, Detail())
+    found = patterns(Chart(0, 8000, spans, kept), lanes_of([EXECUTOR, PLANNER])[0], (0, 6400), Detail())
     assert dict(found.plans) == {"R X W P | R X W P U -": 2}
     assert dict(found.cycles) == {"R X W -": 4}
 
@@ -66,7 +66,7 @@ LANE = Lane(1, "a", "a", None, 80, 1000, 1000)
 
 def order(*stretches: tuple[str, int, int], detail: Detail) -> str:
     spans = tuple(Span("a", 1, Unit(unit), start, end, 0) for unit, start, end in stretches)
-    found = patterns(Chart(0, 2000, spans, (Job("a", 0, 1000, 900),)), LANE, 0, 1000, detail)
+    found = patterns(Chart(0, 2000, spans, (Job("a", 0, 1000, 900),)), LANE, (0, 1000), detail)
     (pattern,) = found.cycles
     return pattern
 
@@ -93,4 +93,4 @@ def test_a_plan_in_its_executors_own_memory_is_read_without_communication() -> N
 @pytest.mark.parametrize("start", [0, 1, 799, 800])
 def test_patterns_begin_on_the_grid_and_in_the_stretch(start: int) -> None:
     chart, lane = simulate([EXECUTOR], 8000), lanes_of([EXECUTOR])[0]
-    assert patterns(chart, lane, start, 4000, Detail()).cycles.total() == (5 if start == 0 else 4)
+    assert patterns(chart, lane, (start, 4000), Detail()).cycles.total() == (5 if start == 0 else 4)

@@ -14,8 +14,8 @@ from rack.boards.config.timing import tick_ns
 from rack.levels.timing.schedule import Chart, Job, Span
 from rack.levels.timing.tasks import Budget, TimedTask, Unit
 from rack.levels.timing.trace_times import UNITS, plans, response_ns, skipped, waking_ns
-from rack.tools.charts.panel import Count, Panel, Stretch, union, without
-from rack.tools.charts.patterns import Detail, Lane, Patterns, lanes_of, patterns
+from rack.tools.charts.panel import Count, Panel, union, without
+from rack.tools.charts.patterns import Detail, Lane, Patterns, Stretch, lanes_of, patterns
 from rack.tools.runs.recording import Recording
 
 BLOCK_NS = 1_000_000_000
@@ -54,7 +54,7 @@ class TracedRun:
             until = min(at + block, self.end_ns)
             chart = self.chart(at, until + reach)
             for lane in lanes:
-                found[lane.name].add(patterns(chart, lane, at, until, details[lane.name]))
+                found[lane.name].add(patterns(chart, lane, (at, until), details[lane.name]))
             for task, count in counts.items():
                 counts[task] = count + Count.of(chart, task, at, until)
             progress(until / self.end_ns)

@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rack.levels.timing.schedule import Chart, Job
-from rack.tools.charts.patterns import Lane, Patterns
+from rack.tools.charts.patterns import Lane, Patterns, Stretch
 
 NS_PER_MS = 1_000_000
-Stretch = tuple[int, int]
-"""Start and end, ns."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from typing import NamedTuple
 from rack.levels.timing.schedule import Chart, Span
 from rack.levels.timing.tasks import TimedTask, Unit
 
+Stretch = tuple[int, int]
+"""Start and end, ns."""
 IDLE = "-"
 SHORT = 0.02
 """Part of a cycle below which a measured stretch may be a remnant, of a late wake-up or of a stretch cut in two."""
@@ -117,21 +119,25 @@ class Detail:
         return cls(short, round(GAP * lane.cycle_ns))
 
 
-def patterns(chart: Chart, lane: Lane, start_ns: int, end_ns: int, detail: Detail) -> Patterns:
-    """Return the patterns of a lane that began from `start_ns` to `end_ns`, with " | " between the cycles of a plan.
+def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patterns:
+    """Return the patterns of a lane that began within a stretch, with " | " between the cycles of a plan.
 
-    `chart` must extend beyond `end_ns` by a slice.
+    `chart` must extend beyond the stretch by a slice.
     """
     counted = Patterns.none()
     spans = _by_cycle([span for span in chart.spans if span.core == lane.core], lane.cycle_ns)
-    for start, cycles, is_plan in _stretches(chart, lane, start_ns, end_ns):
+    for start, cycles, is_plan in _beginnings(chart, lane, within):
         first = start // lane.cycle_ns
         of_cycles = [spans[first + cycle] for cycle in range(cycles)]
         if lane.executor is None:
             # The only cycles of a planner on its own processor are its plans.
             of_cycles = [[span for spans_of_cycle in of_cycles for span in spans_of_cycle]]
         length = cycles * lane.cycle_ns // len(of_cycles)
-        orders = (_order(found, lane, start + at * length, length, detail) for at, found in enumerate(of_cycles))
+        borders = (start + at * length for at in range(len(of_cycles)))
+        orders = (
+            _order(found, lane, (begin, begin + length), detail)
+            for begin, found in zip(borders, of_cycles, strict=True)
+        )
         (counted.plans if is_plan else counted.cycles)[" | ".join(orders)] += 1
     return counted
 
@@ -145,31 +151,31 @@ def _by_cycle(spans: Sequence[Span], cycle_ns: int) -> dict[int, list[Span]]:
     return found
 
 
-def _stretches(chart: Chart, lane: Lane, start_ns: int, end_ns: int) -> Iterator[tuple[int, int, bool]]:
+def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
     """Yield start, number of cycles and True for every plan; start, 1 and False for every cycle without one."""
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
     planned = {plan + at * lane.cycle_ns for plan in plans for at in range(slices)}
-    for at in range(-(-start_ns // lane.cycle_ns) * lane.cycle_ns, end_ns, lane.cycle_ns):
+    for at in range(-(-within[0] // lane.cycle_ns) * lane.cycle_ns, within[1], lane.cycle_ns):
         if at in plans:
             yield at, slices, True
         elif at not in planned and lane.executor is not None:
             yield at, 1, False
 
 
-def _order(spans: Sequence[Span], lane: Lane, start_ns: int, length_ns: int, detail: Detail) -> str:
-    """Return the order of the unit functions from `start_ns` on, as in "R X W P -"."""
+def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -> str:
+    """Return the order of the unit functions within a stretch, as in "R X W P -"."""
     stretches: list[tuple[Unit | None, int]] = []
-    busy_until = start_ns
+    busy_until = within[0]
     for span in sorted(spans, key=lambda span: span.start_ns):
-        start, end = max(span.start_ns, start_ns), min(span.end_ns, start_ns + length_ns)
+        start, end = max(span.start_ns, within[0]), min(span.end_ns, within[1])
         if start - busy_until > detail.gap_ns:
             stretches.append((None, start - busy_until))
         if span.task in lane.tasks:
             stretches.append((span.unit, end - start))
         busy_until = max(busy_until, end)
-    if start_ns + length_ns - busy_until > detail.gap_ns:
-        stretches.append((None, start_ns + length_ns - busy_until))
+    if within[1] - busy_until > detail.gap_ns:
+        stretches.append((None, within[1] - busy_until))
     # Pieces of a unit function that other boards have preempted count as one.
     wholes = [(unit, sum(ns for _, ns in pieces)) for unit, pieces in groupby(stretches, key=itemgetter(0))]
     shown = [unit.value if unit else IDLE for unit, ns in wholes if unit is None or ns > detail.short_ns.get(unit, 0)]

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from rack.levels.timing.tasks import Unit
 from rack.tools.charts.letters import step_for
-from rack.tools.charts.panel import NS_PER_MS, Panel, Stretch
+from rack.tools.charts.panel import NS_PER_MS, Panel
 from rack.tools.charts.patterns import IDLE
 
 if TYPE_CHECKING:
@@ -93,23 +93,17 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
     for unit in Unit:
         bars = [(s.start_ns / NS_PER_MS, (s.end_ns - s.start_ns) / NS_PER_MS) for s in own if s.unit is unit]
         axes.broken_barh(bars, (low, BAR), color=COLOURS[unit], linewidth=EDGE)
-    for span in own:
-        _letter(axes, chart, span.unit.value, (span.start_ns, span.end_ns), at)
-    for idle in panel.idle(lane):
-        _letter(axes, chart, IDLE, idle, at)
+    letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in own]
+    letters += [(IDLE, idle) for idle in panel.idle(lane)]
+    for letter, (begin, stop) in letters:
+        if stop - begin >= LETTER * (chart.end_ns - chart.start_ns):
+            axes.text((begin + stop) / 2 / NS_PER_MS, at, letter, ha="center", va="center", fontsize=9)
     if lane.cycle_ns >= 2 * LETTER * (chart.end_ns - chart.start_ns):
         first = -(-chart.start_ns // lane.cycle_ns) * lane.cycle_ns
         marks = [time / NS_PER_MS for time in range(first, chart.end_ns + 1, lane.cycle_ns)]
         axes.vlines(marks, low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)
     for job in panel.late(lane):
         _mark_late(axes, chart, job, low + BAR + 0.06)
-
-
-def _letter(axes: Axes, chart: Chart, letter: str, stretch: Stretch, at: float) -> None:
-    """Write a letter into the middle of a stretch with room for it."""
-    start, end = stretch
-    if end - start >= LETTER * (chart.end_ns - chart.start_ns):
-        axes.text((start + end) / 2 / NS_PER_MS, at, letter, ha="center", va="center", fontsize=9)
 
 
 def _mark_late(axes: Axes, chart: Chart, job: Job, at: float) -> None:

@@ -61,7 +61,7 @@ class Schedule:
             kind="schedule",
             chart=_later(chart.window(start_ns - skipped, end_ns - skipped), skipped),
             lanes=lanes,
-            patterns={lane.name: patterns(chart, lane, 0, counted_ns, detail) for lane in lanes},
+            patterns={lane.name: patterns(chart, lane, (0, counted_ns), detail) for lane in lanes},
             counts={task.name: Count.of(chart, task.name, 0, counted_ns) for task in self.tasks},
         )
 
