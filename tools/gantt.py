@@ -11,7 +11,7 @@ import typer
 from rack.tools.answer import Failure, Json, Settings, print_json
 from rack.tools.charts import figure5
 from rack.tools.charts.gantt import Subject, gantt_of, subject_of
-from rack.tools.charts.window import times_of, wanted
+from rack.tools.charts.window import times_of, window_options
 from rack.tools.runs.recording import reading_progress
 
 LATEST_MS = 1e10
@@ -29,7 +29,7 @@ Cycles = Annotated[
 ]
 Level = Annotated[
     str | None,
-    typer.Option(metavar="LEVEL", help="level whose cycles are meant; default: the slowest with a tight planner"),
+    typer.Option(metavar="LEVEL", help="level whose cycles count; default: the slowest with a tight planner"),
 ]
 Process = Annotated[
     list[str],
@@ -66,7 +66,7 @@ def gantt(
     if figure is not None:
         _figure_5(found, figure, as_json)
         return
-    window = wanted(from_ms, to_ms, cycles, level)
+    window = window_options(from_ms, to_ms, cycles, level)
     chart = gantt_of(found, window, times_of(process), reading_progress(silent=as_json))
     if chart.spans > MANY_SPANS and not as_json:
         print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)

@@ -16,14 +16,13 @@ from rack.tools.running import run_rack
 from rack.tools.runs.recording import Recording
 
 SLOWER = 4
-"""Times of these runs as multiples of the figures': what boards take for themselves, on a slow machine too, is little
-beside them."""
+"""Times of these runs as multiples of the figures': long compared with the boards' own work, on a slow machine too."""
 COMPUTED = 0.95
-"""Part of its budget that a figure computes then; some of the rest is the board's own work."""
+"""Part of its budget that a figure computes; some of the rest is the board's own work."""
 SECONDS = 0.6
 ATTEMPTS = 10
 QUIET, DISTURBED = 0.1, 0.25
-"""Parts of a run's time lost to others on its cores: below, it is a good one; above, it tells nothing of the rack."""
+"""Parts of a run's time lost to other programs: below the first a run is good, above the second useless."""
 
 
 def slowed(name: str) -> list[str]:
@@ -45,7 +44,7 @@ def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Tr
 
 
 def undisturbed(name: str, folder: Path, *settings: str) -> TracedRun:
-    """Return a run in which nobody outside the rack had its cores for long: of several attempts the best one."""
+    """Return a run in which other programs had its cores only briefly: the best of several attempts."""
     best, least = None, DISTURBED
     for attempt in range(ATTEMPTS):
         found = run(name, folder / str(attempt), *slowed(name), *settings)
@@ -59,7 +58,7 @@ def undisturbed(name: str, folder: Path, *settings: str) -> TracedRun:
 
 
 def lost(found: TracedRun) -> float:
-    """Return the part of a run in which its tasks waited for a core, or were on one, and did not compute.
+    """Return the part of a run in which its tasks waited for a core, or were on one without computing.
 
     An executor is ready at its release, a planner when its executor has let go of the core.
     """
@@ -76,5 +75,5 @@ def whole(found: TracedRun) -> Panel:
 
 
 def usual(counts: Counter[str]) -> str:
-    """Return the pattern that came most often: a machine that wakes processes late makes many others, each seldom."""
+    """Return the most frequent pattern: a machine that wakes processes late makes many others, each rare."""
     return counts.most_common(1)[0][0]

@@ -93,7 +93,7 @@ def test_skipped_releases_are_steps_off_the_grid(config: RackConfig, tmp_path: P
     flags = SKIPPED | 3 << SKIPPED_SHIFT
     trace = [*lower(), Cycle(SETTLED + 11, PLAIN, late=0.2, flags=flags), Cycle(SETTLED + 15, PLAIN)]
     (breach,) = found_in(tmp_path / "run", config, {"lower": trace})
-    # The last one stands behind rows that were lost: no cycle was.
+    # Before the last one rows were lost, but no cycle was.
     assert (breach.tick, equations(breach)) == (SETTLED + 11, ["3.7"])
     assert (breach.broken[0].left, breach.broken[0].right) == (10 * MS, 2.5 * MS)
     assert breach.sharing.lasted_ns == (3 * 2.5 + 0.2 + 1.2) * MS

@@ -6,7 +6,7 @@ import pytest
 
 from rack.levels.timing.tasks import TimedTask
 from rack.tools.answer import Failure
-from rack.tools.charts.window import Wanted, times_of, wanted
+from rack.tools.charts.window import WindowOptions, times_of, window_options
 
 MS = 1_000_000
 
@@ -27,7 +27,7 @@ NASREM = [
 
 
 def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_still_be_seen() -> None:
-    none = wanted(None, None, None, None)
+    none = window_options(None, None, None, None)
     level = none.task(NASREM)
     assert level.name == "primitive.planner"
     assert none.window(level, None, 40 * MS) == (40 * MS, 120 * MS)
@@ -35,28 +35,28 @@ def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_stil
 
 def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
     tasks = [task("a", 10), task("a.planner", 10, 2), task("b", 10, core=1), task("b.planner", 10, 4, core=0)]
-    assert wanted(None, None, None, None).task(tasks).name == "a.planner"
+    assert window_options(None, None, None, None).task(tasks).name == "a.planner"
 
 
 def test_cycles_are_those_of_the_level_that_is_named() -> None:
-    asked = wanted(None, None, "3-5", "servo")
+    asked = window_options(None, None, "3-5", "servo")
     assert asked.window(asked.task(NASREM), None, 0) == (7_500_000, 15 * MS)
-    assert wanted(None, None, "7", None).window(asked.task(NASREM), None, 0) == (17_500_000, 20 * MS)
+    assert window_options(None, None, "7", None).window(asked.task(NASREM), None, 0) == (17_500_000, 20 * MS)
 
 
 def test_begin_and_end_are_as_they_are_asked_for() -> None:
-    assert wanted(3.5, 9.25, None, None).window(NASREM[0], None, 0) == (3_500_000, 9_250_000)
-    assert wanted(3, None, None, None).window(NASREM[0], None, 0) == (3 * MS, 8 * MS)
-    # What nobody has asked for ends with the run.
-    assert wanted(3, None, None, None).window(NASREM[0], 5 * MS, 0) == (3 * MS, 5 * MS)
+    assert window_options(3.5, 9.25, None, None).window(NASREM[0], None, 0) == (3_500_000, 9_250_000)
+    assert window_options(3, None, None, None).window(NASREM[0], None, 0) == (3 * MS, 8 * MS)
+    # A default end is cut at the end of the run.
+    assert window_options(3, None, None, None).window(NASREM[0], 5 * MS, 0) == (3 * MS, 5 * MS)
 
 
-def seen(asked: Wanted) -> tuple[int, int]:
+def seen(asked: WindowOptions) -> tuple[int, int]:
     return asked.window(asked.task(NASREM), 80 * MS, 0)
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("asked", "message"),
     [
         ((90.0, 95.0, None, None), "90 to 95 ms: outside the run, which lasts from 0 to 80 ms"),
         ((70.0, 81.0, None, None), "70 to 81 ms: outside the run"),
@@ -65,27 +65,27 @@ def seen(asked: Wanted) -> tuple[int, int]:
         ((None, None, None, "arm"), "--level arm: no such level in the chart; levels: servo, primitive, task"),
     ],
 )
-def test_a_window_that_is_none_is_refused(asked: tuple[float, float, str, str], told: str) -> None:
-    with pytest.raises(Failure, match=told) as failure:
-        seen(wanted(*asked))
+def test_a_bad_window_is_refused(asked: tuple[float, float, str, str], message: str) -> None:
+    with pytest.raises(Failure, match=message) as failure:
+        seen(window_options(*asked))
     assert failure.value.status == 2
 
 
 def test_a_chart_nobody_could_read_is_refused() -> None:
-    asked = wanted(0.0, 5000.1, None, "servo")
+    asked = window_options(0.0, 5000.1, None, "servo")
     with pytest.raises(Failure, match="a chart shows at most 2000 cycles of 'servo', 5000 ms"):
         asked.window(asked.task(NASREM), None, 0)
 
 
 @pytest.mark.parametrize("cycles", ["x", "5-3", "-3", "3-", "1.5", ""])
-def test_cycles_that_are_none_are_refused(cycles: str) -> None:
+def test_bad_cycles_are_refused(cycles: str) -> None:
     with pytest.raises(Failure, match="give the first and the last cycle"):
-        wanted(None, None, cycles, None)
+        window_options(None, None, cycles, None)
 
 
 def test_cycles_and_times_do_not_go_together() -> None:
     with pytest.raises(Failure, match="--cycles already gives the window"):
-        wanted(1.0, None, "3", None)
+        window_options(1.0, None, "3", None)
 
 
 def test_times_of_x_are_read_by_level() -> None:
@@ -93,6 +93,6 @@ def test_times_of_x_are_read_by_level() -> None:
 
 
 @pytest.mark.parametrize("text", ["level", "level=", "level=a", "level=1,-1", "level=nan", "level=inf", "level=1,,2"])
-def test_times_that_are_none_are_refused(text: str) -> None:
+def test_bad_times_are_refused(text: str) -> None:
     with pytest.raises(Failure, match=f"--process {text}: give a level and its times"):
         times_of([text])

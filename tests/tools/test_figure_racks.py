@@ -1,6 +1,6 @@
-"""Figures 2 to 4 by real processes in real time: what is predicted is what is seen.
+"""Figures 2 to 4 by real processes in real time: the runs agree with the predictions.
 
-The machine takes cores away for some milliseconds now and then: these tests judge by majorities, and time nothing.
+The machine takes cores away for some milliseconds now and then: these tests judge by majorities, without time limits.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ pytestmark = [needs_fifo, needs_two_cores, pytest.mark.alone, pytest.mark.timeou
 FIGURES = ("fig2", "fig3", "fig4", "fig4-overload")
 MOSTLY = 0.7
 ENOUGH = 5
-"""Plan updates from which one can tell."""
+"""Plan updates from which on a majority is significant."""
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TracedRun]:
-    # An executor that is overloaded waits for itself: there is nothing to tell others by.
+    # An overloaded executor waits for itself: the influence of other programs cannot be measured.
     folders = {name: tmp_path_factory.mktemp("runs") for name in FIGURES}
     found = {name: undisturbed(name, folders[name]) for name in FIGURES[:3]}
     overload = FIGURES[3]
@@ -98,7 +98,7 @@ def test_the_run_has_the_patterns_of_its_schedule(name: str, panels: dict[str, P
 def updates_met(found: TracedRun) -> tuple[int, int]:
     """Return how many plan updates their executor was released in, and how many of them it cut in two.
 
-    Who begins later than an update takes began behind it.
+    An executor that begins later than an update takes began after it.
     """
     executor, planner = (found.recording.cycles[task] for task in ("level", "level.planner"))
     met = cut = 0

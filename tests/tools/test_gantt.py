@@ -44,7 +44,7 @@ def run(tmp_path: Path) -> Path:
         ("fig4-overload", ["PPPPPPU-----PPPPPPU-----", "CRXXXXWCRXXXXWCRXXXXWCRX"]),
     ],
 )
-def test_a_figure_is_printed_as_the_paper_has_it_and_drawn(name: str, rows: list[str], tmp_path: Path) -> None:
+def test_a_figure_is_printed_as_in_the_paper_and_drawn(name: str, rows: list[str], tmp_path: Path) -> None:
     shown = rack(name, "--out", tmp_path / "out")
     assert (shown.returncode, shown.stderr) == (0, "")
     assert [line.split()[-1] for line in shown.stdout.splitlines() if line.startswith("core ")] == rows
@@ -129,7 +129,7 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["nosuch"], "no such file; by name: crossing, fig2"),
         (["runs/nosuch"], "runs/nosuch: no such run's folder, and no such config"),
@@ -141,10 +141,10 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
         (["fig2", "--out", "README.md"], "--out README.md: no folder for pictures: File exists"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(words: list[str], told: str) -> None:
+def test_bad_arguments_are_refused_in_one_line(words: list[str], message: str) -> None:
     shown = rack(*words)
     assert (shown.returncode, shown.stdout) == (2, "")
-    assert told in shown.stderr
+    assert message in shown.stderr
     assert len(shown.stderr.splitlines()) == 1
 
 

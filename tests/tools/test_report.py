@@ -178,12 +178,12 @@ def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: i
 
 def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, tmp_path: Path) -> None:
     (tmp_path / "told.toml").write_text(TOLD)
-    told = commands(
+    given = commands(
         "level='upper', what='hold', tick=101",
         "level='upper', what='resume', tick=203",
         "level='lower', what='hold', tick=301",
     )
-    run_rack(load(tmp_path / "told.toml", [f"name={rack_name}", told]), 12.0, tmp_path / "run", Watchful())
+    run_rack(load(tmp_path / "told.toml", [f"name={rack_name}", given]), 12.0, tmp_path / "run", Watchful())
     report, text = write_report(tmp_path / "run")
     assert report["holds"] == [
         {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
@@ -191,9 +191,9 @@ def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, 
     ]
     assert "## Holds: 2" in text.splitlines()
     assert f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it." in text.splitlines()
-    (told,) = standstills(tmp_path / "run")
-    assert told.startswith("nothing has moved for ")
-    assert told.endswith(
+    (standstill,) = standstills(tmp_path / "run")
+    assert standstill.startswith("nothing has moved for ")
+    assert standstill.endswith(
         f": lower held by the operator (hold), since 0.75 s; to release: rack command {rack_name} lower resume"
     )
 

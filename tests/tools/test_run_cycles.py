@@ -82,8 +82,8 @@ def test_a_process_that_starts_up_is_not_counted(config: RackConfig, tmp_path: P
     cold = (0.0, 0.1, 2.2, 0.2)
     ticks = [*range(60), *range(80, 140)]
     trace = [Cycle(tick, cold if tick in (0, 39, 80, 119) else PLAIN) for tick in ticks]
-    told = {"kind": "recovery", "code": "rejoined", "time_ns": 0, "text": ""}
-    rejoined, other = told | {"board": "lower", "tick": 80}, told | {"board": "upper", "tick": 45}
+    event = {"kind": "recovery", "code": "rejoined", "time_ns": 0, "text": ""}
+    rejoined, other = event | {"board": "lower", "tick": 80}, event | {"board": "upper", "tick": 45}
     found = measured_budgets(recorded(tmp_path / "run", config, {"lower": trace}, [rejoined, other]))["lower"]
     assert found.process_ns == MS
     late = [Cycle(tick, cold if tick == 45 else PLAIN) for tick in ticks]

@@ -14,7 +14,7 @@ from rack.tools.charts.letters import column_for, lines
 from rack.tools.charts.measured import TracedRun
 from rack.tools.charts.panel import Panel
 from rack.tools.charts.scheduled import Schedule
-from rack.tools.charts.window import Wanted
+from rack.tools.charts.window import WindowOptions
 from rack.tools.folders import RUNS
 from rack.tools.runs.recording import Recording
 
@@ -84,7 +84,7 @@ class Gantt:
 
 
 def gantt_of(
-    subject: Subject, wanted: Wanted, process_ns: Mapping[str, Sequence[int]], progress: Callable[[float], None]
+    subject: Subject, options: WindowOptions, process_ns: Mapping[str, Sequence[int]], progress: Callable[[float], None]
 ) -> Gantt:
     """Return the chart of a subject. Raises `Failure`.
 
@@ -93,8 +93,8 @@ def gantt_of(
     name, run = subject.config.name, subject.run
     schedule = Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
     if run is not None and not run.is_lockstep:
-        task = wanted.task(run.tasks)
-        start, end = wanted.window(task, run.end_ns, run.middle_ns(task))
+        task = options.task(run.tasks)
+        start, end = options.window(task, run.end_ns, run.middle_ns(task))
         measured = run.panel(start, end, progress)
         if schedule is None:
             return Gantt(name, (measured,), (f"no schedule: {NO_BUDGET}",), column_for(end - start, None))
@@ -104,6 +104,6 @@ def gantt_of(
     still = f"{name} ran in lockstep: time stood still while its tasks computed"
     if schedule is None:
         raise Failure(f"{still}; {NO_BUDGET}" if run is not None else f"{name}: {NO_BUDGET}", 2)
-    start, end = wanted.window(wanted.task(schedule.tasks), None, 0)
+    start, end = options.window(options.task(schedule.tasks), None, 0)
     notes = () if run is None else (f"{still}; only the schedule is shown",)
     return Gantt(name, (schedule.panel(start, end),), notes, column_for(end - start, schedule.shortest_ns))

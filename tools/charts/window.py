@@ -19,7 +19,7 @@ LONGEST = 2000
 
 
 @dataclass(frozen=True)
-class Wanted:
+class WindowOptions:
     """The window that the user asks for, ns; None: not given. `cycles` are the first and the last cycle, of `level`."""
 
     from_ns: int | None = None
@@ -68,12 +68,12 @@ class Wanted:
         return max(tight or seen or [min(tasks, key=lambda task: task.period_ns)], key=lambda task: task.period_ns)
 
 
-def wanted(from_ms: float | None, to_ms: float | None, cycles: str | None, level: str | None) -> Wanted:
+def window_options(from_ms: float | None, to_ms: float | None, cycles: str | None, level: str | None) -> WindowOptions:
     """Return the window of the command's options. Raises `Failure` for bad or conflicting options."""
     if cycles is not None and (from_ms is not None or to_ms is not None):
         raise Failure("--cycles already gives the window: leave out --from-ms and --to-ms", 2)
     from_ns, to_ns = (None if value is None else round(value * NS_PER_MS) for value in (from_ms, to_ms))
-    return Wanted(from_ns, to_ns, None if cycles is None else _cycles(cycles), level)
+    return WindowOptions(from_ns, to_ns, None if cycles is None else _cycles(cycles), level)
 
 
 def _cycles(text: str) -> tuple[int, int]:
