@@ -59,19 +59,19 @@ class Forecast:
 def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
     known = [board for board in rack.boards.values() if board.budget is not None]
     if known and rack.is_lockstep:
-        yield "in lockstep a tick waits for whoever is late: this is the timing of the same rack in real time"
+        yield "in lockstep a tick waits for late tasks; this is the timing of the same rack in real time"
     if known and rack.speed != 1.0:
-        yield f"times are of the wall clock: at speed {rack.speed:g} cycles change, budgets do not"
+        yield f"times are of the wall clock: speed {rack.speed:g} changes the cycles, not the budgets"
     if known and not has_cores:
-        yield "cores are those that the config asks for, not those that this machine gives"
+        yield "cores are those of the config; this machine lacks some of them"
     if without := [name for name, board in rack.boards.items() if board.budget is None]:
         names = ", ".join(without)
-        yield f"not judged, nor counted on their cores, for want of a budget (in the config, or --from a run): {names}"
+        yield f"no budget, so not judged and not counted (set one in the config, or use --from RUN): {names}"
     if silent := [board.name for board in known if board.has_planner and not board.is_plan_budgeted]:
-        yield f"planner not judged, for want of plan_ms in the budget: {', '.join(silent)}"
+        yield f"planner not judged, no plan_ms in the budget: {', '.join(silent)}"
     if not rack.clock.cost_ns:
-        yield "the clock's board is not counted on its core: timing.clock_ms is 0"
+        yield "the clock is not counted on its core: timing.clock_ms is 0"
     sharing = [task for task in rack.tasks if task.cost_ns and not task.priority]
     crowded = [task.name for task in sharing if sum(other.core == task.core for other in sharing) > 1]
     if crowded:
-        yield f"ordinary scheduling promises nothing, these are bounds for fair turns: {', '.join(crowded)}"
+        yield f"ordinary scheduling guarantees nothing; bounds that assume fair turns: {', '.join(crowded)}"

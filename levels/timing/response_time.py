@@ -12,9 +12,10 @@ so the bound is attained. Times are integers in one unit; a rack uses ns.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
+from functools import partial
 from math import lcm
 from typing import Any
 
@@ -25,9 +26,9 @@ Load = tuple[int, int, int]
 
 TURN_NS = 4_000_000
 """Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own slice is 3 ms)."""
-MISSED_OVER = 10
+HORIZON_DEADLINES = 10
 """The search for a response time ends after this many deadlines: near full load it converges too slowly."""
-MOST_STEPS = 10_000
+MAX_STEPS = 10_000
 """Limit on the steps of one search: a 10 us tick against a plan of hours takes too many before any deadline."""
 
 
@@ -62,11 +63,15 @@ def response_time(
         return None
     longest = max([cost, period or 0, blocking, jitter, *(t for _, t, _ in above), *(t for _, t, _ in sharing)])
     horizon = 100 * longest if horizon is None else horizon
+
+    def work(until: int, jobs: int) -> int:
+        turns = sum(min(_released(until, load), jobs * cost + turn) for load in sharing)
+        return blocking + jobs * cost + turns + sum(_released(until, load) for load in above)
+
     worst, job, end = 0, 0, 0
     while True:
-        work = blocking + (job + 1) * cost
-        most = (job + 1) * cost + turn
-        found = _end_of_busy_time(work, max(end, work), above, sharing, most, horizon + job * (period or 0))
+        start = max(end, blocking + (job + 1) * cost)
+        found = _fixed_point(partial(work, jobs=job + 1), start, horizon + job * (period or 0))
         if found is None:
             return None
         end, worst = found, max(worst, found + jitter - job * (period or 0))
@@ -78,18 +83,14 @@ def response_time(
             return worst
 
 
-def _end_of_busy_time(
-    work: int, guess: int, above: Sequence[Load], sharing: Sequence[Load], most: int, horizon: int
-) -> int | None:
-    """Return the smallest w >= `guess` at which `work` and all jobs released before are done; None: there is none."""
-    for _ in range(MOST_STEPS):
+def _fixed_point(work: Callable[[int], int], guess: int, horizon: int) -> int | None:
+    """Return the smallest w >= `guess` at which all work released before w is done; None if there is none."""
+    for _ in range(MAX_STEPS):
         if guess > horizon:
             break
-        demand = work + sum(_released(guess, load) for load in above)
-        demand += sum(min(_released(guess, load), most) for load in sharing)
-        if demand <= guess:
+        if (needed := work(guess)) <= guess:
             return guess
-        guess = demand
+        guess = needed
     return None
 
 
@@ -102,9 +103,9 @@ def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> di
     """Return the worst-case response time of every task with a cost, ns, by name.
 
     A job takes two context switches, into it and out of it (eq. 3.9); its response includes both. None: no bound, or
-    none within `MISSED_OVER` deadlines. Tasks of equal priority delay each other by whole jobs; tasks under ordinary
-    scheduling (priority 0) take turns. The bound is exact for tasks of different priorities without blocking; it does
-    not credit a job for its own parts that cannot be preempted.
+    none within `HORIZON_DEADLINES` deadlines. Tasks of equal priority delay each other by whole jobs; tasks under
+    ordinary scheduling (priority 0) take turns. The bound is exact for tasks of different priorities without blocking;
+    it does not credit a job for its own parts that cannot be preempted.
     """
     busy = [task for task in tasks if task.cost_ns]
     found = {}
@@ -118,7 +119,7 @@ def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> di
             blocking_ns(task, others),
             task.jitter_ns,
             sharing=[_load(other, context_switch_ns) for other in shares],
-            horizon=MISSED_OVER * task.period_ns,
+            horizon=HORIZON_DEADLINES * task.period_ns,
         )
     return found
 

@@ -115,7 +115,7 @@ def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
         "3.1": (equations.fits_cycle(executes, communicates, cycle), "t_proc + t_c <= R_i"),
         "3.4": (equations.executes_in_time(executes, level.longest_cycle_ns), "t_exec < R_max"),
         "3.5": (equations.parts_make_cycle(executes, communicates, cycle), "t_exec + t_comm + t_residual = R_i"),
-        "3.6": (equations.residual_is_left(level.residual_ns), "0 < t_residual, alpha at most"),
+        "3.6": (equations.residual_is_left(level.residual_ns), "0 < t_residual <= alpha"),
         "3.7": (equations.cycle_is_on_grid(cycle, tick_ns), "R_i = k c, k whole"),
     }
     for equation, (relation, meaning) in relations.items():
@@ -128,7 +128,7 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
     board, cycle = level.board, level.cycle_ns
     if level.plan_within_ns is not None:
         relation = Relation(level.slice_ns, "<=", level.plan_within_ns)
-        yield EquationVerdict.of(PLAN_WITHIN, board, relation, "d R_i <= time within which the config wants a plan")
+        yield EquationVerdict.of(PLAN_WITHIN, board, relation, "d R_i <= budget.plan_within_ms")
     if level.coupling == "loose":
         fits = equations.plan_fits_loose(level.planning_ns, level.within_cycles, cycle)
         yield EquationVerdict.of(LOOSE_PLAN, board, fits, "t_plan <= d R_i")
@@ -152,4 +152,4 @@ def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
 def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
     for core, load in rack.loads.items():
         relation = Relation(load, "<=", 1.0)
-        yield EquationVerdict.of(LOAD, f"core {core}", relation, "what its tasks compute of its time", "1")
+        yield EquationVerdict.of(LOAD, f"core {core}", relation, "share of its time that its tasks compute", "1")

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,13 @@ FRUITLESS = 3
 TWIN_EXTRA_TICKS = 40
 """A twin runs for so many ticks after the predicted one."""
 MOVING_RAD_S = 0.02
+
+
+class CommandedRun(NamedTuple):
+    """A recorded run, and the commands that it was given."""
+
+    commands: Sequence[CommandConfig]
+    recording: Recording
 
 
 @dataclass(frozen=True)
@@ -113,27 +120,25 @@ class ResponseRuns:
         fruitless = 0
         with TemporaryDirectory() as scratch:
             while (left := commands - sum(len(r.measured) for r in found)) > 0:
-                drawn = self._draw(left + left % 2)
-                recording, response = self._run(drawn, Path(scratch) / str(self._runs))
-                fruitless = 0 if response is not None and response.measured else fruitless + 1
+                run = self._run(self._draw(left + left % 2), Path(scratch) / str(self._runs))
+                response = response_of(run.recording)
+                measured = len(response.measured) if response is not None else 0
+                self._progress.end(LOCKSTEP_RUN_S, f"{measured} responses", [])
+                fruitless = 0 if measured else fruitless + 1
                 if fruitless == FRUITLESS:
                     raise Failure(f"{self._name}: {FRUITLESS} runs without a response to any command")
                 if response is not None:
                     found.append(response)
-                    compared += self._twins(recording, response, drawn, twins - len(compared), Path(scratch))
+                    compared += self._twins(run, response, twins - len(compared), Path(scratch))
         return ResponseBench(self._name, self._mode, self._seed, self._runs, _together(found), tuple(compared))
 
     def _draw(self, most: int) -> list[CommandConfig]:
         return draw(self._paths, self._config.clock_ns, self._random, most)
 
-    def _run(self, commands: Sequence[CommandConfig], folder: Path) -> tuple[Recording, OperatorResponse | None]:
+    def _run(self, commands: Sequence[CommandConfig], folder: Path) -> CommandedRun:
         self._runs += 1
         self._progress.begin(f"run {self._runs}: {len(commands)} commands")
-        recording = run_commands(self._config, commands, folder, self._seconds(commands))
-        response = response_of(recording)
-        measured = len(response.measured) if response is not None else 0
-        self._progress.end(LOCKSTEP_RUN_S, f"{measured} responses", [])
-        return recording, response
+        return CommandedRun(commands, run_commands(self._config, commands, folder, self._seconds(commands)))
 
     def _seconds(self, commands: Sequence[CommandConfig]) -> float:
         """Return the simulated time that the response to the last command needs, and a little more."""
@@ -141,20 +146,13 @@ class ResponseRuns:
         last = max((command.tick or 0 for command in commands), default=0)
         return min(RUN_S, (last + longest) * self._config.clock_ns * 1e-9 + PAUSE_S)
 
-    def _twins(
-        self,
-        recording: Recording,
-        response: OperatorResponse,
-        drawn: Sequence[CommandConfig],
-        most: int,
-        scratch: Path,
-    ) -> Iterator[Twin]:
+    def _twins(self, run: CommandedRun, response: OperatorResponse, most: int, scratch: Path) -> Iterator[Twin]:
         """Yield the twins of holds given to a moving arm: one of every level before a second of any."""
-        found = holds_of_moving_arm(recording, response) if most > 0 else []
+        found = holds_of_moving_arm(run.recording, response) if most > 0 else []
         chosen = sorted(found, key=lambda c: [o.serial for o in found if o.level == c.level].index(c.serial))
         for command in chosen[: max(0, most)]:
             self._progress.begin(f"twin without command {command.serial} to {command.level}")
-            yield compare(self._config, drawn, recording, command, scratch / f"{self._runs}-{command.serial}")
+            yield compare(self._config, run, command, scratch / f"{self._runs}-{command.serial}")
             self._progress.end(0.7 * LOCKSTEP_RUN_S, "compared", [])
 
 
@@ -206,14 +204,12 @@ def holds_of_moving_arm(recording: Recording, response: OperatorResponse) -> lis
     return [c for c in holds if all(speed.get(c.predicted + k, 0.0) > MOVING_RAD_S for k in range(-8, 24, 8))]
 
 
-def compare(
-    config: RackConfig, commands: Sequence[CommandConfig], recording: Recording, command: AnsweredCommand, folder: Path
-) -> Twin:
-    """Run the twin of a recording without `command`, which is one of `commands`, and compare the torques."""
-    before = [other for other in commands if other.tick is not None and other.tick < command.given]
+def compare(config: RackConfig, run: CommandedRun, command: AnsweredCommand, folder: Path) -> Twin:
+    """Run the twin of a run without one of its commands, and compare the torques."""
+    before = [other for other in run.commands if other.tick is not None and other.tick < command.given]
     seconds = (command.predicted + TWIN_EXTRA_TICKS) * config.clock_ns * 1e-9
     twin = run_commands(config, before, folder, seconds)
-    differs = first_difference(recording, twin)
+    differs = first_difference(run.recording, twin)
     return Twin(command.serial, command.level, command.given, command.predicted, differs)
 
 

@@ -154,7 +154,7 @@ class Change:
         if "every" in changed or "within_cycles" in changed:
             yield from self._cycles()
         if changed.get("coupling") == "loose" and not self.after.timing.level(self.board).exchange_ns:
-            yield "reading the plan over the bus not counted: budget.exchange_ms is 0"
+            yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
 
     def _cycles(self) -> Iterator[str]:
         old, new = (rack.timing.level(self.board) for rack in (self.before, self.after))
@@ -176,8 +176,8 @@ class Change:
         """Return which other tasks are on a core, and whether this machine has it."""
         own = (self.board, f"{self.board}.planner")
         others = [name for name, place in self.after.timing.cores.items() if place == core and name not in own]
-        sharing, obtained = f"beside {', '.join(others)}" if others else "a core of its own", obtained_core(core)
-        return sharing if obtained == core else f"{sharing}; this machine has no core {core} and gives core {obtained}"
+        sharing, obtained = f"shared with {', '.join(others)}" if others else "not shared", obtained_core(core)
+        return sharing if obtained == core else f"{sharing}; this machine has no core {core}, uses core {obtained}"
 
     def _protocols(self) -> dict[str, str]:
         old, new = (rack.config.protocol.mailbox for rack in (self.before, self.after))

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -126,8 +126,8 @@ class OperatorResponse:
         return "\n".join(self._lines(width))
 
     def _lines(self, width: int | None) -> Iterator[str]:
-        yield f"response to {len(self.measured)} commands of an operator, ms of simulated time, to the end of the cycle"
-        yield "whose torque rests on it: from its giving, and from the release that reads it"
+        yield f"response to {len(self.measured)} operator commands, ms of simulated time: from giving a command, and"
+        yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
         head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
         yield from table(head, [[*self._cells(row)] for row in self.rows()], width, ("min", "sum, eq. 3.3", "median"))
@@ -152,9 +152,9 @@ def response_of(recording: Recording) -> OperatorResponse | None:
     if not paths:
         return None
     lowest = f"{lowest_level(paths)}.status"
-    rests_on, ticks, stamps = (recording.signal(lowest, name) for name in ("operator", "tick", "stamp_ns"))
+    statuses = _Statuses(*(recording.signal(lowest, name) for name in ("operator", "tick", "stamp_ns")))
     commands = [one for level, path in paths.items() for one in _commands(recording, level, path)]
-    answered = [_follow(command, stamp, rests_on, ticks, stamps) for command, stamp in commands]
+    answered = [_follow(command, given_ns, statuses) for command, given_ns in commands]
     lockstep = config.clock.mode == "lockstep"
     if lockstep:
         answered = [replace(command, wall_ms=None) for command in answered]
@@ -184,17 +184,24 @@ def _commands(recording: Recording, level: str, path: CommandPath) -> Iterator[t
         yield command, int(stamp)
 
 
-def _follow(
-    command: AnsweredCommand, given_ns: int, rests_on: np.ndarray, ticks: np.ndarray, stamps: np.ndarray
-) -> AnsweredCommand:
+class _Statuses(NamedTuple):
+    """Statuses of the lowest level, each array of shape (n,): the command that each rests on, its tick, its stamp."""
+
+    serial: np.ndarray
+    tick: np.ndarray
+    stamp_ns: np.ndarray
+
+
+def _follow(command: AnsweredCommand, given_ns: int, statuses: _Statuses) -> AnsweredCommand:
     """Return the command with the first cycle of the lowest level that rests on it, or on a newer one."""
-    if command.fate == "refused" or not len(rests_on) or rests_on.max() < command.serial:
+    serial = statuses.serial
+    if command.fate == "refused" or not len(serial) or serial.max() < command.serial:
         return command
-    first = int(np.argmax(rests_on >= command.serial))
-    if rests_on[first] != command.serial:
+    first = int(np.argmax(serial >= command.serial))
+    if serial[first] != command.serial:
         return replace(command, fate="overtaken")
-    wall_ms = round((int(stamps[first]) - given_ns) * 1e-6, 6)
-    return replace(command, acts=int(ticks[first]), fate="acted on", wall_ms=wall_ms)
+    wall_ms = round((int(statuses.stamp_ns[first]) - given_ns) * 1e-6, 6)
+    return replace(command, acts=int(statuses.tick[first]), fate="acted on", wall_ms=wall_ms)
 
 
 def _figure(values: np.ndarray, of: Callable[[np.ndarray], Any]) -> float | None:

@@ -5,7 +5,7 @@ The paper names two kinds: another processor for the planner, and a longer respo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -49,13 +49,13 @@ class Repair:
         """Return every step as text, a line per change, and the failures that remain."""
         found: list[str] = []
         for changes in self.steps:
-            start = "with the first of those, then" if found else "what would do"
-            found.append(f"{start}{', any one of them, the cheapest first' if len(changes) > 1 else ''}:")
+            start = "then, with the first of these" if found else "to make it fit"
+            found.append(f"{start}{', one of these, cheapest first' if len(changes) > 1 else ''}:")
             found += [f"  {change.text}" for change in changes]
         if self.left:
             failing = ", ".join(dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left))
-            tried = f"other priorities and cores, plans and cycles up to {MAX_FACTOR} times as long, others' cycles too"
-            found.append(f"nothing helps against {failing}; tried: {tried}")
+            tried = f"other priorities and cores, cycles and plans up to {MAX_FACTOR} times as long, also of others"
+            found.append(f"no change helps with {failing}; tried: {tried}")
         return found
 
     def document(self) -> dict[str, Any]:
@@ -103,13 +103,12 @@ def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
 def _other_priority(rack: JudgedConfig, board: str) -> Change | None:
     """Put the board's executor, or its planner, above another task on its core; the smallest rise that helps."""
     table, limit = rack.config.board[board], rack.config.clock.priority or HIGHEST + 1
+    tried: list[Settings] = []
     for key, task in (("priority", board), ("planner_priority", f"{board}.planner")):
         core, own = rack.timing.cores.get(task), getattr(table, key)
         above = {other.priority + 1 for other in rack.timing.tasks if other.core == core and other.name != task}
-        tried = ({key: priority} for priority in sorted(above) if own < priority < limit)
-        if (change := next((found for one in tried if (found := _first(rack, board, [one]))), None)) is not None:
-            return change
-    return None
+        tried += [{key: priority} for priority in sorted(above) if own < priority < limit]
+    return _any(rack, board, tried)
 
 
 def _changes_of_others(rack: JudgedConfig, board: str) -> list[Change]:
@@ -136,25 +135,22 @@ def _more_cycles(rack: JudgedConfig, board: str) -> Change | None:
 def _planner_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
     """Couple a planner loosely, or move a loose one to another core; if that is not enough, with more cycles."""
     level, places = rack.timing.level(board), list(_places(rack, board))
-    for place in places:
-        if (change := _first(rack, board, [place])) is not None:
-            return change
+    if (change := _any(rack, board, places)) is not None:
+        return change
     older = _cycles(level, (level.within_cycles or 0) + 1)
     found = [_first(rack, board, [{**place, "within_cycles": d} for d in older]) for place in places]
     return min((change for change in found if change is not None), key=lambda change: change.cost, default=None)
 
 
 def _board_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
-    cores = _other_cores(rack, rack.config.board[board].core)
-    return next((change for core in cores if (change := _first(rack, board, [{"core": core}])) is not None), None)
+    return _any(rack, board, ({"core": core} for core in _other_cores(rack, rack.config.board[board].core)))
 
 
 def _task_elsewhere(rack: JudgedConfig, board: str, cures: str) -> Change | None:
     """Move a board, or its loose planner alone, to another used core so that another board fits."""
     table = rack.config.board[board]
     keys = ["core"] if table.planner_core is None else ["planner_core", "core"]
-    tried = [{key: core} for key in keys for core in _other_cores(rack, getattr(table, key))]
-    return next((change for one in tried if (change := _first(rack, board, [one], cures)) is not None), None)
+    return _any(rack, board, ({key: core} for key in keys for core in _other_cores(rack, getattr(table, key))), cures)
 
 
 def _longer_cycle(
@@ -221,18 +217,24 @@ def _free_slot(rack: JudgedConfig) -> int | None:
     return next((slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken), None)
 
 
+def _attempt(rack: JudgedConfig, board: str, settings: Settings, cures: str | None) -> Change | None:
+    """Return the change of a board if it cures the board, or the board `cures`."""
+    mailboxes: dict[str, Protocol] = {}
+    if settings.get("coupling") == "loose" and rack.timing.boards[board].is_critical:
+        # Between two processors the paper uses time slices or double buffers (section 3.3).
+        mailboxes = {f"{board}.plan": "time-slice"}
+    after = rack.changed(board, settings, mailboxes)
+    return Change(board, rack, after) if after is not None and after.cures(cures or board, rack) else None
+
+
+def _any(rack: JudgedConfig, board: str, tried: Iterable[Settings], cures: str | None = None) -> Change | None:
+    """Return the first change that works, trying one after another."""
+    return next((change for one in tried if (change := _attempt(rack, board, one, cures)) is not None), None)
+
+
 def _first(rack: JudgedConfig, board: str, tried: Sequence[Settings], cures: str | None = None) -> Change | None:
-    """Return the change of a board with the first settings that cure it, or the board `cures`; None if none do."""
-
-    def attempt(settings: Settings) -> Change | None:
-        mailboxes: dict[str, Protocol] = {}
-        if settings.get("coupling") == "loose" and rack.timing.boards[board].is_critical:
-            # Between two processors the paper uses time slices or double buffers (section 3.3).
-            mailboxes = {f"{board}.plan": "time-slice"}
-        after = rack.changed(board, settings, mailboxes)
-        return Change(board, rack, after) if after is not None and after.cures(cures or board, rack) else None
-
-    return first_that(tried, attempt)
+    """Return the first change that works, in few attempts; see `first_that`."""
+    return first_that(tried, lambda settings: _attempt(rack, board, settings, cures))
 
 
 def first_that(tried: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:

@@ -19,7 +19,7 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
     """Yield a forecast as text for people."""
     yield from _prediction_lines(forecast.system)
     if forecast.levels:
-        yield from ("", f"worst case by the budgets, ms, with t_cs {ms(forecast.context_switch_ns)} ms:", "")
+        yield from ("", f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:", "")
         yield from level_table(forecast.levels, width)
     if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in (RESPONSE_TIME, LOAD)]:
         yield ""
@@ -40,7 +40,7 @@ def _prediction_lines(system: Prediction) -> Iterator[str]:
         yield f"  eq. 3.3 sum of the cycles {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound {system.bound_eq_3_2_ms:g} ms"
         yield f"  on the clock's grid: a command down {system.command_ms:g} ms, a status up {system.status_ms:g} ms"
     for level, plan_ms in system.plan_ms.items():
-        yield f"plan of {level}: used {plan_ms:g} ms after its planner's release"
+        yield f"plan of {level}: available {plan_ms:g} ms after its planner's release"
 
 
 def level_table(levels: Iterable[LevelTiming], width: int | None = None) -> Iterator[str]:

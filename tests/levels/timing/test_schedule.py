@@ -1,4 +1,4 @@
-"""Schedules: the paper's figures to the millisecond, and the rack's rules for whoever is late."""
+"""Schedules: the paper's figures to the millisecond, and the rack's rules for late tasks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def planner(text: str, every: int, cycles: int, core: int = 1, ceiling: int = 80
 
 
 def row(chart: Chart, core: int = 1) -> str:
-    """Return who computes in each unit of time, as the paper's figures have it."""
+    """Return the unit function of each unit of time, as in the paper's figures."""
     letters = ["-"] * chart.end_ns
     for span in (span for span in chart.spans if span.core == core):
         letters[span.start_ns : span.end_ns] = span.unit.value * (span.end_ns - span.start_ns)
@@ -44,7 +44,7 @@ FIG_3 = (executor("R1 X2 W1", 6), planner("P6 U1", 6, 3))
 FIG_4 = (executor("C1 R1 X2 W1", 6), planner("P6 U1", 6, 2, core=2, ceiling=0))
 
 
-def test_figure_2_is_printed_as_the_paper_has_it() -> None:
+def test_figure_2_is_as_in_the_paper() -> None:
     assert row(simulate(FIG_2, 32)) == "RXXWPPPPRXXWPPU-" * 2
 
 
@@ -77,7 +77,7 @@ def test_figure_4_with_a_longer_executor_misses_every_cycle() -> None:
     assert len(chart.late("level")) == 10
 
 
-def test_whoever_is_late_takes_the_newest_release_and_skips_the_others() -> None:
+def test_a_late_task_takes_the_newest_release_and_skips_the_others() -> None:
     chart = simulate([executor("X25", 10)], 60)
     # Done at 25 and at 45: the releases of 10 and of 30 have passed, those of 20 and 40 are the newest.
     assert ends(chart, "level") == [(0, 25), (10, None), (20, 50), (30, None), (40, None), (50, None)]
@@ -99,7 +99,7 @@ def test_a_planner_that_lost_more_than_its_slice_skips_to_the_oldest_release_tha
     assert ends(chart, "level.planner") == [(0, 35), (30, 70), (65, 105), (100, None)]
 
 
-def test_the_plan_update_keeps_its_executor_out_and_nobody_above_it() -> None:
+def test_the_plan_update_blocks_its_executor_but_no_task_above_it() -> None:
     tasks = executor("R1 X1", 4), planner("P2 U3", 4, 3)
     assert row(simulate(tasks, 12)) == "RXPPRXUUURX-"
     above = TimedTask("clock", "clock", "clock", 1, 90, 8, parts("X1"))
@@ -219,7 +219,7 @@ JOBS = (Job("a", 0, 20, 14), Job("a", 20, 40, 45), Job("b", 0, 30, None), Job("b
 CHART = Chart(0, 60, SPANS, JOBS)
 
 
-def test_a_job_is_late_when_it_ended_behind_its_deadline_or_did_not_end_by_then() -> None:
+def test_a_job_is_late_if_it_ended_after_its_deadline_or_did_not_end_by_then() -> None:
     assert CHART.late("a") == [JOBS[1]]
     # The second one still has time when the chart ends.
     assert CHART.late("b") == [JOBS[2]]

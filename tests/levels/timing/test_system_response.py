@@ -14,11 +14,11 @@ NASREM = CommandPath(("task", "elemental_move", "primitive", "servo"), (400, 100
 @pytest.mark.parametrize(
     ("given", "sampled", "acts"),
     [
-        # Visible a tick later; each level's next release on the grid: 400, 800, 904 (900 is none of every 8), 912.
+        # Visible a tick later; each level's next release on the grid: 400, 800, 904 (900 is not a multiple of 8), 912.
         (0, 400, 912),
         (399, 400, 912),
         (400, 800, 1312),
-        # 1200 + 400 + 100 = 1700 is none of every 8: 1704, and its slice.
+        # 1200 + 400 + 100 = 1700 is not a multiple of 8: 1704, and its slice.
         (800, 1200, 1712),
     ],
 )
@@ -30,7 +30,7 @@ def test_a_command_is_followed_from_release_to_release(given: int, sampled: int,
 def test_bounds_are_those_of_the_paper_and_of_the_grid() -> None:
     assert NASREM.bound_eq_3_2 == 4 * 400
     assert NASREM.sum_eq_3_3 == 400 + 100 + 8 + 1
-    # A cycle of the first level until it is read, the sum, and up to 4 ticks: 100 is no multiple of 8.
+    # A cycle of the first level until it is read, the sum, and up to 4 ticks: 100 is not a multiple of 8.
     assert NASREM.longest == 400 + 509 + 4
 
 

@@ -1,4 +1,4 @@
-"""What would do where something fails: the smallest change of each kind, tried and not assumed."""
+"""Changes that make a rack fit: the smallest of each kind, tried and not assumed."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_a_new_core_is_asked_for_where_no_used_one_has_room(judge: Judge) -> Non
     judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
     change = change_of(judged, "planner_core")
     assert change.settings["planner_core"] == 2
-    assert "planner_core 2 (a core of its own" in change.text
+    assert "planner_core 2 (not shared" in change.text
 
 
 def test_a_core_of_unknown_load_is_left_alone(judge: Judge, budgeted: object) -> None:
@@ -138,7 +138,7 @@ def test_an_executor_too_long_for_its_cycle_gets_a_longer_one_and_nothing_else(j
 def test_a_core_of_its_own_with_older_plans_ranks_by_their_age(judge: Judge, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1, 2})
     loose = ["coupling=loose", "planner_slot=4", "planner_core=1", "within_cycles=2", "budget.plan_ms=24"]
-    # 24.7 of planning need 5 cycles beside its executor, 5 beside the upper level, 3 alone.
+    # 24.7 of planning need 5 cycles on the core of its executor or of the upper level, 3 alone.
     judged = judge(*(f"board.lower.{setting}" for setting in loose), "board.upper.budget.process_ms=6")
     assert settings_for(judged)[:2] == [{"within_cycles": 3, "planner_core": 2}, {"within_cycles": 5}]
 
@@ -167,7 +167,7 @@ def test_a_board_that_waits_for_others_gets_a_core_of_its_own(judge: Judge) -> N
 def test_a_planner_elsewhere_and_a_longer_cycle_together_are_a_last_resort(judge: Judge) -> None:
     settings = ["budget.process_ms=9", "budget.plan_ms=29", "budget.plan_within_ms=30", "budget.exchange_ms=0"]
     alone = ("timing.context_switch_ms=0", "board.upper.rate_hz=16.666666666666668")
-    # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of 15 beside it: just.
+    # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of 15 on another core: just.
     assert settings_for(judge(*(f"board.lower.{setting}" for setting in settings), *alone)) == [
         {"within_cycles": 2, "coupling": "loose", "planner_slot": 4, "planner_core": 2, "every": 6, "rate_hz": None}
     ]
@@ -182,8 +182,8 @@ def test_boards_are_mended_one_after_another(judge: Judge) -> None:
     # The second step rests on the first.
     assert mended.end.config.board["lower"].within_cycles == 2
     assert [line.split(":")[0] for line in mended.lines() if not line.startswith(" ")] == [
-        "what would do, any one of them, the cheapest first",
-        "with the first of those, then",
+        "to make it fit, one of these, cheapest first",
+        "then, with the first of these",
     ]
 
 
@@ -191,7 +191,7 @@ def test_what_nothing_helps_against_is_said(judge: Judge) -> None:
     hopeless = repair(judge("board.lower.budget.process_ms=200"))
     assert hopeless.steps == ()
     assert {verdict.equation for verdict in hopeless.left} >= {"3.1", "3.4"}
-    assert hopeless.lines()[-1].startswith("nothing helps against 3.1 of lower, ")
+    assert hopeless.lines()[-1].startswith("no change helps with 3.1 of lower, ")
     assert hopeless.document() == {"steps": [], "fits": False}
 
 
@@ -216,4 +216,4 @@ def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_core_that_the_machine_lacks_is_said_to_be_lacking(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
-    assert "this machine has no core 2 and gives core 0" in change_of(judged, "planner_core").text
+    assert "this machine has no core 2, uses core 0" in change_of(judged, "planner_core").text
