@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +14,14 @@ from rack.tools.analysis.document import document
 from rack.tools.analysis.tables import text
 from rack.tools.display import SilentDisplay
 from rack.tools.running import run_rack
-from tests.processes import RACK
+from tests.tools.in_process import rack
 from tests.tools.recordings import MS, Cycle, recorded
 
-ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 30
 SETTLED = 40
 PLAIN = (0.0, 0.1, 1.0, 0.1)
 BUDGET = ["board.lower.budget.process_ms=1.0", "board.lower.budget.read_ms=0.2", "board.lower.budget.write_ms=0.2"]
 USUAL = ["--percentile", "50"]
 """What a machine whose host stalls it cannot change."""
-
-
-def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [*RACK, *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 
 def run_of(figure: str, name: str, folder: Path) -> Path:
