@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -12,8 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from rack.levels.timing.rack import LevelTiming
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import deviation_ns, worst_words
+from rack.tools.runs.cycles import Cycles
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -35,7 +37,8 @@ def plot(analysis: Analysis, path: Path) -> None:
     low, high = _span(analysis, levels)
     edges = np.geomspace(low, high, BINS + 1)
     for row, name in enumerate(reversed(levels)):
-        _level(axes, analysis, name, row, edges)
+        level = _Level(analysis.cycles[name], analysis.measured.levels[name], analysis.predicted.levels.get(name))
+        _draw(axes, level, row, edges)
     axes.set_yticks(np.arange(len(levels)) + 0.1, levels[::-1], fontsize=9)
     axes.set_ylim(-0.35, len(levels) - 0.15)
     _scale(axes, low, high)
@@ -85,24 +88,28 @@ def _span(analysis: Analysis, levels: list[str]) -> tuple[float, float]:
     return max(least, 1e-6) / 1.5, max(most, 1.0) * 1.5
 
 
-def _level(axes: Axes, analysis: Analysis, name: str, row: int, edges: np.ndarray) -> None:
+class _Level(NamedTuple):
+    """The cycles of a level, and its times: measured, and predicted where it has a budget."""
+
+    cycles: Cycles
+    measured: LevelTiming
+    predicted: LevelTiming | None
+
+
+def _draw(axes: Axes, level: _Level, row: int, edges: np.ndarray) -> None:
     """Draw one level: the histogram of its used time, so scaled that a single cycle shows; its marks and numbers."""
-    cycles, timing = analysis.cycles[name], analysis.measured.levels[name]
-    used = cycles.used_ns[cycles.is_judged] / timing.cycle_ns
-    counts, _ = np.histogram(used, edges)
+    cycles, timing, predicted = level
+    used_ns = cycles.used_ns[cycles.is_judged]
+    counts, _ = np.histogram(used_ns / timing.cycle_ns, edges)
     heights = 0.72 * np.log1p(counts) / np.log1p(max(counts.max(), 1))
     axes.fill_between(edges[:-1], row, row + heights, step="post", color=CYCLES, linewidth=0)
     axes.axhline(row, color="#bbbbbb", linewidth=0.6)
-    _mark(axes, (timing.execution_ns + timing.communication_ns) / timing.cycle_ns, row, MEASURED, "v")
-    predicted = analysis.predicted.levels.get(name)
-    if predicted is not None:
-        _mark(axes, (predicted.execution_ns + predicted.communication_ns) / predicted.cycle_ns, row, PREDICTED, "^")
-    usual_ms = (timing.cycle_ns - float(np.median(cycles.used_ns[cycles.is_judged]))) * MS
+    for side, colour, marker in ((timing, MEASURED, "v"), (predicted, PREDICTED, "^")):
+        if side is not None:
+            part = (side.execution_ns + side.communication_ns) / side.cycle_ns
+            axes.plot([part], [row], marker, color=colour, markersize=6, clip_on=False)
+    usual_ms = (timing.cycle_ns - float(np.median(used_ns))) * MS
     words = f"R_i {timing.cycle_ns * MS:g} ms, usually left {usual_ms:.4g} ms\nalpha {timing.residual_ns * MS:.4g} ms"
     words += f", deviation {deviation_ns(cycles) * MS:.2g} ms"
     words += "" if predicted is None else f"\nalpha predicted {predicted.residual_ns * MS:.4g} ms"
     axes.annotate(words, (1.02, row + 0.1), xycoords=("axes fraction", "data"), fontsize=8, va="center")
-
-
-def _mark(axes: Axes, part: float, row: int, colour: str, marker: str) -> None:
-    axes.plot([part], [row], marker, color=colour, markersize=6, clip_on=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -76,33 +76,31 @@ def holds(recording: Recording) -> list[dict[str, Any]]:
 
     `by` is "operator", with the command as `why`; or "holding", with the last reason that the level gave.
     """
-    tick_s = recording.layout.clock_ns * 1e-9
-    found = []
-    for mailbox in recording.mailboxes:
-        level, _, port = mailbox.partition(".")
-        if port != "status" or "state" not in recording.fields(mailbox):
-            continue
-        ticks, own = recording.signal(mailbox, "tick"), recording.signal(mailbox, "state") == State.HOLDING
-        standing = np.zeros(len(ticks), int)
-        if "standing" in recording.fields(mailbox):
-            standing = recording.signal(mailbox, "standing").astype(int)
-        # An operator's command takes precedence over the level's own state.
-        what = np.where(standing > 0, standing, -own.astype(int))
-        for first, end in _stretches(what):
-            is_operators = what[first] > 0
-            said = What(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
-            since, until = int(ticks[first]), int(ticks[end]) if end < len(ticks) else None
-            found.append(
-                {
-                    "level": level,
-                    "by": "operator" if is_operators else OWN,
-                    "why": said,
-                    "since_s": round(since * tick_s, 6),
-                    "until_s": None if until is None else round(until * tick_s, 6),
-                    "lasted_s": round(((int(ticks[-1]) if until is None else until) - since) * tick_s, 6),
-                }
-            )
+    levels = [mailbox.removesuffix(".status") for mailbox in recording.mailboxes if mailbox.endswith(".status")]
+    found = [hold for level in levels for hold in _holds_of(recording, level)]
     return sorted(found, key=lambda hold: (hold["since_s"], hold["level"]))
+
+
+def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
+    mailbox, tick_s = f"{level}.status", recording.layout.clock_ns * 1e-9
+    fields = recording.fields(mailbox)
+    if "state" not in fields:
+        return
+    ticks, own = recording.signal(mailbox, "tick"), recording.signal(mailbox, "state") == State.HOLDING
+    standing = recording.signal(mailbox, "standing").astype(int) if "standing" in fields else np.zeros(len(ticks), int)
+    # An operator's command takes precedence over the level's own state.
+    what = np.where(standing > 0, standing, -own.astype(int))
+    for first, end in _stretches(what):
+        is_operators = what[first] > 0
+        since, until = int(ticks[first]), int(ticks[end]) if end < len(ticks) else None
+        yield {
+            "level": level,
+            "by": "operator" if is_operators else OWN,
+            "why": What(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1]),
+            "since_s": round(since * tick_s, 6),
+            "until_s": None if until is None else round(until * tick_s, 6),
+            "lasted_s": round(((int(ticks[-1]) if until is None else until) - since) * tick_s, 6),
+        }
 
 
 def _stretches(what: np.ndarray) -> list[tuple[int, int]]:
