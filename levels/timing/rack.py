@@ -11,6 +11,8 @@ from rack.levels.timing.equations import communication_ns, residual_ns, response
 from rack.levels.timing.response_time import load_of
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
+Coupling = Literal["tight", "loose", "none"]
+
 
 @dataclass(frozen=True)
 class BoardTiming:
@@ -23,7 +25,7 @@ class BoardTiming:
     name: str
     above: str | None
     below: str | None
-    coupling: Literal["tight", "loose", "none"]
+    coupling: Coupling
     every: int
     within_cycles: int
     core: int
@@ -51,7 +53,7 @@ class LevelTiming:
     """
 
     board: str
-    coupling: Literal["tight", "loose", "none"]
+    coupling: Coupling
     cycle_ns: int
     longest_cycle_ns: int
     read_ns: int

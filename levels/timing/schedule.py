@@ -41,11 +41,6 @@ class Job:
     deadline_ns: int
     end_ns: int | None
 
-    @property
-    def is_late(self) -> bool:
-        """Whether it ended after its deadline; `Chart.late` judges jobs that have not ended."""
-        return self.end_ns is not None and self.end_ns > self.deadline_ns
-
 
 @dataclass(frozen=True)
 class Chart:
@@ -58,8 +53,10 @@ class Chart:
 
     def late(self, task: str) -> list[Job]:
         """Return the jobs of a task that missed their deadline, unfinished ones included."""
-        jobs = [job for job in self.jobs if job.task == task]
-        return [job for job in jobs if job.is_late or (job.end_ns is None and job.deadline_ns <= self.end_ns)]
+        return [job for job in self.jobs if job.task == task and self._is_late(job)]
+
+    def _is_late(self, job: Job) -> bool:
+        return job.deadline_ns <= self.end_ns if job.end_ns is None else job.deadline_ns < job.end_ns
 
     def window(self, start_ns: int, end_ns: int) -> Chart:
         """Return the chart from `start_ns` to `end_ns`: spans are cut there, jobs kept whole.

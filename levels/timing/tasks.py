@@ -79,7 +79,3 @@ class TimedTask:
     def locked_ns(self) -> int:
         """The longest part of a job that is not preemptible."""
         return max((part.time_ns for part in self.parts if not part.preemptible), default=0)
-
-    def time_of(self, unit: Unit) -> int:
-        """Return the time that a job spends on one unit function."""
-        return sum(part.time_ns for part in self.parts if part.unit is unit)
