@@ -96,7 +96,9 @@ def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
         yield {
             "level": level,
             "by": "operator" if is_operators else OWN,
-            "why": What(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1]),
+            "why": What(what[first]).name.lower()
+            if is_operators
+            else str(recording.signal(mailbox, "reason")[end - 1]),
             "since_s": round(since * tick_s, 6),
             "until_s": None if until is None else round(until * tick_s, 6),
             "lasted_s": round(((int(ticks[-1]) if until is None else until) - since) * tick_s, 6),
