@@ -92,13 +92,12 @@ def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
     what = np.where(standing > 0, standing, -own.astype(int))
     for first, end in _stretches(what):
         is_operators = what[first] > 0
+        why = What(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
         since, until = int(ticks[first]), int(ticks[end]) if end < len(ticks) else None
         yield {
             "level": level,
             "by": "operator" if is_operators else OWN,
-            "why": What(what[first]).name.lower()
-            if is_operators
-            else str(recording.signal(mailbox, "reason")[end - 1]),
+            "why": why,
             "since_s": round(since * tick_s, 6),
             "until_s": None if until is None else round(until * tick_s, 6),
             "lasted_s": round(((int(ticks[-1]) if until is None else until) - since) * tick_s, 6),

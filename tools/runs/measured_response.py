@@ -87,9 +87,7 @@ def _delays(recording: Recording, levels: Sequence[str], since: int, until: int)
     ]
     yield from (f"{board} was lost" for board in dict.fromkeys(lost))
     for name in levels:
-        rows = recording.trace(name)
-        missed, skipped = counts(
-            rows[(rows["tick"] >= since) & (rows["tick"] < until + recording.layout.task(name).every)]
-        )
+        rows, last = recording.trace(name), until + recording.layout.task(name).every
+        missed, skipped = counts(rows[(rows["tick"] >= since) & (rows["tick"] < last)])
         if missed or skipped:
             yield f"{name}: {missed} missed, {skipped} skipped"

@@ -114,7 +114,7 @@ class Recording:
 
     @cached_property
     def stolen(self) -> list[Stolen]:
-        """When the hypervisor had a core, earliest first; empty where the recorder did not measure it, or was killed."""
+        """When the hypervisor had a core, earliest first; empty if the recorder did not measure it, or was killed."""
         with _naming(self.folder / "cycles.parquet"):
             found = json.loads(self._cycles.metadata.metadata.get(b"stolen", b"[]"))
             return [Stolen(*map(int, entry)) for entry in found]
