@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from math import ceil, isfinite
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -71,9 +71,8 @@ def _pair(pair: Pair) -> Document:
 def _verdict(verdict: EquationVerdict | None) -> Document | None:
     if verdict is None:
         return None
-    found = asdict(verdict) | {"margin": verdict.margin}
-    del found["equation"], found["subject"]
-    return {name: value if not isinstance(value, float) or isfinite(value) else None for name, value in found.items()}
+    # Equation and subject are those of the pair.
+    return {name: value for name, value in verdict.document().items() if name not in ("equation", "subject")}
 
 
 def _breach(breach: Breach, clock_ns: int) -> Document:
