@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
-from rack.boards.config import RackConfig, load, loads, rack_timing, wire
+from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.levels.timing.response_time import response_times
 from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
@@ -50,8 +50,8 @@ class Partition:
         boards = {name: self._board(board, free) for name, board in config.board.items()}
         clock = config.clock.model_copy(update={"mode": "realtime", "core": config.clock.core % self.cores})
         changed = config.model_copy(update={"board": boards, "clock": clock})
-        # Copying validates nothing: only the loader finds mistakes.
-        return loads(changed.text())
+        # A copy is not validated: load and check it like a user's config.
+        return resolve(loads(changed.text())).config
 
     def _board(self, board: BoardConfig, free: Iterator[int]) -> BoardConfig:
         core = board.core % self.cores

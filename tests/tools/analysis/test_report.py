@@ -22,7 +22,7 @@ from rack.tools.display import SilentDisplay
 from rack.tools.running import run_rack
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
-from tests.boards.told_racks import TOLD, commands
+from tests.boards.commanded_racks import COMMANDED, commands
 from tests.conftest import SMALL
 
 TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
@@ -177,13 +177,13 @@ def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: i
 
 
 def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, tmp_path: Path) -> None:
-    (tmp_path / "told.toml").write_text(TOLD)
+    (tmp_path / "commanded.toml").write_text(COMMANDED)
     given = commands(
         "level='upper', what='hold', tick=101",
         "level='upper', what='resume', tick=203",
         "level='lower', what='hold', tick=301",
     )
-    run_rack(load(tmp_path / "told.toml", [f"name={rack_name}", given]), 12.0, tmp_path / "run", Watchful())
+    run_rack(load(tmp_path / "commanded.toml", [f"name={rack_name}", given]), 12.0, tmp_path / "run", Watchful())
     report, text = write_report(tmp_path / "run")
     assert report["holds"] == [
         {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
