@@ -12,7 +12,7 @@ import numpy as np
 from rack.backplane.layout import TaskSpec
 from rack.backplane.message import State
 from rack.backplane.trace import Flag
-from rack.levels.operator import What
+from rack.levels.operator import Operation
 from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
 from rack.tools.answer import Failure
 from rack.tools.runs.recording import Recording
@@ -92,7 +92,7 @@ def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
     what = np.where(standing > 0, standing, -own.astype(int))
     for first, end in _stretches(what):
         is_operators = what[first] > 0
-        why = What(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
+        why = Operation(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
         since, until = int(ticks[first]), int(ticks[end]) if end < len(ticks) else None
         yield {
             "level": level,
