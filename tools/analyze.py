@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rack.tools.answer import Json, print_json
+from rack.tools.console.answer import Json, print_json
 from rack.tools.report import RunFolder
 
 Percentile = Annotated[
@@ -48,7 +48,7 @@ def analyze(
     from rack.tools.analysis.plot import plot
     from rack.tools.analysis.text import text
     from rack.tools.charting.progress import part_for
-    from rack.tools.live_table import print_wrapped, terminal_width
+    from rack.tools.console.tables import print_wrapped, terminal_width
     from rack.tools.recording import Recording
 
     if response:

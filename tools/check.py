@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
+from rack.tools.console.answer import ConfigName, Failure, Faults, Json, Settings, print_json
 
 if TYPE_CHECKING:
     from rack.boards.config import RackConfig
@@ -61,8 +61,8 @@ def check(
     Examples: rack check fig3; rack check fig3 --fix > fits.toml; rack check nasrem --from runs/nasrem-20250101-120000
     """
     from rack.boards.config import budgets, load, shared_out
+    from rack.tools.console.tables import print_wrapped, terminal_width
     from rack.tools.inventory import Inventory
-    from rack.tools.live_table import print_wrapped, terminal_width
     from rack.tools.timing.forecast import Forecast
     from rack.tools.timing.repair import repair
     from rack.tools.timing.trial import Trial

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rack.tools.answer import Failure, Json, Settings, print_json
+from rack.tools.console.answer import Failure, Json, Settings, print_json
 
 if TYPE_CHECKING:
     from rack.tools.charting.subject import Subject

@@ -9,7 +9,7 @@ from typing import Any
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config.schema import CLOCK_SLOT, RackConfig
-from rack.tools.text_table import table
+from rack.tools.console.tables import table
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rack.tools.answer import Json, print_json
+from rack.tools.console.answer import Json, print_json
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
 
@@ -39,7 +39,7 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
 
 def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
     """Print a report: one JSON document; on a terminal as much as fits; elsewhere `text`, as for a run not recorded."""
-    from rack.tools.live_table import console
+    from rack.tools.console.tables import console
     from rack.tools.reporting.markdown import show
 
     if as_json:

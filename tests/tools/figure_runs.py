@@ -11,9 +11,9 @@ import pytest
 from rack.boards.config import load
 from rack.tools.charting.measured import Run
 from rack.tools.charting.panel import Panel
-from rack.tools.display import SilentDisplay
 from rack.tools.recording import Recording
-from rack.tools.running import run_rack
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 
 SLOWER = 4
 """Times of these runs as multiples of the figures': what boards take for themselves, on a slow machine too, is little

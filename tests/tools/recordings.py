@@ -12,9 +12,8 @@ import numpy as np
 from rack.backplane.trace import RECORD
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
-from rack.tools.recorder.cycles import CyclesFile
-from rack.tools.recorder.signals import SignalsFile
 from rack.tools.recording import Recording
+from rack.tools.runs.parquet import CyclesFile, SignalsFile
 
 MS = 1_000_000
 

@@ -13,8 +13,8 @@ from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
 from rack.tools.analysis.text import text
-from rack.tools.display import SilentDisplay
-from rack.tools.running import run_rack
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from tests.processes import RACK
 from tests.tools.recordings import MS, Cycle, recorded
 

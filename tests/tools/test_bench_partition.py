@@ -8,10 +8,10 @@ import pytest
 
 from rack.boards.config import load, loads
 from rack.boards.errors import ConfigError
-from rack.tools.answer import Failure
 from rack.tools.bench.partition import compare, lines_of
 from rack.tools.bench.partitions import PARTITIONS, Partition
-from rack.tools.progress import Silent
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Silent
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores
 

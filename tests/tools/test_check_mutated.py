@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 
 from rack.boards.config import CONFIGS, load, names
 from rack.boards.config.text import to_toml
-from rack.tools.answer import LONGEST_LINE
 from rack.tools.cli import run_commands
+from rack.tools.console.answer import LONGEST_LINE
 
 EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "300"))
 BOUND_S = 20

@@ -9,8 +9,8 @@ import pytest
 
 from rack.boards.config import load
 from rack.levels.timing.chart import Chart
-from rack.tools.answer import Failure
 from rack.tools.charting.measured import Run
+from rack.tools.console.answer import Failure
 from tests.tools.traces import EPOCH_NS, cycle, recorded
 
 TICK_US = 2000

@@ -11,11 +11,11 @@ import pytest
 
 from rack.boards.config import load
 from rack.boards.rack import Rack
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
 from rack.tools.replay import replay
+from rack.tools.runs.window import ViewerWindow
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.window import Window
 from tests.processes import RACK
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,7 +54,7 @@ def test_a_window_without_a_screen_says_what_to_do_elsewhere(monkeypatch: pytest
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(Failure, match=r"no screen: .*: rerun run\.rrd"):
-        Window("run.rrd")
+        ViewerWindow("run.rrd")
 
 
 def test_a_folder_without_a_recording_is_no_run_to_replay(tmp_path: Path) -> None:

@@ -13,12 +13,12 @@ import pytest
 
 from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
-from rack.tools.answer import Failure
 from rack.tools.charting.subject import subject_of
-from rack.tools.display import SilentDisplay
+from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
 from rack.tools.reporting.report import write_report
-from rack.tools.running import run_rack
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from tests.conftest import SMALL
 
 READERS: tuple[Callable[[Path], object], ...] = (

@@ -14,9 +14,9 @@ import pytest
 from rack.boards.config import load, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.operating.config import CommandConfig
-from rack.tools.answer import Failure
 from rack.tools.bench.response import Bench
-from rack.tools.progress import Silent
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Silent
 from rack.tools.recording import Recording
 from rack.tools.responding.course import Course, courses
 from rack.tools.responding.plot import plot

@@ -10,9 +10,8 @@ import numpy as np
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
 from rack.tools.charting.measured import Run
-from rack.tools.recorder.cycles import CyclesFile
-from rack.tools.recorder.signals import SignalsFile
 from rack.tools.recording import Recording
+from rack.tools.runs.parquet import CyclesFile, SignalsFile
 
 EPOCH_NS = 5_000_000_123
 US = 1_000

@@ -11,7 +11,7 @@ from rack.tools.analysis.breaches import Breach, breaches
 from rack.tools.analysis.comparison import Pair, compare
 from rack.tools.analysis.cycles import Cycles, cycles_of
 from rack.tools.analysis.model import Model
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
 from rack.tools.timing.level_timing import LevelTiming, level_timings
 from rack.tools.timing.measured import WORST, budgets_of

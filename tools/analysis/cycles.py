@@ -17,7 +17,7 @@ import numpy as np
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import FIELDS, Flag
 from rack.tools.analysis.occupation import Occupation
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
 
 START_UP_S = 0.1

@@ -12,7 +12,7 @@ from rack.tools.analysis.comparison import Pair
 from rack.tools.analysis.cycles import START_UP_S, Cycles, restarts
 from rack.tools.analysis.summary import summary, worst_words
 from rack.tools.analysis.tasks import task_document
-from rack.tools.text_table import table
+from rack.tools.console.tables import table
 from rack.tools.timing.level_timing import LevelTiming
 from rack.tools.timing.verdict import Verdict
 

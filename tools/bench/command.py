@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from rack.tools.answer import Json, print_json
-from rack.tools.interrupt import INTERRUPT
+from rack.tools.console.answer import Json, print_json
+from rack.tools.console.interrupt import INTERRUPT
 
-bench = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 
 Config = Annotated[str, typer.Option("--config", metavar="CONFIG", help="rack by name, or a path to a .toml file")]
 
@@ -45,8 +45,7 @@ def mailbox(as_json: Json = False) -> None:
 def recording(config: Config = "nasrem", as_json: Json = False) -> None:
     """Misses and lateness of a rack without a recorder, with it, and with a live viewer, interleaved."""
     from rack.tools.bench.recording import measure
-    from rack.tools.live_table import terminal_width
-    from rack.tools.text_table import table
+    from rack.tools.console.tables import table, terminal_width
 
     costs = measure(config)
     if as_json:
@@ -97,8 +96,8 @@ def partition(
     plan ages; and beside them what the timing model predicts of each from the budgets of the config.
     """
     from rack.tools.bench.partition import compare, lines_of
-    from rack.tools.live_table import print_wrapped, terminal_width
-    from rack.tools.progress import progress_for
+    from rack.tools.console.progress import progress_for
+    from rack.tools.console.tables import print_wrapped, terminal_width
 
     with progress_for(as_json) as progress:
         found = compare(config, seconds, rounds, progress)
@@ -125,8 +124,8 @@ def response(
     Exit status 1 where one does not, or is beyond a bound.
     """
     from rack.tools.bench.response import Bench
-    from rack.tools.live_table import print_wrapped, terminal_width
-    from rack.tools.progress import progress_for
+    from rack.tools.console.progress import progress_for
+    from rack.tools.console.tables import print_wrapped, terminal_width
 
     with progress_for(as_json) as progress:
         measured = Bench(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)

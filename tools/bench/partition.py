@@ -15,13 +15,13 @@ from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, budgets, load, timed_tasks, wire
 from rack.levels.timing.response_time import response_times
 from rack.tools.bench.partitions import PARTITIONS, Partition
-from rack.tools.display import display_for
-from rack.tools.progress import Progress
+from rack.tools.console.progress import Progress
+from rack.tools.console.tables import table
 from rack.tools.recording import Recording
 from rack.tools.reporting.statistics import Distribution, distribution
 from rack.tools.reporting.timing import plan_ages_ms
-from rack.tools.running import run_rack
-from rack.tools.text_table import table
+from rack.tools.runs.display import display_for
+from rack.tools.runs.launch import run_rack
 from rack.tools.timing.verdicts import context_switch_ns
 
 LAUNCH_S = 3.0

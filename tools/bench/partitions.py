@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from rack.boards.config import RackConfig, loads
 from rack.boards.config.schema import LAST_SLOT, BoardConfig, Coupling
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from typing import Any
 
 from rack.boards.config import load, wire
 from rack.boards.operating.config import CommandConfig
-from rack.tools.answer import Failure
-from rack.tools.progress import Progress
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
 from rack.tools.recording import Recording
 from rack.tools.responding.course import courses
 from rack.tools.responding.response import Response, response_of

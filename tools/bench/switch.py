@@ -24,7 +24,7 @@ import posix_ipc
 
 from rack.backplane.process import pin
 from rack.boards.processor import die_with_parent, set_priority
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.reporting.statistics import Distribution, distribution
 
 PAPER_US = 100.0

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from rack.boards.config import budgets
-from rack.tools.answer import Failure
 from rack.tools.charting.measured import Run
 from rack.tools.charting.panel import Panel
 from rack.tools.charting.scheduled import Schedule
 from rack.tools.charting.subject import Subject
 from rack.tools.charting.text import column_for, lines
 from rack.tools.charting.window import Wanted
+from rack.tools.console.answer import Failure
 
 NO_BUDGET = "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"
 

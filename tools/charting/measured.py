@@ -15,11 +15,11 @@ from rack.boards.config import RackConfig, timed_tasks
 from rack.levels.timing.budget import Budget
 from rack.levels.timing.chart import Chart, Job, Span
 from rack.levels.timing.tasks import TimedTask, Unit
-from rack.tools.answer import Failure
 from rack.tools.charting.lanes import Lane, lanes_of
 from rack.tools.charting.panel import Count, Panel
 from rack.tools.charting.patterns import Detail, Patterns, patterns
 from rack.tools.charting.stretches import Stretch, union, without
+from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
 
 SEQUENCES = {

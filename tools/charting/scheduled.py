@@ -11,10 +11,10 @@ from rack.boards.config import RackConfig, budgets, timed_tasks
 from rack.levels.timing.chart import Chart
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Part, Unit
-from rack.tools.answer import Failure
 from rack.tools.charting.lanes import lanes_of
 from rack.tools.charting.panel import Count, Panel
 from rack.tools.charting.patterns import Detail, patterns
+from rack.tools.console.answer import Failure
 
 SLICES = 10
 """Slices of the slowest task over which patterns are counted, at least."""

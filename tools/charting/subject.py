@@ -8,10 +8,10 @@ from pathlib import Path
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, load, wire
-from rack.tools.answer import Failure
 from rack.tools.charting.measured import Run
-from rack.tools.folders import RUNS
+from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
+from rack.tools.runs.folder import RUNS
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from rich.console import Console
 
-from rack.tools.holds import resume_command
+from rack.tools.console.tables import table
 from rack.tools.reporting.misses import counted
-from rack.tools.text_table import table
+from rack.tools.runs.holds import resume_command
 
 Report = dict[str, Any]
 

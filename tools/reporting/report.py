@@ -21,7 +21,7 @@ from rack.tools.reporting.motion import motion
 from rack.tools.reporting.response import system_response
 from rack.tools.reporting.steal import steal
 from rack.tools.reporting.timing import plan_age_ms, task_times
-from rack.tools.snapshot import TASK_STATUS
+from rack.tools.runs.snapshot import TASK_STATUS
 
 Report = dict[str, Any]
 

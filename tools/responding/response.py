@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 
 from rack.levels.operator import Answer, What
+from rack.tools.console.tables import table
 from rack.tools.recording import Recording
 from rack.tools.responding.course import Course, acting, courses
-from rack.tools.text_table import table
 
 Fate = Literal["acted on", "refused", "overtaken", "run over"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from rack.tools.answer import Failure, print_json
-from rack.tools.live_table import print_wrapped, terminal_width
+from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.tables import print_wrapped, terminal_width
 from rack.tools.recording import Recording
 from rack.tools.responding.plot import plot
 from rack.tools.responding.response import response_of

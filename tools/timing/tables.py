@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from rack.tools.text_table import table
+from rack.tools.console.tables import table
 from rack.tools.timing.level_timing import LevelTiming
 from rack.tools.timing.task_response import TaskResponse
 from rack.tools.timing.verdict import Verdict

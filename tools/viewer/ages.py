@@ -6,9 +6,7 @@ import numpy as np
 import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.tools.viewer.blocks import Block
-from rack.tools.viewer.stream import Stream
-from rack.tools.viewer.timelines import Ints
+from rack.tools.viewer.stream import Ints, RowBlock, Stream
 
 AGES = "ages"
 
@@ -24,7 +22,7 @@ class Age:
         self._upto = -1
         stream.static(self._lane, rr.SeriesLines(names=[f"{mailbox.name}, ms"]))
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Take messages down; they count from the tick at which they become visible."""
         self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
         self._made = np.concatenate((self._made, block.ticks))

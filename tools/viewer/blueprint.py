@@ -1,9 +1,11 @@
-"""The first look: what the viewer shows of a run, without a click."""
+"""The blueprint: what the viewer shows of a run at first, without a click."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
+import numpy as np
 import rerun.blueprint as rrb
 
 from rack.backplane.layout import Layout
@@ -12,20 +14,14 @@ from rack.levels.cell import Cell
 from rack.levels.messages import SERVO_STATUS
 from rack.tools.timing.prediction import hierarchy
 from rack.tools.viewer import ages, load
-from rack.tools.viewer.activity import LEVELS, LOG
-from rack.tools.viewer.document import CONFIG
-from rack.tools.viewer.events import EVENTS
-from rack.tools.viewer.eye import eye_on
-from rack.tools.viewer.fields import SIGNALS
+from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
+from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
+from rack.tools.viewer.events import EVENTS, RECORDER
 from rack.tools.viewer.gantt import BOARDS
-from rack.tools.viewer.geometry import CELL, COLLISION
-from rack.tools.viewer.hierarchy import COLUMN, HIERARCHY, ROW, positions
-from rack.tools.viewer.joints import ERROR, GRIPPER, JOINTS, QUANTITIES
-from rack.tools.viewer.lanes import lanes_view
-from rack.tools.viewer.own import RECORDER
-from rack.tools.viewer.poses import FRAMES
-from rack.tools.viewer.stream import path
-from rack.tools.viewer.timelines import SIM_TIME
+from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, LOG, ROW, positions
+from rack.tools.viewer.sink import CONFIG
+from rack.tools.viewer.stream import SIM_TIME, path
+from rack.tools.viewer.style import lanes_view
 
 CYCLES_S = 0.022
 """What the Gantt lanes show before and behind the time that is looked at: some cycles of fast and of slower boards."""
@@ -120,3 +116,24 @@ def _curves(name: str, contents: list[str], legend: bool = True) -> rrb.View:
 
 def _all(entity: str) -> str:
     return f"{path(entity)}/**"
+
+
+DIRECTION = np.array([0.75, -0.95, 0.55])
+"""From what is looked at to the eye: from the front right, a little above."""
+DISTANCE = 1.75
+"""In radii of what is looked at: it fills the view, a raised arm included."""
+ENDLESS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+
+
+def eye_on(cell: Cell) -> rrb.EyeControls3D:
+    """Return the eye's place for a cell at its start; ground does not count."""
+    model, data = cell.model, cell.start()
+    geoms = np.flatnonzero(~np.isin(model.geom_type, ENDLESS))
+    radii = model.geom_rbound[geoms, None]
+    low = (data.geom_xpos[geoms] - radii).min(axis=0, initial=np.inf)
+    high = (data.geom_xpos[geoms] + radii).max(axis=0, initial=-np.inf)
+    if not np.isfinite([low, high]).all():
+        low, high = model.stat.center - model.stat.extent, model.stat.center + model.stat.extent
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
+    return rrb.EyeControls3D(position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1))

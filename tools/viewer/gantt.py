@@ -6,10 +6,8 @@ import numpy as np
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import Flag
-from rack.tools.viewer.blocks import Block
-from rack.tools.viewer.lanes import style_lane, write_spans
-from rack.tools.viewer.palette import PHASES
-from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.stream import RowBlock, Stream
+from rack.tools.viewer.style import PHASES, style_lane, write_spans
 
 BOARDS = "boards"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
@@ -20,7 +18,7 @@ def lane_of(task: TaskSpec) -> tuple[str, ...]:
     return (BOARDS, f"{task.slot}-{task.board}", task.role)
 
 
-class Gantt:
+class CycleLanes:
     """Writes trace records as spans: read, process or plan, write, wait. What was missed is red.
 
     In real time a span lies where it was on the wall clock, scaled to simulated time. In lockstep, where the wall
@@ -34,7 +32,7 @@ class Gantt:
         self._work = "process" if task.role == "executor" else "plan"
         style_lane(stream, self._lane, PHASES, quiet=["wait"])
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Write four spans a cycle."""
         rows = block.rows
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)

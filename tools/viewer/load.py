@@ -6,9 +6,8 @@ import numpy as np
 import rerun as rr
 
 from rack.backplane.layout import TaskSpec
-from rack.tools.viewer.blocks import Block
-from rack.tools.viewer.palette import LIMIT, of_joint
-from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.stream import RowBlock, Stream
+from rack.tools.viewer.style import LIMIT, of_joint
 
 LOAD, TIMES = "load", "times"
 
@@ -26,7 +25,7 @@ class Load:
         stream.static((TIMES, task.name), rr.SeriesLines(names=curves, colors=[of_joint(1), of_joint(0), LIMIT]))
         stream.static((LOAD, task.name), rr.SeriesLines(names=[f"{task.name}, %"]))
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Write every cycle; 100 % is the deadline."""
         rows = block.rows
         lateness = rows["start_ns"] - rows["release_ns"]

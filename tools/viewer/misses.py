@@ -7,11 +7,9 @@ import rerun as rr
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import Flag
-from rack.tools.viewer.activity import LEVELS, LOG
-from rack.tools.viewer.blocks import Block
-from rack.tools.viewer.lanes import style_lane, write_spans
-from rack.tools.viewer.palette import PHASES
-from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.levels import LEVELS, LOG
+from rack.tools.viewer.stream import RowBlock, Stream
+from rack.tools.viewer.style import PHASES, style_lane, write_spans
 
 MISSED = "missed"
 SPAN_S = 0.25
@@ -30,7 +28,7 @@ class Misses:
         self._span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
         self._is_styled = False
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Write what was missed."""
         missed = np.flatnonzero(block.rows["flags"] & Flag.MISSED)
         if not len(missed):

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from rack.tools.answer import Failure
-from rack.tools.viewer.timelines import SIM_TIME
-from rack.tools.viewer.window import HOST, Window, free_port, url
+from rack.tools.console.answer import Failure
+from rack.tools.runs.window import HOST, ViewerWindow, free_port, url
+from rack.tools.viewer.stream import SIM_TIME
 
 PATIENCE_S = 30.0
 LOOK_S = 0.05
@@ -83,7 +83,7 @@ def opened(recording: Path) -> Iterator[Screen]:
     """Open a recording in a headless viewer. Raises `NoViewerError` where the machine lacks the graphics libraries."""
     port = free_port()
     # Started here: the viewer that `ViewerClient.spawn` starts listens to every machine around.
-    window = Window(headless=True, port=port)
+    window = ViewerWindow(headless=True, port=port)
     try:
         client = _connected(window, port)
         try:
@@ -95,7 +95,7 @@ def opened(recording: Path) -> Iterator[Screen]:
         window.close()
 
 
-def _connected(window: Window, port: int) -> ViewerClient:
+def _connected(window: ViewerWindow, port: int) -> ViewerClient:
     deadline = time.monotonic() + PATIENCE_S
     while window.is_open and time.monotonic() < deadline:
         with socket.socket() as probe:
@@ -105,7 +105,7 @@ def _connected(window: Window, port: int) -> ViewerClient:
     raise NoViewerError(_why(window, f"it does not listen after {PATIENCE_S:g} s"))
 
 
-def _why(window: Window, otherwise: object) -> str:
+def _why(window: ViewerWindow, otherwise: object) -> str:
     """Return why there is no picture, and what helps on a machine without a graphics card."""
     with suppress(TimeoutError):
         window.await_end(DYING_S)

@@ -1,32 +1,43 @@
-"""A recorder's rows as a recording for the viewer: taken as they are drained, written in blocks."""
+"""The recorder's rows as a recording for the viewer: taken as they are drained, written in blocks."""
 
 from __future__ import annotations
 
+import platform
+from collections import defaultdict
 from collections.abc import Mapping
 from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
-from rack.boards.config import loads
+from rack.boards.config import RackConfig, loads
+from rack.levels.cell import Cell
+from rack.levels.messages import (
+    ARM_STATE,
+    JOINT_SET_POINT,
+    MOVE_PLAN,
+    MOVE_STATUS,
+    SCENE,
+    SERVO_STATUS,
+    TASK_PLAN,
+    WORLD_MODEL,
+)
 from rack.tools.timing.prediction import hierarchy
 from rack.tools.viewer.ages import Age
-from rack.tools.viewer.blocks import Block, Part
 from rack.tools.viewer.blueprint import blueprint
-from rack.tools.viewer.document import write_document
-from rack.tools.viewer.events import Events
-from rack.tools.viewer.gantt import Gantt
-from rack.tools.viewer.geometry import write_geometry
-from rack.tools.viewer.hierarchy import Hierarchy
+from rack.tools.viewer.cell import CurrentGoal, Goals, PlannedPath, Poses, write_geometry
+from rack.tools.viewer.curves import Fields, Joints
+from rack.tools.viewer.events import Events, Losses
+from rack.tools.viewer.gantt import CycleLanes
+from rack.tools.viewer.levels import Activity, Commanded, Hierarchy, Moves
 from rack.tools.viewer.load import Load
 from rack.tools.viewer.misses import Misses
-from rack.tools.viewer.own import Losses
-from rack.tools.viewer.parts import parts_of
-from rack.tools.viewer.stream import Stream
-from rack.tools.viewer.timelines import Timelines
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart
 
 FILE = "run.rrd"
 BLOCK_S = 1.0
@@ -61,9 +72,9 @@ class ViewSink:
         lockstep, period_ns = bool(words[System.LOCKSTEP]), words[System.PERIOD_NS]
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
-        self._of_task: dict[str, list[Part]] = {
+        self._of_task: dict[str, list[ViewPart]] = {
             task.name: [
-                Gantt(stream, task, speed, lockstep),
+                CycleLanes(stream, task, speed, lockstep),
                 Load(stream, task, slice_ns, lockstep),
                 Misses(stream, task),
             ]
@@ -112,12 +123,12 @@ class ViewSink:
         if self._fastest in cycles:
             self._times.learn(cycles[self._fastest]["tick"], cycles[self._fastest]["start_ns"])
         for task, rows in cycles.items():
-            block = Block(rows, "start_ns", self._times)
+            block = RowBlock(rows, "start_ns", self._times)
             for part in self._of_task[task]:
                 part.write(block)
             self._hierarchy.write(task, block)
         for mailbox, rows in signals.items():
-            block = Block(rows, "stamp_ns", self._times)
+            block = RowBlock(rows, "stamp_ns", self._times)
             for part in self._of_mailbox[mailbox]:
                 part.write(block)
             if mailbox in self._ages:
@@ -134,3 +145,69 @@ def _taken(waiting: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     for blocks in waiting.values():
         blocks.clear()
     return taken
+
+
+SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
+"""Messages whose numbers nobody reads as curves."""
+
+
+def parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> Mapping[str, list[ViewPart]]:
+    """Return the parts by mailbox."""
+    parts: dict[str, list[ViewPart]] = defaultdict(list)
+    for mailbox in layout.mailboxes:
+        parts[mailbox.name] += _of_any(stream, mailbox)
+    if cell is not None and config.robot is not None:
+        goals = Goals(stream, config.scene.bodies)
+        for mailbox in layout.mailboxes:
+            parts[mailbox.name] += _of_arm(stream, mailbox, config, cell, goals)
+    return parts
+
+
+def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
+    names = {field.name for field in mailbox.fields}
+    parts: list[ViewPart] = []
+    if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
+        parts.append(Activity(stream, mailbox))
+    elif mailbox.name.endswith(".command") and "id" in names and mailbox.message != JOINT_SET_POINT.name:
+        parts.append(Commanded(stream, mailbox))
+    if mailbox.message == MOVE_STATUS.name:
+        parts.append(Moves(stream, mailbox))
+    if mailbox.message not in (*SHOWN_IN_3D, SERVO_STATUS.name):
+        parts.append(Fields(stream, mailbox))
+    return parts
+
+
+def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals) -> list[ViewPart]:
+    robot = config.robot
+    assert robot is not None, "there is an arm"
+    match mailbox.message:
+        case ARM_STATE.name:
+            return [Poses(stream, cell, config.clock_ns)]
+        case SERVO_STATUS.name:
+            return [Joints(stream, robot.joints, cell, robot.gripper is not None)]
+        case MOVE_PLAN.name:
+            return [PlannedPath(stream, cell)]
+        case TASK_PLAN.name:
+            return [goals]
+        case MOVE_STATUS.name:
+            return [CurrentGoal(goals)]
+        case _:
+            return []
+
+
+CONFIG = "config"
+
+
+def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout) -> None:
+    """Log the resolved config, and what run this is."""
+    stream.static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))
+    values = rr.AnyValues(
+        rack=layout.rack,
+        mode=config.clock.mode,
+        speed=config.clock.speed,
+        clock_ms=layout.clock_ns * 1e-6,
+        tasks=[task.name for task in layout.tasks],
+        robot=str(config.robot.model.stem) if config.robot else "none",
+        machine=platform.platform(),
+    )
+    stream.property("run", values)
