@@ -10,7 +10,7 @@ import typer
 from rack.tools.console.answer import Failure, Json, RackName, print_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.tables import terminal_width
-from rack.tools.runs.desk import OperatorDesk
+from rack.tools.runs.desk import LiveDesk
 from rack.tools.runs.holds import resume_command
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
@@ -68,7 +68,7 @@ def command(
       rack command nasrem task goto position=0.45,0.1,0.95
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
     """
-    desk = OperatorDesk(rack)
+    desk = LiveDesk(rack)
     if is_list:
         print_json(desk.levels()) if as_json else print("\n".join(desk.text(terminal_width())))
         return

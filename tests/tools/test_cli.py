@@ -66,7 +66,7 @@ def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
 def test_bytes_that_are_no_text_are_refused() -> None:
     command = [*RACK, "check", b"\xff"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
-    assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": is no UTF-8\n')
+    assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": not UTF-8\n')
 
 
 @pytest.mark.parametrize(

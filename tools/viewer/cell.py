@@ -15,10 +15,19 @@ from rack.tools.viewer.shapes import shape_of, xyzw
 from rack.tools.viewer.stream import Changes, RowBlock, Stream
 from rack.tools.viewer.style import CURRENT, GOAL, PLANNED
 
-CELL, COLLISION = "cell", "collision"
+CELL, COLLISION, FRAMES = "cell", "collision", "frames"
 WORLD = "world"
 SHOWN_GROUPS = 3
-"""MuJoCo's own viewer shows groups 0, 1, 2; those above hold collision shapes, by custom."""
+"""MuJoCo's own viewer shows groups 0, 1, 2; by convention those above hold collision shapes."""
+POSES_S = 0.02
+"""Time between poses: the rate of a screen."""
+TOOL = (CELL, "tool")
+TOOL_COLOUR = (230, 60, 200)
+PATH, WAYPOINTS = (CELL, "planned_path"), (CELL, "way_points")
+GOALS, CURRENT_GOAL = (CELL, "goals"), (CELL, "current_goal")
+STEP_RAD = 0.03
+"""A straight line in joint space is a curve of the tool: it is drawn in pieces of at most this length."""
+POINT_M, LINE_M = 0.008, 0.003
 
 
 def frame_of(model: mujoco.MjModel, body: int) -> str:
@@ -27,7 +36,7 @@ def frame_of(model: mujoco.MjModel, body: int) -> str:
 
 
 def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
-    """Return the bodies that joints or their own will move, and all that hang on them."""
+    """Return the bodies moved by joints or as mocap bodies, and all attached to them."""
     moves = np.zeros(model.nbody, dtype=bool)
     for body in range(1, model.nbody):  # parents come first
         own = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
@@ -36,7 +45,7 @@ def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
 
 
 def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Log all geoms, and the frames that never move as `data` has them."""
+    """Log all geoms, and the frames that never move with their poses in `data`."""
     stream.static((CELL,), rr.CoordinateFrame(WORLD))
     shown = {geom: _is_shown(model, geom) for geom in range(model.ngeom)}
     for geom in shown:
@@ -51,7 +60,7 @@ def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -
             parent_frame=WORLD,
             child_frame=frame_of(model, body),
         )
-        stream.static(("frames", frame_of(model, body)), pose)
+        stream.static((FRAMES, frame_of(model, body)), pose)
 
 
 def _is_shown(model: mujoco.MjModel, geom: int) -> bool:
@@ -64,15 +73,8 @@ def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
     return (CELL, *(() if shown else (COLLISION,)), body, name)
 
 
-FRAMES = "frames"
-POSES_S = 0.02
-"""Time from pose to pose: what a screen can show."""
-TOOL = (CELL, "tool")
-TOOL_COLOUR = (230, 60, 200)
-
-
 class Poses:
-    """Writes `ARM_STATE`s as poses: MuJoCo's own kinematics of the recorded state."""
+    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the way of the tool."""
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
@@ -114,15 +116,8 @@ class Poses:
         self._stream.columns((FRAMES,), times.columns(np.repeat(ticks, count), np.repeat(stamps, count)), poses)
 
 
-PATH, WAYPOINTS = (CELL, "planned_path"), (CELL, "way_points")
-GOALS, CURRENT_GOAL = (CELL, "goals"), (CELL, "current_goal")
-STEP_RAD = 0.03
-"""A straight line of the joints is a curve of the tool: drawn in pieces of at most that."""
-POINT_M, LINE_M = 0.008, 0.003
-
-
 class PlannedPath:
-    """Writes `MOVE_PLAN`s, from the tick at which they can be used."""
+    """Writes `MOVE_PLAN`s as a line of the tool point with its way points, from the tick at which they are visible."""
 
     def __init__(self, stream: Stream, cell: Cell) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
@@ -130,7 +125,7 @@ class PlannedPath:
             stream.static(entity, rr.CoordinateFrame(WORLD))
 
     def write(self, block: RowBlock) -> None:
-        """Write every plan; one for the gripper clears the path."""
+        """Write every plan; a plan for the gripper clears the path."""
         for row in range(len(block.rows)):
             plan, tick = block.messages[row], int(block.rows["visible_at"][row])
             moves = plan["kind"] == SegmentKind.PATH and not plan["error"]
@@ -159,7 +154,7 @@ def in_pieces(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Goals:
-    """Writes where a `TASK_PLAN` puts its objects down, and the end of the move under way."""
+    """Writes the places where a `TASK_PLAN` puts its objects down, and the goal of the current move."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream, self._objects = stream, objects

@@ -12,14 +12,17 @@ from rack.levels.cell import Cell
 from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
 
+SIGNALS = "signals"
+MAX_CURVES = 16
+"""Fields with more numbers than this are tables, not curves; they are in signals.parquet."""
 JOINTS, ERROR, GRIPPER = "joints", "tracking_error", "gripper"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
-"""Curves of a joint and their units; a torque is what the arm was given, behind the limit gate."""
+"""Curves of a joint and their units; the torque is the one applied, after the limit gate."""
 _COMMANDED = {"position": "target", "velocity": "target_velocity"}
 
 
 class Joints:
-    """Writes `SERVO_STATUS`es."""
+    """Writes `SERVO_STATUS`es: measured against commanded, the limits, the tracking error and the gripper."""
 
     def __init__(self, stream: Stream, names: tuple[str, ...], cell: Cell, has_gripper: bool) -> None:
         self._stream, self._names, self._has_gripper = stream, names, has_gripper
@@ -56,7 +59,7 @@ class Joints:
             self._stream.scalars((GRIPPER, "force"), times, messages["grip_force"])
 
     def _write_limits(self, block: RowBlock) -> None:
-        # A straight line needs its ends alone.
+        # A straight line needs only its ends.
         ends = [0, -1]
         times = self._stream.times.columns(block.ticks[ends], block.stamps_ns[ends])
         for quantity, limits in self._limits.items():
@@ -68,17 +71,12 @@ def _style(name: str, at: int, quantity: str, unit: str) -> rr.SeriesLines:
     if quantity not in _COMMANDED:
         return rr.SeriesLines(names=[f"{name} given, {unit}"], colors=[of_joint(at)])
     names = [f"{name} commanded, {unit}", f"{name} measured, {unit}"]
-    # The one below is the wider: it shows on both sides where the two agree.
+    # The lower one is wider: it shows on both sides where the two agree.
     return rr.SeriesLines(names=names, colors=[COMMANDED, of_joint(at)], widths=[2.5, 1.0])
 
 
-SIGNALS = "signals"
-MOST_CURVES = 16
-"""Fields with more numbers than this are tables, no curves; the Parquet file has them."""
-
-
 class Fields:
-    """Writes every numeric field of a mailbox, as it was written."""
+    """Writes every numeric field of a mailbox: a user's own messages show without any configuration."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream = stream
@@ -99,4 +97,4 @@ class Fields:
 
 def is_curve(field: FieldSpec) -> bool:
     """Return whether a field can be shown as curves."""
-    return not field.fields and field.kind[1] in "iufb" and 0 < prod(field.shape) <= MOST_CURVES
+    return not field.fields and field.kind[1] in "iufb" and 0 < prod(field.shape) <= MAX_CURVES

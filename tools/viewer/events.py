@@ -1,4 +1,4 @@
-"""Log lines: what happened to the rack, from its event log, and the recorder's own losses and load.
+"""Log lines: the rack's events, from its event log, and the recorder's own losses and load.
 
 Each board also has a lane: the kind of its last event, until the next."""
 
@@ -16,11 +16,11 @@ from rack.tools.viewer.levels import LOG, Hierarchy
 from rack.tools.viewer.stream import Stream
 from rack.tools.viewer.style import EVENT_COLOURS, style_lane, write_span
 
-EVENTS = "events"
+EVENTS, RECORDER = "events", "recorder"
 UNSHOWN = ("printed", "miss")
-"""Events that are in the log alone: misses have lanes of their own."""
+"""Events without a lane: misses have their own."""
 RACK = "rack"
-"""Lane of events that are of no board."""
+"""Lane of events that belong to no board."""
 LEVELS = {
     "died": "ERROR",
     "detection": "ERROR",
@@ -30,7 +30,7 @@ LEVELS = {
     "miss": "DEBUG",
     "printed": "DEBUG",
 }
-"""Log levels by kind of event; of any other it is INFO."""
+"""Log levels by kind of event; INFO for any other."""
 
 
 class Events:
@@ -47,7 +47,7 @@ class Events:
             return
         with self._path.open("rb") as file:
             file.seek(self._read)
-            # A line that is still being written is read the next time.
+            # A line still being written is read the next time.
             lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
@@ -73,34 +73,31 @@ class Events:
     def _show(self, tick: int, stamp_ns: int, board: str, kind: str, code: str) -> None:
         if board not in self._lanes:
             style_lane(self._stream, (EVENTS, board), EVENT_COLOURS)
-        # The end of a fault ends its span, and nothing that came of it meanwhile.
+        # The end of a fault ends its own span only, not that of a later event.
         if code == "ends" and self._lanes.get(board) != kind:
             return
         self._lanes[board] = "" if code == "ends" else kind
         write_span(self._stream, tick, stamp_ns, (EVENTS, board), self._lanes[board])
 
 
-RECORDER = "recorder"
-
-
 class Losses:
-    """Writes how many rows were overwritten before they could be taken; every loss is a log line too."""
+    """Writes how many rows were overwritten before the recorder took them, and its load; logs every loss."""
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
-        self._told: dict[str, int] = {}
+        self._logged: dict[str, int] = {}
         stream.static((RECORDER, "rows_lost"), rr.SeriesLines(names=["rows lost"], colors=[(230, 50, 50)]))
         stream.static((RECORDER, "load"), rr.SeriesLines(names=["recorder, % of a core"]))
         self._cpu_s, self._wall_s = time.process_time(), time.monotonic()
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write the losses and the load up to now."""
+        """Write the losses and the load since the last call."""
         stamp_ns = time.monotonic_ns()
         for ring, count in lost.items():
-            if count > self._told.get(ring, 0):
-                line = rr.TextLog(f"recorder: {count - self._told.get(ring, 0)} rows of {ring} lost", level="ERROR")
+            if count > self._logged.get(ring, 0):
+                line = rr.TextLog(f"recorder: {count - self._logged.get(ring, 0)} rows of {ring} lost", level="ERROR")
                 self._stream.at(tick, stamp_ns, (LOG, "recorder"), line)
-        self._told = dict(lost)
+        self._logged = dict(lost)
         self._stream.at(tick, stamp_ns, (RECORDER, "rows_lost"), rr.Scalars(sum(lost.values())))
         cpu_s, wall_s = time.process_time(), time.monotonic()
         share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)

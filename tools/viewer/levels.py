@@ -16,6 +16,9 @@ from rack.tools.viewer.stream import Changes, RowBlock, Stream
 from rack.tools.viewer.style import STATES, style_lane, write_spans
 
 LEVELS, LOG = "levels", "log"
+HIERARCHY = "hierarchy"
+ROW, COLUMN = 45.0, 110.0
+"""Distance between nodes, in the graph's units; a letter is about 7 wide."""
 
 
 class Activity:
@@ -42,7 +45,7 @@ class Activity:
 
 
 class Commanded:
-    """Writes the serial of the command that a mailbox holds."""
+    """Writes the serial of the command in a mailbox."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         board, _, port = mailbox.name.partition(".")
@@ -58,7 +61,7 @@ class Commanded:
 
 
 class Moves:
-    """Writes the elemental move under way, of `MOVE_STATUS`es, by its verb."""
+    """Writes the current elemental move of `MOVE_STATUS`es, by its verb."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream, self._lane = stream, (LEVELS, mailbox.name.partition(".")[0], "move")
@@ -81,15 +84,10 @@ def _times(stream: Stream, block: RowBlock, rows: np.ndarray) -> list[rr.TimeCol
     return stream.times.columns(block.ticks[rows], block.stamps_ns[rows])
 
 
-HIERARCHY = "hierarchy"
-ROW, COLUMN = 45.0, 110.0
-"""From node to node, in the graph's units: about the width of a letter is 7."""
-
-
 class Hierarchy:
-    """Writes the tasks as nodes, levels above each other, whenever the state of one changes.
+    """Writes the tasks as nodes of a graph, coloured by state, whenever a state changes.
 
-    Edges go down with commands and from planners with plans; a board outside the hierarchy stands beside it.
+    Levels are above each other, other boards to the left. Edges go down with commands, and from planners with plans.
     """
 
     def __init__(self, stream: Stream, layout: Layout, levels: tuple[str, ...]) -> None:
@@ -104,7 +102,7 @@ class Hierarchy:
         self._log(0, int(stream.times.stamps_of(np.zeros(1, dtype=np.int64))[0]))
 
     def write(self, task: str, block: RowBlock) -> None:
-        """Take down where a task's state changes."""
+        """Note where a task's state changes."""
         names = _names(block.rows)
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero(names != before):
@@ -112,19 +110,19 @@ class Hierarchy:
         self._states[task] = str(names[-1])
 
     def lose(self, tick: int, stamp_ns: int, board: str) -> None:
-        """Take down that a board ended or hangs."""
+        """Note that a board died or does not respond."""
         if board in self._states:
             self._changes.append((tick, stamp_ns, board, "lost"))
             self._states[board] = "lost"
 
     def recover(self, tick: int, stamp_ns: int, board: str) -> None:
-        """Take down that a board that was lost is back; what it is at, its cycles tell."""
+        """Note that a lost board is back; its state follows from its cycles."""
         if self._states.get(board) == "lost":
             self._changes.append((tick, stamp_ns, board, "idle"))
             self._states[board] = "idle"
 
     def advance(self) -> None:
-        """Write what has been taken down, in the order of time."""
+        """Write what was noted, in the order of time."""
         if not self._changes:
             return
         shown = dict(self._shown)
@@ -145,19 +143,19 @@ class Hierarchy:
 
 
 def _label(task: str) -> str:
-    """Return what stands in a task's node: a planner stands beside its board's."""
+    """Return the label of a task's node; a planner's node is next to its board's."""
     return task.partition(".")[2] or task
 
 
 def _names(rows: np.ndarray) -> np.ndarray:
-    """Return what to show of each trace record: the level's state, or that the cycle was missed."""
+    """Return the state of the level in each trace record, or "missed"."""
     names = np.array([state.name.lower() for state in State] + ["missed"])
     shown = np.where((rows["flags"] & Flag.MISSED) > 0, len(names) - 1, rows["state"])
     return np.asarray(names[shown])
 
 
 def positions(layout: Layout, levels: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    """Return where the tasks stand: levels in the middle, their planners to the right, other boards to the left."""
+    """Return the places of the tasks: levels in the middle, their planners to the right, other boards to the left."""
     others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in levels]
     rows = {board: row for row, board in enumerate(levels)} | {board: row for row, board in enumerate(others)}
     columns = dict.fromkeys(levels, 0) | dict.fromkeys(others, -1)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import platform
 from collections import defaultdict
 from collections.abc import Mapping
 from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
-import rerun as rr
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
 from rack.boards.config import RackConfig, loads
-from rack.levels.cell import Cell
+from rack.levels.cell import Cell, build_cell
 from rack.levels.messages import (
     ARM_STATE,
     JOINT_SET_POINT,
@@ -29,7 +27,7 @@ from rack.levels.messages import (
 )
 from rack.tools.timing.prediction import hierarchy
 from rack.tools.viewer.ages import Age
-from rack.tools.viewer.blueprint import blueprint
+from rack.tools.viewer.blueprint import blueprint, write_document
 from rack.tools.viewer.cell import CurrentGoal, Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses
@@ -39,27 +37,27 @@ from rack.tools.viewer.load import Load
 from rack.tools.viewer.misses import Misses
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart
 
+SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
+"""Messages whose numbers are not shown as curves."""
 FILE = "run.rrd"
 BLOCK_S = 1.0
-"""Simulated time in one block: a call costs the same for 4 rows and for 400."""
+"""Simulated time in one block: a call costs the same for 4 rows as for 400."""
 
 
 def next_file(folder: Path) -> Path:
-    """Return the file to write: a recorder that was started again leaves run.rrd alone and writes run-2.rrd."""
+    """Return the file to write: a restarted recorder does not overwrite run.rrd, and writes run-2.rrd."""
     names = chain([FILE], (f"run-{part}.rrd" for part in count(2)))
     return next(folder / name for name in names if not (folder / name).is_file())
 
 
 class ViewSink:
-    """Writes run.rrd of one rack into `folder`; with a port, serves it to a viewer of this machine as well."""
+    """Writes run.rrd of one rack into `folder`; with a port, also serves it to a viewer on this machine."""
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
         layout, words = segment.layout, segment.words
         config = loads(segment.config)
         cell = None
         if config.robot is not None:
-            from rack.levels.cell import build_cell
-
             cell = build_cell(config.robot, config.scene, config.clock_ns)
         self._times = Timelines(layout.clock_ns)
         view = blueprint(layout, config, cell, live=port is not None)
@@ -68,7 +66,7 @@ class ViewSink:
         write_document(stream, segment.config, config, layout)
         if cell is not None:
             write_geometry(stream, cell.model, cell.start())
-        self._of_mailbox = parts_of(stream, layout, config, cell)
+        self._of_mailbox = _parts_of(stream, layout, config, cell)
         lockstep, period_ns = bool(words[System.LOCKSTEP]), words[System.PERIOD_NS]
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
@@ -80,7 +78,7 @@ class ViewSink:
             ]
             for task in layout.tasks
         }
-        # An operator's mailbox has no age: commands come now and then.
+        # An operator's mailbox has no age: it is not written periodically.
         periodic = [mailbox for mailbox in layout.mailboxes if mailbox.writer != CLOCK]
         self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
         self._hierarchy = Hierarchy(stream, layout, hierarchy(config))
@@ -103,7 +101,7 @@ class ViewSink:
             self._signals[mailbox].append(rows)
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write a block when one is full: everything before `tick` has been taken. `lost` counts rows by ring.
+        """Write a block if one is full; everything before `tick` has been taken. `lost` counts rows by ring.
 
         Raises `RuntimeError` when the file cannot be written.
         """
@@ -147,12 +145,8 @@ def _taken(waiting: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     return taken
 
 
-SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
-"""Messages whose numbers nobody reads as curves."""
-
-
-def parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> Mapping[str, list[ViewPart]]:
-    """Return the parts by mailbox."""
+def _parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> Mapping[str, list[ViewPart]]:
+    """Return the parts of the view by mailbox: chosen by message types, so that any rack has a view."""
     parts: dict[str, list[ViewPart]] = defaultdict(list)
     for mailbox in layout.mailboxes:
         parts[mailbox.name] += _of_any(stream, mailbox)
@@ -193,21 +187,3 @@ def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell
             return [CurrentGoal(goals)]
         case _:
             return []
-
-
-CONFIG = "config"
-
-
-def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout) -> None:
-    """Log the resolved config, and what run this is."""
-    stream.static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))
-    values = rr.AnyValues(
-        rack=layout.rack,
-        mode=config.clock.mode,
-        speed=config.clock.speed,
-        clock_ms=layout.clock_ns * 1e-6,
-        tasks=[task.name for task in layout.tasks],
-        robot=str(config.robot.model.stem) if config.robot else "none",
-        machine=platform.platform(),
-    )
-    stream.property("run", values)

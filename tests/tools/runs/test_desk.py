@@ -18,7 +18,7 @@ from rack.boards.config import load
 from rack.boards.rack import Rack
 from rack.tools.command import LiveDesk, goal_of
 from rack.tools.console.answer import Failure
-from rack.tools.runs import desk as patience
+from rack.tools.runs import desk
 from rack.tools.runs.desk import Replies
 from tests.boards.told_racks import TOLD
 from tests.processes import RACK, wait_until
@@ -86,7 +86,7 @@ def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     running: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A level that never comes to an end with it.
-    monkeypatch.setattr(Replies, "look", lambda answers: replace(answers.told, fate="taken", taken_up=0))
+    monkeypatch.setattr(Replies, "look", lambda replies: replace(replies.reply, fate="taken", taken_up=0))
     still = f", not done; in force until: rack command {running} upper resume$"
     with pytest.raises(Failure, match=f"^timed out after 0 s: command .*{still}"):
         LiveDesk(running).give({"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0)
@@ -121,8 +121,8 @@ REFUSED = {
     "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
     "not for this level": (("lower", "setpoint", "joints=1"), "'lower' takes no setpoint; it takes: hold, resume"),
     "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' has one of: home"),
-    "no word": (("upper", "goto", "hom"), "'hom' is no goal; permitted: home, joints=..., position=..."),
-    "no number": (("upper", "goto", "joints=1,x"), "'joints=1,x': 'x' is not a number; permitted: numbers with commas"),
+    "no word": (("upper", "goto", "hom"), "'hom': not a goal; permitted: home, joints=..., position=..."),
+    "no number": (("upper", "goto", "joints=1,x"), "'joints=1,x': 'x' is not a number; permitted: numbers separated by commas"),
     "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),
     "a tick that has passed": (("upper", "hold", "--tick", "0"), "tick = 0: has passed; the rack is at tick "),
 }
@@ -173,12 +173,12 @@ def test_a_rack_that_ends_meanwhile_is_told(tmp_path: Path) -> None:
 def test_a_clock_without_ticks_is_not_waited_for(
     rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patience, "SILENT_S", 0.05)
+    monkeypatch.setattr(desk, "SILENT_S", 0.05)
     path = tmp_path / "told.toml"
     path.write_text(TOLD)
     # Launched and not started: there is a rack, and no clock yet.
     with Rack(load(path, [f"name={rack_name}"])):
-        with pytest.raises(Failure, match="no tick for"):
+        with pytest.raises(Failure, match="has not ticked for"):
             LiveDesk(rack_name).give({"level": "upper", "what": "hold"}, wait=False)
         assert OperatorTable(Segment.attach(rack_name)).waiting() == []
 

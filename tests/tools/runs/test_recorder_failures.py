@@ -17,14 +17,14 @@ from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
 from rack.boards.rack import Rack
 from rack.tools.console.answer import Failure
-from rack.tools.recorder.recorder import Recorder, SideSink
+from rack.tools.recorder.recorder import Recorder, SafeSink
 from rack.tools.recording import Recording
 from rack.tools.reporting.report import write_report
-from rack.tools.runs import recorder_process as process
+from rack.tools.runs import recorder_process
 from rack.tools.runs.display import SilentDisplay
-from rack.tools.runs.launch import LATE, run_rack
+from rack.tools.runs.launch import NO_RECORDER, run_rack
 from rack.tools.runs.snapshot import Snapshot
-from rack.tools.runs.spool import NAME, mend
+from rack.tools.runs.spool import SPOOL, mend
 from rack.tools.runs.window import executable
 from rack.tools.viewer.reading import read
 from tests.processes import children_of
@@ -68,11 +68,11 @@ class Failing:
 def test_a_sink_that_fails_is_told_of_once_and_left_alone() -> None:
     told: list[str] = []
     sink = Failing()
-    beside = SideSink(lambda: sink, told.append)
+    safe = SafeSink(lambda: sink, told.append)
     for tick in range(5):
-        beside.add_cycles("servo", np.zeros(1))
-        beside.advance(tick, {})
-    beside.close(5, {})
+        safe.add_cycles("servo", np.zeros(1))
+        safe.advance(tick, {})
+    safe.close(5, {})
     assert told == ["run.rrd ends here: the disk is full"]
     assert sink.blocks == 2
 
@@ -167,13 +167,13 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config:
 def test_what_a_killed_recorder_took_is_readable(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "RESTARTS", 0)
+    monkeypatch.setattr(recorder_process, "RESTARTS", 0)
     result = run_rack(realtime(config), 3.0, tmp_path / "run", AtTick(signal.SIGKILL))
     assert result.worked
     assert result.recording == "the recorder ended with status -9"
     report, _ = write_report(tmp_path / "run")
     assert report["worked"]
-    assert told(Recording(tmp_path / "run")) == ["the recorder ended with status -9; the rack runs on, unrecorded"]
+    assert told(Recording(tmp_path / "run")) == ["the recorder ended with status -9; the run continues, unrecorded"]
     ticks = pq.read_table(tmp_path / "run" / "signals.parquet", columns=["tick"])["tick"].to_numpy()
     assert ticks.max() > FIRST_BLOCK / 2
     repaired = tmp_path / "repaired.rrd"
@@ -192,17 +192,17 @@ def test_a_recorder_that_is_stopped_delays_no_end(config: RackConfig, tmp_path: 
 def test_a_recorder_that_comes_late_delays_no_run(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "ATTACH_S", 0.0)
+    monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
     result = run_rack(realtime(config), 3.0, tmp_path / "run", SilentDisplay())
     assert (result.worked, result.recording) == (True, "complete")
-    assert told(Recording(tmp_path / "run"))[:1] == [LATE]
+    assert told(Recording(tmp_path / "run"))[:1] == [NO_RECORDER]
 
 
 def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path):
-        with pytest.raises(Failure, match="a recorder is still at work there"):
+        with pytest.raises(Failure, match="another recorder is running there"):
             Recorder(rack.segment, tmp_path)
-        with pytest.raises(Failure, match="a recorder is still at work there"):
+        with pytest.raises(Failure, match="another recorder is running there"):
             mend(tmp_path)
 
 
@@ -210,12 +210,12 @@ def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(config: RackConfig, tm
     with Rack(config) as rack, Recorder(rack.segment, tmp_path) as recorder:
         rack.run(0.5)
         recorder.drain()
-        whole = (tmp_path / NAME).read_bytes()
+        whole = (tmp_path / SPOOL).read_bytes()
     found = []
     for size in (len(whole), len(whole) - 1, len(whole) * 2 // 3, len(whole) // 2):
         folder = tmp_path / str(size)
         folder.mkdir()
-        (folder / NAME).write_bytes(whole[:size])
+        (folder / SPOOL).write_bytes(whole[:size])
         assert mend(folder)
         found.append(pq.read_metadata(folder / "signals.parquet").num_rows)
     assert found == sorted(found, reverse=True)
