@@ -156,7 +156,7 @@ class _View:
             why, *release = hold.parts
             yield Text(hold.line if len(hold.line) <= width else "\n  ".join([why, *release]), style=HELD)
         if snapshot.progress is not None:
-            yield _bar(snapshot.progress, width)
+            yield _bar(snapshot.progress, width if terminal.is_terminal else 0)
 
 
 def line_of(snapshot: Snapshot) -> str:
@@ -207,11 +207,12 @@ def _ms(value: float | None) -> str:
 
 
 def _bar(progress: TaskProgress, width: int) -> RenderableType:
+    """Return the progress as a bar and text; without a width, as text alone."""
     done = f"action {progress.actions_done}/{progress.actions}, move {progress.moves_done}/{progress.moves}"
     left = width - len(f"task  {done} {progress.state}") - 1
-    row = Table.grid(padding=(0, 1))
     bar = ProgressBar(total=max(progress.moves, 1), completed=progress.moves_done, width=max(4, min(BAR, left)))
-    row.add_row("task", bar, done, progress.state)
+    row = Table.grid(padding=(0, 1))
+    row.add_row("task", *([bar] if width else []), done, progress.state)
     return row
 
 

@@ -23,7 +23,7 @@ HOLD = Hold("task", 15268, 38.17, "diverted by the operator (goto home)", "rack 
 
 
 def shown(snapshot: Snapshot, width: int) -> str:
-    console = Console(width=width)
+    console = Console(width=width, force_terminal=True, color_system=None)
     with console.capture() as capture:
         console.print(table_of(snapshot))
     return capture.get()
