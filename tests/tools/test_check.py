@@ -14,7 +14,7 @@ from rack.boards.config import budgets, load
 from rack.tools.inventory import Inventory
 from rack.tools.timing.forecast import Forecast
 from rack.tools.timing.trial import Trial
-from tests.tools.test_commands import rack
+from tests.tools.command_line import rack
 
 FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
 FAILS = ("--set", "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }")

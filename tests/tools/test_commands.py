@@ -17,14 +17,7 @@ import pytest
 from rack.backplane.segment import racks
 from rack.tools.cli import COMMANDS
 from tests.processes import RACK
-
-ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 30
-
-
-def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [*RACK, *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+from tests.tools.command_line import BOUND_S, ROOT, rack, refused
 
 
 @contextmanager
@@ -188,12 +181,12 @@ def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str]
 
 
 def test_a_rack_that_is_not_there_is_named(rack_name: str) -> None:
-    done = rack("stop", rack_name)
-    assert done.returncode == 1
-    assert f"rack '{rack_name}' is not there" in done.stderr
+    status, _, why = refused("stop", rack_name)
+    assert status == 1
+    assert f"rack '{rack_name}' is not there" in why
 
 
 def test_a_folder_that_holds_files_is_not_written_over(small: Path, tmp_path: Path) -> None:
-    done = rack("run", small, "--seconds", 1, "--out", tmp_path)
-    assert done.returncode == 2
-    assert "not an empty folder" in done.stderr
+    status, _, why = refused("run", str(small), "--seconds", "1", "--out", str(tmp_path))
+    assert status == 2
+    assert "not an empty folder" in why

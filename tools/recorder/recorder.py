@@ -50,23 +50,23 @@ class SafeSink:
 
     def add_cycles(self, task: str, rows: np.ndarray) -> None:
         """Pass trace records on."""
-        if (sink := self._sink) is not None:
-            self._guarded(lambda: sink.add_cycles(task, rows))
+        self._pass(lambda sink: sink.add_cycles(task, rows))
 
     def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
         """Pass messages on."""
-        if (sink := self._sink) is not None:
-            self._guarded(lambda: sink.add_signals(mailbox, rows))
+        self._pass(lambda sink: sink.add_signals(mailbox, rows))
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Pass the tick on."""
-        if (sink := self._sink) is not None:
-            self._guarded(lambda: sink.advance(tick, lost))
+        self._pass(lambda sink: sink.advance(tick, lost))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Finish the sink."""
+        self._pass(lambda sink: sink.close(tick, lost))
+
+    def _pass(self, call: Callable[[Sink], None]) -> None:
         if (sink := self._sink) is not None:
-            self._guarded(lambda: sink.close(tick, lost))
+            self._guarded(lambda: call(sink))
 
     def _guarded(self, call: Callable[[], None]) -> None:
         try:

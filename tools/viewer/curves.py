@@ -69,7 +69,7 @@ class Joints:
 
 def _style(name: str, at: int, quantity: str, unit: str) -> rr.SeriesLines:
     if quantity not in _COMMANDED:
-        return rr.SeriesLines(names=[f"{name} given, {unit}"], colors=[of_joint(at)])
+        return rr.SeriesLines(names=[f"{name} applied, {unit}"], colors=[of_joint(at)])
     names = [f"{name} commanded, {unit}", f"{name} measured, {unit}"]
     # The lower one is wider: it shows on both sides where the two agree.
     return rr.SeriesLines(names=names, colors=[COMMANDED, of_joint(at)], widths=[2.5, 1.0])
