@@ -45,4 +45,4 @@ def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = 
         recorder.follow()
     for text in notes:
         print(text, file=sys.stderr)
-    print_json({"rack": rack, "folder": str(folder), "told": notes}) if as_json else print(f"recorded into {folder}")
+    print_json({"rack": rack, "folder": str(folder), "notes": notes}) if as_json else print(f"recorded into {folder}")

@@ -1,4 +1,4 @@
-"""`rack record` on a rack that runs, and `--view` and `rack replay` where there is nothing to show or no screen."""
+"""`rack record` on a running rack; the viewer without a screen, `rack replay` without a recording."""
 
 from __future__ import annotations
 
@@ -26,14 +26,7 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
     config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
     with Rack(config) as rack:
         rack.start()
-        command = [
-            *RACK,
-            "record",
-            rack_name,
-            "--out",
-            str(tmp_path / "run"),
-            "--json",
-        ]
+        command = [*RACK, "record", rack_name, "--out", str(tmp_path / "run"), "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
             deadline = time.monotonic() + WATCHDOG_S
             while not (tmp_path / "run" / "run.rrd").is_file() and time.monotonic() < deadline:
@@ -43,7 +36,7 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
                 continue
             answer = json.loads(recorder.communicate(timeout=WATCHDOG_S)[0])
     assert recorder.returncode == 0
-    assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "told": []}
+    assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "notes": []}
     assert rack.outcome is not None
     ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
     assert ticks[-1] == rack.outcome.ticks - 1

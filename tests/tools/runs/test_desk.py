@@ -1,4 +1,4 @@
-"""`rack command` on racks that run: what it hands over, what it waits for, and what it refuses."""
+"""`rack command` on running racks: giving a command, waiting for the reply, and refusals."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
     assert done.returncode == 0, done.stderr
     assert (answer["level"], answer["text"], answer["worked"]) == ("upper", "hold", True)
     assert answer["fate"] in ("taken", "done")
-    # Read at the first release behind its tick, if none was skipped.
+    # Read at the first release after its tick, if none was skipped.
     assert answer["given"] < answer["taken_up"]
     assert answer["taken_up"] % 8 == 0
     again = rack("command", running, "upper", "resume")
@@ -71,7 +71,7 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
 def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
     answer = json.loads(rack("command", running, "upper", "hold", "--wait", "--json").stdout)
     assert answer["fate"] == "done"
-    # The level below has heard of it: two cycles behind.
+    # The level below has answered: two cycles later.
     assert answer["given"] < answer["taken_up"] < answer["done"]
     assert rack("command", running, "upper", "resume").returncode == 0
 
@@ -79,7 +79,7 @@ def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
 def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     running: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A level that never comes to an end with it.
+    # A level that never completes it.
     monkeypatch.setattr(Replies, "look", lambda replies: replace(replies.reply, fate="taken", taken_up=0))
     still = f", not done; in force until: rack command {running} upper resume$"
     with pytest.raises(Failure, match=f"^timed out after 0 s: command .*{still}"):
@@ -99,9 +99,9 @@ def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
     assert done.stdout.rstrip().endswith(": the way home is closed")
 
 
-def test_what_can_be_told_to_whom_is_listed(running: str) -> None:
+def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
     rows = {row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)}
-    assert rows["upper"] == {"level": "upper", "stands": "", "takes": "hold, resume, goto home"}
+    assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
     assert rows["lower"]["takes"] == "hold, resume"
 
 
@@ -122,12 +122,12 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("words", "told"), REFUSED.values(), ids=REFUSED)
-def test_bad_usage_is_one_line_and_status_2(running: str, words: tuple[str, ...], told: str) -> None:
+@pytest.mark.parametrize(("words", "reason"), REFUSED.values(), ids=REFUSED)
+def test_bad_usage_is_one_line_and_status_2(running: str, words: tuple[str, ...], reason: str) -> None:
     status, _, why = refused("command", running, *words)
     assert status == 2
     assert len(why.splitlines()) == 1
-    assert told in why
+    assert reason in why
 
 
 def test_a_rack_that_is_not_there_is_one_line() -> None:
@@ -148,7 +148,7 @@ def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(running: str
     assert table.waiting() == []
 
 
-def test_a_rack_that_ends_meanwhile_is_told(tmp_path: Path) -> None:
+def test_the_end_of_the_run_ends_a_wait(tmp_path: Path) -> None:
     name = f"test-command-end-{os.getpid()}"
     process = start(tmp_path / "told.toml", name, "clock.mode=realtime")
     try:
@@ -157,9 +157,9 @@ def test_a_rack_that_ends_meanwhile_is_told(tmp_path: Path) -> None:
         waiting = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
         wait_until(table.waiting)
         rack("stop", name)
-        _, told = waiting.communicate(timeout=BOUND_S)
+        _, printed = waiting.communicate(timeout=BOUND_S)
         assert waiting.returncode == 1
-        assert told.splitlines()[-1] == "'upper', hold: the run ended before it was given"
+        assert printed.splitlines()[-1] == "'upper', hold: the run ended before it was given"
     finally:
         end(process, name)
 

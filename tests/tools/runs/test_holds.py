@@ -1,4 +1,4 @@
-"""What holds a rack: read from its memory, since when, and the command that releases it."""
+"""Holds of a rack, read from its memory: since when, why, and the command that releases it."""
 
 from __future__ import annotations
 
@@ -97,11 +97,11 @@ def test_nothing_holds_a_level_at_its_work_or_a_rack_whose_run_is_over(segment: 
 def test_a_standstill_is_one_event_for_each_hold(segment: Segment) -> None:
     give(segment, What.HOLD)
     answer(segment, What.HOLD, 1, Answer.DONE)
-    standstill, told = Standstill(segment), []
+    standstill, events = Standstill(segment), []
     for second in range(20):
         segment.words[System.TICK] = round(second / TICK_S)
-        told += list(standstill.look())
-    (event,) = told
+        events += list(standstill.look())
+    (event,) = events
     assert (event.kind, event.code, event.subject, event.since) == ("held", "standstill", "upper", 100)
     # Held since 0.25 s, looked at every second.
     assert event.tick == round((STILL_S + 1) / TICK_S)

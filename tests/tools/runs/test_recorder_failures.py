@@ -1,4 +1,4 @@
-"""A recording that cannot go on: the rack does, what was written stays readable, and the user is told."""
+"""Recordings that fail: the run continues, what was written stays readable, and the user gets a message."""
 
 from __future__ import annotations
 
@@ -65,15 +65,15 @@ class Failing:
         raise AssertionError("a sink that failed is not asked again")
 
 
-def test_a_sink_that_fails_is_told_of_once_and_left_alone() -> None:
-    told: list[str] = []
+def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
+    notes: list[str] = []
     sink = Failing()
-    safe = SafeSink(lambda: sink, told.append)
+    safe = SafeSink(lambda: sink, notes.append)
     for tick in range(5):
         safe.add_cycles("servo", np.zeros(1))
         safe.advance(tick, {})
     safe.close(5, {})
-    assert told == ["run.rrd ends here: the disk is full"]
+    assert notes == ["run.rrd ends here: the disk is full"]
     assert sink.blocks == 2
 
 
@@ -100,23 +100,23 @@ def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path
     assert lines[0].startswith("run.rrd ends here: ")
 
 
-class Telling(SilentDisplay):
-    """Keeps what it is told."""
+class Keeping(SilentDisplay):
+    """Keeps the texts of events."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.texts: list[str] = []
 
     def show_event(self, event: Event) -> None:
         """Keep the text."""
-        self.told.append(event.text)
+        self.texts.append(event.text)
 
 
 def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: Path) -> None:
-    folder, display = tmp_path / "run", Telling()
+    folder, display = tmp_path / "run", Keeping()
     folder.mkdir()
     (folder / "events.jsonl").symlink_to("/dev/full")
     assert run_rack(config, 0.5, folder, display).worked
-    assert display.told.count("events.jsonl ends here: No space left on device") == 1
+    assert display.texts.count("events.jsonl ends here: No space left on device") == 1
 
 
 class AtTick(SilentDisplay):
@@ -139,7 +139,7 @@ def command_of(pid: int) -> bytes:
     return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
-def told(recording: Recording) -> list[str]:
+def notes_of(recording: Recording) -> list[str]:
     return [event["text"] for event in recording.events if event["kind"] == "recorder"]
 
 
@@ -153,7 +153,7 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config:
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
-    assert told(recording)[0] == "the recorder ended with status -9; restarted, 1 of at most 3 times"
+    assert notes_of(recording)[0] == "the recorder ended with status -9; restarted, 1 of at most 3 times"
     # In lockstep the clock waits for the next one as it did for the first: not one row is missing.
     serials = recording.signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
@@ -173,7 +173,7 @@ def test_what_a_killed_recorder_took_is_readable(
     assert result.recording == "the recorder ended with status -9"
     report, _ = write_report(tmp_path / "run")
     assert report["worked"]
-    assert told(Recording(tmp_path / "run")) == ["the recorder ended with status -9; the run continues, unrecorded"]
+    assert notes_of(Recording(tmp_path / "run")) == ["the recorder ended with status -9; the run continues, unrecorded"]
     ticks = pq.read_table(tmp_path / "run" / "signals.parquet", columns=["tick"])["tick"].to_numpy()
     assert ticks.max() > FIRST_BLOCK / 2
     repaired = tmp_path / "repaired.rrd"
@@ -195,7 +195,7 @@ def test_a_recorder_that_comes_late_delays_no_run(
     monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
     result = run_rack(realtime(config), 3.0, tmp_path / "run", SilentDisplay())
     assert (result.worked, result.recording) == (True, "complete")
-    assert told(Recording(tmp_path / "run"))[:1] == [NO_RECORDER]
+    assert notes_of(Recording(tmp_path / "run"))[:1] == [NO_RECORDER]
 
 
 def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> No
         assert {"sim_time", "tick", "wall"} <= set(chunk.timeline_names), chunk.entity_path
         times = chunk.to_record_batch().column("sim_time").to_numpy().astype(np.int64)
         assert times.min() >= 0, chunk.entity_path
-        # A plan shows from the tick at which it can be used, which may lie behind the end.
+        # A plan shows from the tick at which it can be used, which may be after the end.
         assert times.max() <= end_ns + 2 * 10**9, chunk.entity_path
 
 
@@ -127,9 +127,9 @@ def test_config_and_events_are_in_it(run: Recording) -> None:
     document = RrdReader(str(file)).stream().filter(content="/config").to_chunks()[0].to_record_batch()
     assert run.config in document.column("TextDocument:text")[0].as_py()[0]
     lines = read(file, "/log/events", "TextLog:text").values.ravel().tolist()
-    told = [e for e in run.events if "tick" in e]
-    assert len(lines) == len(told)
-    assert [line.partition(":")[0] for line in lines] == [e["kind"] for e in told]
+    shown = [e for e in run.events if "tick" in e]
+    assert len(lines) == len(shown)
+    assert [line.partition(":")[0] for line in lines] == [e["kind"] for e in shown]
 
 
 def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
