@@ -16,7 +16,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.operating.config import CommandConfig
 from rack.tools.bench.response import Bench
 from rack.tools.console.answer import Failure
-from rack.tools.console.progress import Silent
+from rack.tools.console.progress import Progress
 from rack.tools.recording import Recording
 from rack.tools.responding.course import Course, courses
 from rack.tools.responding.plot import plot
@@ -174,7 +174,7 @@ def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(rack_
 
 
 def test_a_bench_measures_as_many_as_asked_for() -> None:
-    found = Bench("nasrem", "lockstep", 3, Silent()).measure(2, twins=0)
+    found = Bench("nasrem", "lockstep", 3, Progress()).measure(2, twins=0)
     assert found.held
     assert len(found.response.measured) >= 2
 
