@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rack.boards.config import load
-from rack.levels.timing.chart import Chart
+from rack.levels.timing.schedule import Chart
 from rack.tools.charting.measured import Run
 from rack.tools.console.answer import Failure
 from tests.tools.traces import EPOCH_NS, cycle, recorded

@@ -13,7 +13,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
-from rack.boards.config import RackConfig, loads
+from rack.boards.config import RackConfig, loads, rack_timing
 from rack.levels.cell import Cell, build_cell
 from rack.levels.messages import (
     ARM_STATE,
@@ -25,7 +25,6 @@ from rack.levels.messages import (
     TASK_PLAN,
     WORLD_MODEL,
 )
-from rack.tools.timing.prediction import hierarchy
 from rack.tools.viewer.ages import Age
 from rack.tools.viewer.blueprint import blueprint, write_document
 from rack.tools.viewer.cell import CurrentGoal, Goals, PlannedPath, Poses, write_geometry
@@ -81,7 +80,7 @@ class ViewSink:
         # An operator's mailbox has no age: it is not written periodically.
         periodic = [mailbox for mailbox in layout.mailboxes if mailbox.writer != CLOCK]
         self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
-        self._hierarchy = Hierarchy(stream, layout, hierarchy(config))
+        self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout).hierarchy)
         self._events = Events(stream, folder / "events.jsonl", self._hierarchy)
         self._losses = Losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
