@@ -12,7 +12,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, Run, System
 from rack.tools.console.answer import Failure, Json, RackName, print_json
 
-Reset = Annotated[bool, typer.Option("--reset", help="clear the latch and release the arm")]
+Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")]
 
 OBEY_S = 2.0
 """Longest wait for the clock, which reads the latch every tick."""

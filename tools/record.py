@@ -21,10 +21,11 @@ View = Annotated[bool, typer.Option("--view", help="open the viewer on the runni
 
 
 def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = False) -> None:
-    """Record a running rack, from what its rings still hold until its run is over, or Ctrl-C.
+    """Record a running rack until its run is over, or until Ctrl-C.
 
-    Writes the trace, the signals and run.rrd, for `rack report`, `rack analyze` and `rack replay`. Recording costs the
-    rack no deadline, and ending it does not end the run.
+    The recording begins with what the rack's rings still hold, about two seconds. It is written as the trace, the
+    signals and run.rrd, for `rack report`, `rack analyze` and `rack replay`. Recording costs the rack no deadline, and
+    ending it does not end the run.
 
     \b
     Examples:
