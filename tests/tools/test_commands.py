@@ -146,18 +146,6 @@ def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], 
     assert wait_until_gone(rack_name)
 
 
-def test_a_recorder_can_join_a_run(running: subprocess.Popen[str], rack_name: str, tmp_path: Path) -> None:
-    recorder = subprocess.Popen([*RACK, "record", rack_name, "--out", str(tmp_path / "joined")], cwd=ROOT)
-    deadline = time.monotonic() + BOUND_S
-    while not (tmp_path / "joined" / "signals.parquet").exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    rack("stop", rack_name)
-    assert recorder.wait(BOUND_S) == 0
-    report = json.loads(rack("report", tmp_path / "joined", "--json").stdout)
-    assert report["rack"] == rack_name
-    assert report["tasks"]["lower"]["traced"] > 0
-
-
 def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path) -> None:
     with launched(small, rack_name, "--out", str(tmp_path / "run")) as running:
         running.send_signal(signal.SIGINT)

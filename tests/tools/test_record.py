@@ -14,6 +14,7 @@ from rack.boards.rack import Rack
 from rack.tools.console.answer import Failure
 from rack.tools.recording import Recording
 from rack.tools.replay import replay
+from rack.tools.reporting.report import write_report
 from rack.tools.runs.window import ViewerWindow
 from rack.tools.viewer.reading import read
 from tests.processes import RACK
@@ -38,6 +39,9 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
     assert recorder.returncode == 0
     assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "notes": []}
     assert rack.outcome is not None
+    report, _ = write_report(tmp_path / "run")
+    assert report["rack"] == rack_name
+    assert report["tasks"]["lower"]["traced"] > 0
     ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
     assert ticks[-1] == rack.outcome.ticks - 1
     assert read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist() == ticks.tolist()
