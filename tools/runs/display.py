@@ -84,7 +84,8 @@ class LiveDisplay:
         """Print the event above the table."""
         if _is_shown(event):
             style = EVENTS.get(event.kind, OTHER_EVENTS)
-            self._live.console.print(_line(event), style=style, highlight=False, markup=False)
+            # The terminal wraps it, not rich: a command in it can still be copied.
+            self._live.console.print(_line(event), style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 class PlainDisplay:
