@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 COMMANDS = (
     ("run", "rack.tools.run:run", "Run a rack until its task ends, and report on the run."),
     ("check", "rack.tools.check:check", "Validate a config and predict its timing."),
+    ("schema", "rack.tools.schema:schema", "List the keys of a config."),
     ("list", "rack.tools.list:list_racks", "List the racks on this machine."),
     ("status", "rack.tools.status:status", "Show a running rack once."),
     ("stop", "rack.tools.stop:stop", "End a run and wait until it is gone."),
@@ -110,14 +111,15 @@ def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
 
 
 def _loaded(name: str, source: str) -> Any:
-    """Import a command from "module:attribute"."""
+    """Import a command from "module:attribute"; EXAMPLES in its module end its help."""
     import typer
 
-    module, _, attribute = source.partition(":")
-    found = getattr(import_module(module), attribute)
+    path, _, attribute = source.partition(":")
+    module = import_module(path)
+    found = getattr(module, attribute)
     if not isinstance(found, typer.Typer):
         app = _app()
-        app.command(name)(found)
+        app.command(name, epilog=getattr(module, "EXAMPLES", None))(found)
         found = app
     return typer.main.get_command(found)
 

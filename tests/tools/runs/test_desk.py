@@ -20,7 +20,7 @@ from rack.tools.command import LiveDesk, goal_of
 from rack.tools.console.answer import Failure
 from rack.tools.runs import desk
 from rack.tools.runs.desk import Replies
-from tests.boards.told_racks import TOLD
+from tests.boards.commanded_racks import COMMANDED
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack, refused
 
@@ -28,7 +28,7 @@ from tests.tools.command_line import BOUND_S, ROOT, rack, refused
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
     """Start a rack that runs until it is stopped; return when it does."""
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -106,15 +106,15 @@ def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
 
 
 REFUSED = {
-    "no level": (("uper", "hold"), 'level = "uper": no level that can be commanded; levels: upper, lower'),
+    "no level": (("uper", "hold"), 'level = "uper": no such level takes commands; levels: upper, lower'),
     "no wait to bound": (
         ("upper", "hold", "--timeout", "1"),
         "--timeout is the bound of --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
     "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
-    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' takes no setpoint; it takes: hold, resume"),
-    "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' has one of: home"),
+    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
+    "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
     "no word": (("upper", "goto", "hom"), "'hom': not a goal; permitted: home, joints=..., position=..."),
     "no number": (("upper", "goto", "joints=1,x"), "'joints=1,x': 'x' is not a number; permitted: numbers separated by commas"),
     "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),
@@ -169,7 +169,7 @@ def test_a_clock_without_ticks_is_not_waited_for(
 ) -> None:
     monkeypatch.setattr(desk, "SILENT_S", 0.05)
     path = tmp_path / "told.toml"
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     # Launched and not started: there is a rack, and no clock yet.
     with Rack(load(path, [f"name={rack_name}"])):
         with pytest.raises(Failure, match="has not ticked for"):
