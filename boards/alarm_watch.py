@@ -17,7 +17,7 @@ from rack.boards.config.cell import geom_name
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
 from rack.boards.operating.command import describe, level_of, message_of
-from rack.levels.operator import What
+from rack.levels.operator import Operation
 
 
 class Heard(NamedTuple):
@@ -57,7 +57,7 @@ class AlarmWatch:
     def _command(self, row: np.void, entry: RequestEntry) -> Event:
         """Return the event of a command that was given."""
         level, message, serial = level_of(entry, self._layout), message_of(entry, self._layout), int(row["value"])
-        text, code = f"{describe(message)} (command {serial})", What(message.what).name.lower()
+        text, code = f"{describe(message)} (command {serial})", Operation(message.what).name.lower()
         realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
         return Event(realtime_ns, int(row["tick"]), "command", level, text, code, subject=level, value=serial)
 

@@ -9,8 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from rack.levels.cell import STATE, Cell
 from rack.levels.messages import SegmentKind, Verb
+from rack.levels.robot.cell import STATE, Cell
 from rack.tools.viewer.shapes import shape_of, xyzw
 from rack.tools.viewer.stream import Changes, RowBlock, Stream
 from rack.tools.viewer.style import CURRENT, GOAL, PLANNED

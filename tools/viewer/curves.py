@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 
 from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.levels.cell import Cell
+from rack.levels.robot.cell import Cell
 from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
 

@@ -14,7 +14,6 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
 from rack.boards.config import RackConfig, loads, rack_timing
-from rack.levels.cell import Cell, build_cell
 from rack.levels.messages import (
     ARM_STATE,
     JOINT_SET_POINT,
@@ -25,6 +24,7 @@ from rack.levels.messages import (
     TASK_PLAN,
     WORLD_MODEL,
 )
+from rack.levels.robot.cell import Cell, build_cell
 from rack.tools.viewer.ages import Age
 from rack.tools.viewer.blueprint import blueprint, write_document
 from rack.tools.viewer.cell import CurrentGoal, Goals, PlannedPath, Poses, write_geometry
