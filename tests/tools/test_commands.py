@@ -61,7 +61,6 @@ def wait_until_gone(name: str) -> bool:
         (["--help"], ("numpy", "pydantic", "pyarrow", "mujoco", "rerun")),
         (["list"], ("pyarrow", "mujoco", "rerun")),
         (["clean", "--help"], ("pyarrow", "mujoco", "rerun")),
-        (["status", "--help"], ("pyarrow", "mujoco", "rerun")),
     ],
 )
 def test_a_command_starts_without_libraries_that_it_does_not_need(arguments: list[str], heavy: tuple[str, ...]) -> None:
