@@ -12,8 +12,8 @@ import typer
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
 from rack.tools.analysis.tables import text
-from rack.tools.answer import Json, print_json
-from rack.tools.live_table import print_wrapped, terminal_width
+from rack.tools.console.answer import Json, print_json
+from rack.tools.console.tables import print_wrapped, terminal_width
 from rack.tools.report import RunFolder
 from rack.tools.runs.recording import Recording, reading_progress
 from rack.tools.timing.operator_response import show

@@ -1,18 +1,21 @@
-"""`rack clean`: remove what killed racks left behind."""
+"""`rack clean`: remove the shared memory that killed racks left behind."""
 
 from __future__ import annotations
 
-from rack.tools.answer import Json, print_json
+from rack.boards.clean import clean as remove_leftovers
+from rack.tools.console.answer import Json, print_json
 
 
 def clean(as_json: Json = False) -> None:
-    """Remove what killed racks left in shared memory.
+    """Remove the shared memory that killed racks left behind.
 
-    A rack in use is never touched, nor what only has the name of one: a directory, a symbolic link.
+    Never touches a rack in use, nor a directory or symbolic link that only has the name of one.
+
+    \b
+    Examples:
+      rack clean
     """
-    from rack.boards.clean import clean as remove
-
-    removed, in_use, strange = remove()
+    removed, in_use, strange = remove_leftovers()
     if as_json:
         print_json({"removed": removed, "in_use": in_use, "strange": strange})
         return

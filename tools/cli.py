@@ -1,80 +1,49 @@
-"""The `rack` command: one file a subcommand; each imports what it needs only when it runs."""
+"""The `rack` command line. A command's module is imported only when that command runs or shows its help."""
 
 from __future__ import annotations
 
 import errno
 import sys
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from rack.tools.interrupt import INTERRUPT, Interrupted
+from rack.tools.console.interrupt import INTERRUPT, Interrupted
 
 if TYPE_CHECKING:
     import typer
+    from typer.core import TyperGroup
 
-LONGEST_ARGUMENT = 4096
-"""Characters, as in the longest path; what a config holds beyond that belongs into a file."""
+COMMANDS = (
+    ("run", "rack.tools.run:run", "Run a rack until its task ends, and report on the run."),
+    ("check", "rack.tools.check:check", "Validate a config and predict its timing."),
+    ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
+    ("list", "rack.tools.list:list_racks", "List the racks on this machine."),
+    ("status", "rack.tools.status:status", "Show a running rack once."),
+    ("stop", "rack.tools.stop:stop", "End a run and wait until it is gone."),
+    ("clean", "rack.tools.clean:clean", "Remove the shared memory that killed racks left behind."),
+    ("command", "rack.tools.command:command", "Command one level of a running rack."),
+    ("inject", "rack.tools.inject:app", "Inject a fault into a running rack."),
+    ("estop", "rack.tools.estop:estop", "Engage the brakes of the arm at once, until --reset."),
+    ("record", "rack.tools.record:record", "Record a running rack."),
+    ("replay", "rack.tools.replay:replay", "Open the recording of a run in the viewer."),
+    ("report", "rack.tools.report:report", "Report on a recorded run, or compare two runs."),
+    ("analyze", "rack.tools.analyze:analyze", "Compare a run with the timing model, equation by equation."),
+    ("gantt", "rack.tools.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
+    ("campaign", "rack.tools.campaign.command:campaign", "Inject random faults into many runs, and judge each."),
+    ("bench", "rack.tools.bench.command:bench", "Measure costs on this machine."),
+)
+"""Name, module and function or `typer.Typer` in it, and one line of help."""
+MAX_ARGUMENT = 4096
+"""Characters, as in the longest path; longer values belong in the config file."""
 USAGE = (errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ELOOP, errno.EACCES)
-"""What the system says of a path that a user should not have given."""
-
-
-def commands() -> typer.Typer:
-    """Return the command line."""
-    import typer
-
-    from rack.tools.analyze import analyze
-    from rack.tools.bench.command import bench
-    from rack.tools.campaign.command import campaign
-    from rack.tools.check import check
-    from rack.tools.clean import clean
-    from rack.tools.command import EXAMPLES as COMMANDING
-    from rack.tools.command import command
-    from rack.tools.estop import estop
-    from rack.tools.gantt import gantt
-    from rack.tools.inject import EXAMPLES as INJECTING
-    from rack.tools.inject import inject
-    from rack.tools.injecting.kinds import KindsCommand
-    from rack.tools.list import list_racks
-    from rack.tools.record import record
-    from rack.tools.replay import replay
-    from rack.tools.report import report
-    from rack.tools.run import run
-    from rack.tools.schema import EXAMPLES as SCHEMA_EXAMPLES
-    from rack.tools.schema import schema
-    from rack.tools.status import status
-    from rack.tools.stop import stop
-
-    app = typer.Typer(
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
-        epilog="Exit status: 0 it worked, 1 it did not, 2 usage or config error, 128 + N ended by signal N.",
-    )
-    app.command()(run)
-    app.command()(check)
-    app.command(epilog=SCHEMA_EXAMPLES)(schema)
-    app.command("list")(list_racks)
-    app.command()(status)
-    app.command()(stop)
-    app.command()(clean)
-    app.command(epilog=COMMANDING)(command)
-    app.command(cls=KindsCommand, epilog=INJECTING)(inject)
-    app.command()(estop)
-    app.command()(record)
-    app.command()(replay)
-    app.command()(report)
-    app.command()(analyze)
-    app.command()(gantt)
-    app.add_typer(bench, name="bench")
-    app.command()(campaign)
-    return app
+"""Errors of the system that mean that the user gave a wrong path."""
 
 
 def main() -> None:
-    """Run the command line; what is refused shows as one line a mistake."""
+    """Run the command line; an error of the user is one line."""
     if sys.platform != "linux":
-        sys.exit(f"rack runs on Linux alone, not on {sys.platform}: it needs /dev/shm, pidfds and SCHED_FIFO")
-    # First of all: to import what commands need takes longer than many a command.
+        sys.exit(f"rack runs only on Linux, not on {sys.platform}: it needs /dev/shm, pidfds and SCHED_FIFO")
+    # First of all: importing what a command needs takes longer than many a command.
     INTERRUPT.catch()
     try:
         run_commands()
@@ -85,12 +54,12 @@ def main() -> None:
 
 
 def run_commands() -> None:
-    """Run the command line in this process, its signals left alone."""
+    """Run the command line in this process, without handling signals."""
     from rack.boards.errors import shown
-    from rack.tools.answer import Failure, fail
+    from rack.tools.console.answer import Failure, fail
 
     try:
-        _look_over(sys.argv[1:])
+        _check_arguments(sys.argv[1:])
         commands()(prog_name="rack")
     except Failure as failure:
         fail(str(failure), failure.status)
@@ -99,24 +68,72 @@ def run_commands() -> None:
             raise
         fail(f"{shown(str(error.filename))}: {error.strerror}", 2 if error.errno in USAGE else 1)
     except Exception as error:
-        status_of_error = _status(error)
-        if status_of_error is None:
+        status = _status(error)
+        if status is None:
             raise
-        fail(str(error), status_of_error)
+        fail(str(error), status)
 
 
-def _look_over(arguments: list[str]) -> None:
-    """Refuse what no command can use, before any sees it. Raises `Failure`."""
+def commands() -> TyperGroup:
+    """Return the command line; its commands are loaded when they are used."""
+    import typer
+    from typer.core import TyperCommand, TyperGroup
+
+    class LazyCommand(TyperCommand):
+        """A command of which only the name and one line of help are known."""
+
+        def __init__(self, name: str, source: str, line: str) -> None:
+            super().__init__(name, short_help=line)
+            self._source = source
+
+        def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+            """Load the command; from here on it takes this one's place."""
+            return _loaded(self.name or "", self._source).make_context(info_name, args, parent, **extra)
+
+    app = _app(
+        add_completion=True,
+        no_args_is_help=True,
+        help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
+        epilog="Exit status: 0 success, 1 failure, 2 usage or config error, 128 + N ended by signal N.",
+    )
+    app.callback()(lambda: None)
+    group = typer.main.get_command(app)
+    assert isinstance(group, TyperGroup), "it has a callback"
+    for name, source, line in COMMANDS:
+        group.add_command(LazyCommand(name, source, line))
+    return group
+
+
+def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
+    import typer
+
+    return typer.Typer(add_completion=add_completion, rich_markup_mode=None, **settings)
+
+
+def _loaded(name: str, source: str) -> Any:
+    """Import a command from "module:attribute"; EXAMPLES in its module end its help."""
+    import typer
+
+    path, _, attribute = source.partition(":")
+    module = import_module(path)
+    found = getattr(module, attribute)
+    if not isinstance(found, typer.Typer):
+        app = _app()
+        app.command(name, epilog=getattr(module, "EXAMPLES", None))(found)
+        found = app
+    return typer.main.get_command(found)
+
+
+def _check_arguments(arguments: list[str]) -> None:
+    """Refuse arguments that no command can use. Raises `Failure`."""
     from rack.boards.errors import shown
-    from rack.tools.answer import Failure
+    from rack.tools.console.answer import Failure
 
     for at, argument in enumerate(arguments, 1):
-        if len(argument) > LONGEST_ARGUMENT:
-            raise Failure(
-                f"argument {at} = {shown(argument)}: {len(argument)} characters; at most {LONGEST_ARGUMENT}", 2
-            )
+        if len(argument) > MAX_ARGUMENT:
+            raise Failure(f"argument {at} = {shown(argument)}: {len(argument)} characters; at most {MAX_ARGUMENT}", 2)
         if any("\ud800" <= c <= "\udfff" for c in argument):
-            raise Failure(f"argument {at} = {shown(argument)}: is no UTF-8", 2)
+            raise Failure(f"argument {at} = {shown(argument)}: not UTF-8", 2)
 
 
 def _status(error: Exception) -> int | None:

@@ -2,51 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import typer
 
-from rack.tools.answer import Failure, Json, RackName, print_json
-from rack.tools.interrupt import INTERRUPT
+from rack.tools.console.answer import Failure, Json, RackName, print_json
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.tables import terminal_width
+from rack.tools.runs.desk import LiveDesk
+from rack.tools.runs.holds import resume_command
+
+GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 
 Level = Annotated[
-    str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or your own")
+    str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own")
 ]
-Said = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint or goto")]
+What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint or goto")]
 Goals = Annotated[
     list[str] | None,
     typer.Argument(metavar="GOAL", help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1"),
 ]
-Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
-At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="instead of --tick: simulated time, s")]
+Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which to give the command; default: the next")]
+At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same as simulated time, s")]
 Wait = Annotated[bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")]
 Timeout = Annotated[
     float | None,
-    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: wall-clock seconds, then exit status 1"),
+    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: give up after S seconds of wall-clock time"),
 ]
-List = Annotated[bool, typer.Option("--list", help="list each level, the commands that it takes, and what is in force")]
-
-EXAMPLES = """\b
-Examples:
-
-  rack command nasrem --list
-
-  rack command nasrem task hold
-
-  rack command nasrem task resume
-
-  rack command nasrem servo setpoint joints=0.2,1.3,-2.9,0,-1.3,0 --wait
-
-  rack command nasrem task goto position=0.45,0.1,0.95
-
-  rack command nasrem task goto home --tick 4000 --wait --timeout 60
-"""
+List = Annotated[bool, typer.Option("--list", help="list each level, the commands it takes, and the one in force")]
 
 
 def command(
     rack: RackName,
     level: Level = None,
-    what: Said = None,
+    what: What = None,
     goal: Goals = None,
     tick: Tick = None,
     at: At = None,
@@ -57,20 +47,27 @@ def command(
 ) -> None:
     """Command one level of a running rack, overriding the level above it.
 
-    hold: the arm comes to rest on its path and stays there. setpoint (servo level) and goto: it moves to a goal and
-    stays there. resume: the level goes on with its own work. A command stays in force until resume, even if the
-    level's board restarts. An emergency stop takes precedence.
+    \b
+    hold      bring the arm to rest on its path, and keep it there
+    goto      move the arm to a goal, and keep it there
+    setpoint  the same, at the servo level: a straight line in joint space,
+              without checking for collisions
+    resume    let the level continue its own work
 
-    A setpoint is followed on a straight line in joint space, without checking for collisions.
+    The command stays in force until `resume`, even if the level's board restarts. An emergency stop takes precedence.
 
-    Exit status: 0 the level took the command up, with --wait: it is done; 1 it refused, or did not answer in time; 2
-    usage.
+    Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did not answer in time;
+    2 usage.
+
+    \b
+    Examples:
+      rack command nasrem --list
+      rack command nasrem task hold
+      rack command nasrem task resume
+      rack command nasrem servo setpoint joints=0.2,1.3,-2.9,0,-1.3,0 --wait
+      rack command nasrem task goto position=0.45,0.1,0.95
+      rack command nasrem task goto home --tick 4000 --wait --timeout 60
     """
-    from rack.tools.commanding.goals import goal_of
-    from rack.tools.commanding.live import LiveDesk
-    from rack.tools.holds import resume_command
-    from rack.tools.live_table import terminal_width
-
     desk = LiveDesk(rack)
     if is_list:
         print_json(desk.levels()) if as_json else print("\n".join(desk.text(terminal_width())))
@@ -79,11 +76,36 @@ def command(
         raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
     if timeout is not None and not wait:
         raise Failure("--timeout is the bound of --wait; give both, or neither", 2)
-    # Raised, not ended at once: a command that nobody waits for any more is withdrawn.
+    # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising():
-        told = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
-    print_json(told.document()) if as_json else print(told.line)
-    if not told.worked:
+        reply = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
+    print_json(reply.document()) if as_json else print(reply.line)
+    if not reply.worked:
         raise typer.Exit(1)
-    if told.is_standing and what != "resume" and not as_json:
+    if reply.is_standing and what != "resume" and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
+
+
+def goal_of(words: Sequence[str]) -> dict[str, Any]:
+    """Return a goal, typed as `home` or key=numbers, as in a `[[command]]` table. Raises `Failure`."""
+    goal: dict[str, Any] = {}
+    for word in words:
+        key, is_given, values = word.partition("=")
+        if word == "home":
+            goal["home"] = True
+        elif not is_given or key not in GOAL_KEYS:
+            permitted = ", ".join(f"{k}=..." for k in GOAL_KEYS)
+            raise Failure(f"'{word}': not a goal; permitted: home, {permitted}", 2)
+        elif key in goal:
+            raise Failure(f"'{word}': {key} is given twice", 2)
+        else:
+            goal[key] = [_number(value, word) for value in values.split(",")]
+    return goal
+
+
+def _number(text: str, word: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        why = f"'{text}' is not a number; permitted: numbers separated by commas, as in joints=0,0.5,1"
+        raise Failure(f"'{word}': {why}", 2) from None

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import time
 from typing import Annotated
 
 import typer
 
-from rack.tools.answer import Failure, Json, RackName, print_json
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment
+from rack.backplane.words import Demand, Run, System
+from rack.tools.console.answer import Failure, Json, RackName, print_json
 
-Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, provided every input is good")]
+Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")]
 
 OBEY_S = 2.0
-"""Bound of the wait for the clock, which looks at the latch every tick."""
+"""Longest wait for the clock, which reads the latch every tick."""
 
 
 def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
-    """Stop the arm at once: the brakes are engaged, and stay engaged until --reset.
+    """Engage the brakes of the arm at once, and keep them engaged until --reset.
 
-    The run goes on with the arm braked. A reset is refused while a board is lost or holds SYSFAIL, or ACFAIL is set.
+    The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or ACFAIL is asserted.
 
     Exit status: 0 the latch is set, or with --reset clear; 1 the reset was refused, or there is no such rack.
 
@@ -26,12 +30,6 @@ def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
       rack estop nasrem
       rack estop nasrem --reset
     """
-    import time
-
-    from rack.backplane.lines import UtilityLines
-    from rack.backplane.segment import Segment
-    from rack.backplane.words import Demand, Run, System
-
     segment = Segment.attach(rack)
     words, lines = segment.words, UtilityLines(segment)
     if words[System.STATE] == Run.STOPPED or not segment.launcher_is_alive:
@@ -41,14 +39,14 @@ def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
     else:
         lines.latch_emergency_stop()
     deadline = time.monotonic() + OBEY_S
-    # What the arm is told follows at the next tick; a board that is lost may demand something of its own.
+    # The demand on the arm follows at the next tick; a lost board may cause a demand, too.
     while (words[System.DEMAND] == Demand.BRAKE) == reset and words[System.STATE] == Run.RUNNING:
         if time.monotonic() > deadline:
-            raise Failure(f"rack '{rack}': the latch is {'clear' if reset else 'set'}; no tick has followed it")
+            raise Failure(f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but no tick has followed")
         time.sleep(0.001)
-    told = "reset" if reset else "latched"
-    how = "" if reset else f"; to release: rack estop {rack} --reset"
-    document = {"rack": rack, "emergency_stop": not reset, "tick": words[System.TICK]}
-    print_json(document) if as_json else print(
-        f"rack '{rack}': emergency stop {told} at tick {words[System.TICK]}{how}"
-    )
+    tick = words[System.TICK]
+    if as_json:
+        print_json({"rack": rack, "emergency_stop": not reset, "tick": tick})
+        return
+    state = f"reset at tick {tick}" if reset else f"latched at tick {tick}; to release: rack estop {rack} --reset"
+    print(f"rack '{rack}': emergency stop {state}")

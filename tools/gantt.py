@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from rack.tools.answer import Failure, Json, Settings, print_json
 from rack.tools.charts import figure5
 from rack.tools.charts.gantt import Subject, gantt_of, subject_of
 from rack.tools.charts.window import times_of, window_options
+from rack.tools.console.answer import Failure, Json, Settings, print_json
 from rack.tools.runs.recording import reading_progress
 
 LATEST_MS = 1e10

@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from rack.tools.answer import Failure, Json, named, print_json
+from rack.tools.console.answer import Failure, Json, named, print_json
+from rack.tools.injecting.kinds import KindsCommand, kinds_document, kinds_text
 
 Rack = Annotated[
     str | None,
@@ -83,9 +84,8 @@ def inject(
     Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or --timeout has passed;
     2 usage.
     """
-    from rack.tools.injecting.kinds import kinds_document, kinds_text
+    from rack.tools.console.tables import terminal_width
     from rack.tools.injecting.live import LiveRack
-    from rack.tools.live_table import terminal_width
 
     if is_list and rack is None:
         print_json(kinds_document()) if as_json else print("\n".join(kinds_text(terminal_width())))
@@ -114,3 +114,7 @@ def _named(parameters: list[str]) -> dict[str, str]:
         if not text.partition("=")[0] or not text.partition("=")[2]:
             raise Failure(f"'{text}': a parameter must be key=value, as in size=0.05", 2)
     return {key.strip(): value.strip() for key, _, value in (text.partition("=") for text in parameters)}
+
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app.command(cls=KindsCommand, epilog=EXAMPLES)(inject)

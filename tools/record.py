@@ -1,4 +1,4 @@
-"""`rack record`: attach a recorder to a rack that is running."""
+"""`rack record`: attach a recorder to a running rack."""
 
 from __future__ import annotations
 
@@ -8,37 +8,42 @@ from typing import Annotated
 
 import typer
 
-from rack.tools.answer import Json, RackName, print_json
-from rack.tools.interrupt import INTERRUPT
+from rack.backplane.segment import Segment
+from rack.tools.console.answer import Json, RackName, print_json
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.recorder.recorder import Recorder, SafeSink
+from rack.tools.runs.folder import folder_of
+from rack.tools.runs.window import ViewerWindow, free_port, url
+from rack.tools.viewer.sink import ViewSink
 
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 
 
 def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = False) -> None:
-    """Record a running rack, from what its rings still hold on.
+    """Record a running rack until its run is over, or until Ctrl-C.
 
-    Trace, signals and run.rrd, until its run is over or Ctrl-C.
+    The recording begins with what the rack's rings still hold, about two seconds. It is written as the trace, the
+    signals and run.rrd, for `rack report`, `rack analyze` and `rack replay`. Recording costs the rack no deadline, and
+    ending it does not end the run.
+
+    \b
+    Examples:
+      rack record nasrem
+      rack record nasrem --view --out runs/look
     """
-    from rack.backplane.segment import Segment
-    from rack.tools.folders import folder_of
-    from rack.tools.recorder.recorder import Recorder
-    from rack.tools.recorder.side_sink import SideSink
-    from rack.tools.viewer.sink import ViewSink
-    from rack.tools.viewer.window import Window, free_port, url
-
     segment = Segment.attach(rack)
     folder = folder_of(out, rack)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.toml").write_text(segment.config)
-    told: list[str] = []
+    notes: list[str] = []
     port = free_port() if view else None
-    beside = SideSink(lambda: ViewSink(segment, folder, port), told.append)
-    # Ctrl-C ends the recording, not the run; the files are finished on the way out.
-    with INTERRUPT.orderly(), Recorder(segment, folder, beside) as recorder, INTERRUPT.orderly(recorder.stop):
+    sink = SafeSink(lambda: ViewSink(segment, folder, port), notes.append)
+    # Ctrl-C ends the recording, not the run; leaving the context finishes the files.
+    with INTERRUPT.orderly(), Recorder(segment, folder, sink) as recorder, INTERRUPT.orderly(recorder.stop):
         if port is not None:
-            Window(url(port))
+            ViewerWindow(url(port))
         recorder.follow()
-    for text in told:
+    for text in notes:
         print(text, file=sys.stderr)
-    print_json({"rack": rack, "folder": str(folder), "told": told}) if as_json else print(f"recorded into {folder}")
+    print_json({"rack": rack, "folder": str(folder), "notes": notes}) if as_json else print(f"recorded into {folder}")

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.report import RunFolder
+from rack.tools.runs.window import ViewerWindow
 
 
 def replay(run: RunFolder) -> None:
-    """Open a run in the viewer: the arm, curves, a Gantt lane a task, what happened. Returns when it is closed."""
-    from rack.tools.viewer.window import Window
+    """Open the recording of a run in the viewer; return when it is closed.
 
-    # A run's folder, or a file in it: both are what a user may point at. A restarted recorder has left several files.
+    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd itself.
+
+    \b
+    Examples:
+      rack replay runs/nasrem-20250101-120000
+    """
+    # A restarted recorder leaves several files.
     recordings = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
     if not recordings or not all(recording.is_file() for recording in recordings):
         raise Failure(f"{run}: no recording for the viewer, it has no run.rrd", 2)
-    if problem := Window(*(str(recording.resolve()) for recording in recordings)).wait():
+    if problem := ViewerWindow(*(str(recording.resolve()) for recording in recordings)).wait():
         raise Failure(problem)

@@ -10,8 +10,8 @@ import typer
 
 from rack.tools.analysis.report import write_report
 from rack.tools.analysis.report_markdown import show
-from rack.tools.answer import Json, print_json
-from rack.tools.live_table import console
+from rack.tools.console.answer import Json, print_json
+from rack.tools.console.tables import console
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
 

@@ -4,32 +4,33 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from rack.tools.answer import ConfigName, Failure, Faults, Json, Settings
-from rack.tools.interrupt import INTERRUPT
-
-if TYPE_CHECKING:
-    from rack.boards.config.schema import RackConfig
-    from rack.tools.running import RunResult
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.tools.analysis.report import unrecorded, write_report
+from rack.tools.console.answer import ConfigName, Failure, Faults, Json, Settings
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.report import print_report
+from rack.tools.runs.display import display_for
+from rack.tools.runs.folder import folder_of
+from rack.tools.runs.launch import NO_TIME, RunResult, run_rack
 
 Lockstep = Annotated[
-    bool, typer.Option("--lockstep", help="begin a tick when every task due has finished: exact and repeatable")
+    bool, typer.Option("--lockstep", help="begin a tick only when every due task has finished: exact and repeatable")
 ]
 Seconds = Annotated[
-    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="simulated time to run for; default: until it ends")
+    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until it ends")
 ]
-Speed = Annotated[
-    float | None, typer.Option(metavar="X", help="run this many times as fast as real time, as in 2 or 0.5")
-]
+Speed = Annotated[float | None, typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5")]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 Share = Annotated[
-    bool, typer.Option("--share", help="run on cores that another rack's real-time boards hold, too: both will be late")
+    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: both will be late")
 ]
-NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
+NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report files")]
 
 
 def run(
@@ -45,26 +46,22 @@ def run(
     share: Share = False,
     as_json: Json = False,
 ) -> None:
-    """Run a rack until its task ends, and report on it.
+    """Run a rack until its task ends, and report on the run.
 
-    On a terminal a live table shows every task, and what holds the rack; elsewhere a line a second does. --json prints
-    the report as one document, with the same keys whether the run was recorded or not; what only a recording
-    knows is null then.
+    On a terminal a live table shows every task and what holds the rack; elsewhere one line is printed a second. --json
+    prints the report as one document. Its keys are the same with --no-record; values that only a recording knows are
+    null then.
 
-    Exit status: 0 the task was done, or --seconds are over, and no fault is latched; 1 otherwise; 2 usage or config.
-    Ctrl-C ends the run in order, with a report and 130.
+    Exit status: 0 the task was done, or --seconds are over, and no fault is latched; 1 otherwise; 2 usage or config
+    error. Ctrl-C ends the run in order, with a report and exit status 130.
 
     \b
     Examples:
       rack run nasrem
       rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
+      rack run nasrem --faults bad-sensors --out runs/sensors
+      rack run nasrem --set clock.speed=2 --view
     """
-    from rack.boards.config import load
-    from rack.tools.display import display_for
-    from rack.tools.folders import folder_of
-    from rack.tools.report import print_report
-    from rack.tools.running import NO_TIME, run_rack
-
     if view and no_record:
         raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
     overrides = list(settings)
@@ -72,21 +69,19 @@ def run(
     overrides += [f"clock.speed={speed}"] if speed is not None else []
     found = load(config, overrides, faults)
     folder = None if no_record else folder_of(out, found.name)
-    # From the start of the run to the end of its report; the launch in between ends at once.
+    # From the start of the run to the end of its report; during the launch a signal ends the command at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:
-            result = run_rack(found, seconds, folder, display, view, share)
+            result = run_rack(found, seconds, folder, display, view=view, share=share)
         print_report(*_report(found, folder, result), as_json)
     if not result.worked:
-        # Last, and by itself: whoever looks only at the end, or only at stderr, sees why.
+        # On stderr and last, where it is seen in any case.
         print(result.failure(), file=sys.stderr)
     sys.exit(0 if result.worked else 1)
 
 
 def _report(config: RackConfig, folder: Path | None, result: RunResult) -> tuple[dict[str, Any], str]:
-    """Make the report; a recording that cannot be read spoils no run."""
-    from rack.tools.analysis.report import unrecorded, write_report
-
+    """Make the report; a recording that cannot be read does not fail the run."""
     try:
         if folder is not None:
             return write_report(folder)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.answer import Failure, Json, configs, print_json
+from rack.tools.console.answer import Failure, Json, config_names, print_json
 
 if TYPE_CHECKING:
     from rack.boards.config.reference import KeyTable
@@ -24,7 +24,7 @@ TableName = Annotated[
 Of = Annotated[
     str,
     typer.Option(
-        "--config", metavar="CONFIG", help="config whose levels declare [task] and params", autocompletion=configs
+        "--config", metavar="CONFIG", help="config whose levels declare [task] and params", autocompletion=config_names
     ),
 ]
 
@@ -52,16 +52,14 @@ def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False)
 
 
 def _list(found: list[KeyTable]) -> None:
-    from rack.tools.live_table import terminal_width
-    from rack.tools.text_table import table
+    from rack.tools.console.tables import table, terminal_width
 
     rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
     print(*table(["table", "in TOML", "meaning"], rows, terminal_width(), ("in TOML",)), sep="\n")
 
 
 def _show(found: list[KeyTable]) -> None:
-    from rack.tools.live_table import terminal_width
-    from rack.tools.text_table import table
+    from rack.tools.console.tables import table, terminal_width
 
     for at, entry in enumerate(found):
         rows = [[k.name, k.unit, k.type, k.permitted, k.default, k.meaning] for k in entry.keys]

@@ -11,8 +11,8 @@ import pytest
 from rack.boards.config import load
 from rack.tools.charts.measured import TracedRun
 from rack.tools.charts.panel import Panel
-from rack.tools.display import SilentDisplay
-from rack.tools.running import run_rack
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 
 SLOWER = 4

@@ -12,8 +12,7 @@ import numpy as np
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
-from rack.tools.recorder.cycles import CyclesFile
-from rack.tools.recorder.signals import SignalsFile
+from rack.tools.runs.parquet import CyclesFile, SignalsFile
 from rack.tools.runs.recording import Recording
 
 MS, US = 1_000_000, 1_000

@@ -12,8 +12,8 @@ from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
 from rack.tools.analysis.tables import text
-from rack.tools.display import SilentDisplay
-from rack.tools.running import run_rack
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from tests.tools.in_process import rack
 from tests.tools.recordings import MS, Cycle, recorded
 

@@ -8,9 +8,9 @@ import pytest
 
 from rack.boards.config import load, loads
 from rack.boards.errors import ConfigError
-from rack.tools.answer import Failure
 from rack.tools.bench.partition import PARTITIONS, Partition, compare, lines_of
-from rack.tools.progress import Silent
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores
 
@@ -52,7 +52,7 @@ def test_a_board_that_polls_cannot_share_the_only_core() -> None:
 def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLANNED)
-    found = compare(str(path), 0.3, 1, Silent())
+    found = compare(str(path), 0.3, 1, Progress())
     assert [one.partition for one in found] == [partition.name for partition in PARTITIONS]
     for one in found:
         wave, watch = one.levels
@@ -75,7 +75,7 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
 @needs_two_cores
 @pytest.mark.alone
 def test_predictions_from_budgets_agree_with_measurements() -> None:
-    measured = compare("fig3", 0.6, 1, Silent())
+    measured = compare("fig3", 0.6, 1, Progress())
     found = {one.partition: one.levels[0] for one in measured}
     tight, loose = found["tight, 2 cores"].planner, found["loose, 2 cores"].planner
     assert tight is not None

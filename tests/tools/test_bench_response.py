@@ -19,7 +19,7 @@ from rack.tools.bench.response import (
     holds_of_moving_arm,
     run_commands,
 )
-from rack.tools.progress import Silent
+from rack.tools.console.progress import Progress
 from rack.tools.timing.operator_response import response_of
 
 
@@ -57,6 +57,6 @@ def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(rack_
 
 
 def test_a_bench_measures_as_many_as_asked_for() -> None:
-    found = ResponseRuns("nasrem", "lockstep", 3, Silent()).measure(2, twins=0)
+    found = ResponseRuns("nasrem", "lockstep", 3, Progress()).measure(2, twins=0)
     assert found.held
     assert len(found.response.measured) >= 2

@@ -17,11 +17,11 @@ from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.consequences import recovery_ticks
 from rack.boards.faults.kinds import KINDS, NUMBERS
 from rack.boards.faults.request import cycle_ticks, injections
-from rack.tools.answer import Failure
 from rack.tools.campaign.draw import EPISODE, MOST, Course, fault_plans, kill_plans, needs_real_time, size_plans
 from rack.tools.campaign.plan import EXTERNAL, Kill, Plan
 from rack.tools.campaign.shape import SIZED, swept_sizes
 from rack.tools.campaign.targets import Targets, kinds_for
+from rack.tools.console.answer import Failure
 
 BOTH = (True, False)
 COUNT = 10

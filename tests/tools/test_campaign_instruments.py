@@ -6,8 +6,8 @@ import pytest
 
 from rack.boards.config import load
 from rack.levels.arm.monitors import LimitMonitor
-from rack.tools.answer import Failure
 from rack.tools.campaign.instruments import examine
+from rack.tools.console.answer import Failure
 
 
 def test_a_counter_of_violations_that_counts_passes() -> None:

@@ -18,7 +18,7 @@ from rack.tools.cli import run_commands
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.tables import forecast_lines
 from tests.conftest import SMALL
-from tests.tools.test_commands import rack
+from tests.tools.command_line import rack
 
 Check = Callable[..., subprocess.CompletedProcess[str]]
 FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")

@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 
 from rack.boards.config import CONFIGS, load, names
 from rack.boards.config.toml import to_toml
-from rack.tools.answer import LONGEST_LINE
 from rack.tools.cli import run_commands
+from rack.tools.console.answer import MAX_LINE
 
 EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "300"))
 BOUND_S = 20
@@ -165,7 +165,7 @@ def check(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dic
 def judge(status: int, document: dict[str, Any]) -> None:
     if status == 2:
         assert document["error"]
-        assert all(line and line.isprintable() and len(line) <= LONGEST_LINE for line in document["error"])
+        assert all(line and line.isprintable() and len(line) <= MAX_LINE for line in document["error"])
     else:
         assert status == (0 if document["timing"]["holds"] else 1)
 

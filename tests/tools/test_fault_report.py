@@ -11,8 +11,8 @@ import pytest
 from rack.boards.config import load
 from rack.tools.analysis.report import write_report
 from rack.tools.analysis.report_markdown import markdown
-from rack.tools.display import SilentDisplay
-from rack.tools.running import run_rack
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from rack.tools.viewer.reading import read
 
 HANG = '{ kind = "hang", board = "upper", tick = 80 }'
@@ -98,7 +98,7 @@ def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder:
 
 
 def test_the_graph_of_boards_shows_who_is_lost_until_it_is_back(folder: Path, report: Report) -> None:
-    from rack.tools.viewer.palette import STATES
+    from rack.tools.viewer.style import STATES
 
     names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
     nodes = read(folder / "run.rrd", "/hierarchy", "GraphNodes:colors")

@@ -18,7 +18,7 @@ from rack.boards.config import load
 from rack.boards.errors import ConfigError
 from rack.boards.faults.kinds import KINDS
 from rack.boards.rack import Rack
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.injecting import live
 from rack.tools.injecting.live import LiveRack
 from tests.boards.fault_racks import DRIVEN

@@ -1,4 +1,4 @@
-"""`rack record` on a rack that runs, and `--view` and `rack replay` where there is nothing to show or no screen."""
+"""`rack record` on a running rack; the viewer without a screen, `rack replay` without a recording."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import pytest
 
 from rack.boards.config import load
 from rack.boards.rack import Rack
-from rack.tools.answer import Failure
+from rack.tools.analysis.report import write_report
+from rack.tools.console.answer import Failure
 from rack.tools.replay import replay
 from rack.tools.runs.recording import Recording
+from rack.tools.runs.window import ViewerWindow
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.window import Window
 from tests.processes import RACK
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,14 +27,7 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
     config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
     with Rack(config) as rack:
         rack.start()
-        command = [
-            *RACK,
-            "record",
-            rack_name,
-            "--out",
-            str(tmp_path / "run"),
-            "--json",
-        ]
+        command = [*RACK, "record", rack_name, "--out", str(tmp_path / "run"), "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
             deadline = time.monotonic() + WATCHDOG_S
             while not (tmp_path / "run" / "run.rrd").is_file() and time.monotonic() < deadline:
@@ -43,8 +37,11 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
                 continue
             answer = json.loads(recorder.communicate(timeout=WATCHDOG_S)[0])
     assert recorder.returncode == 0
-    assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "told": []}
+    assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "notes": []}
     assert rack.outcome is not None
+    report, _ = write_report(tmp_path / "run")
+    assert report["rack"] == rack_name
+    assert report["tasks"]["lower"]["traced"] > 0
     ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
     assert ticks[-1] == rack.outcome.ticks - 1
     assert read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist() == ticks.tolist()
@@ -54,7 +51,7 @@ def test_a_window_without_a_screen_says_what_to_do_elsewhere(monkeypatch: pytest
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(Failure, match=r"no screen: .*: rerun run\.rrd"):
-        Window("run.rrd")
+        ViewerWindow("run.rrd")
 
 
 def test_a_folder_without_a_recording_is_no_run_to_replay(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tests.tools.test_commands import rack
+from tests.tools.command_line import rack
 
 
 def test_without_a_table_it_lists_the_tables(small: Path) -> None:

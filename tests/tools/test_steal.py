@@ -10,8 +10,8 @@ from rack.backplane.trace import Flag
 from rack.boards.config import load
 from rack.tools.analysis.report import report_of
 from rack.tools.analysis.report_markdown import markdown
-from rack.tools.recorder import steal as meter
-from rack.tools.recorder.steal import Stolen
+from rack.tools.runs import steal as meter
+from rack.tools.runs.steal import Stolen
 from tests.tools.recordings import MS, Cycle, recorded
 
 HEAD = "cpu  9 9 9 9 9 9 9 99 0 0\n"

@@ -12,7 +12,7 @@ from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, SYSTEM, EquationVerdict, verdicts
 from rack.tools.analysis.breaches import Breach, breaches
 from rack.tools.analysis.rules import cycle_ns, response_ns, slice_ns, steps_ns
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.runs.cycles import WORST, Cycles, budgets_of, cycles_of, worst_of
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording

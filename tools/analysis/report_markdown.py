@@ -8,10 +8,10 @@ from typing import Any
 
 from rich.console import Console
 
-from rack.tools.holds import resume_command
+from rack.tools.console.tables import table
 from rack.tools.runs import markdown as md
 from rack.tools.runs.history import counted
-from rack.tools.text_table import table
+from rack.tools.runs.holds import resume_command
 
 Report = dict[str, Any]
 

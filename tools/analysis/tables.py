@@ -11,8 +11,8 @@ from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.analysis.breaches import Breach, Broken
 from rack.tools.analysis.document import summary, task_document, worst_words
+from rack.tools.console.tables import table
 from rack.tools.runs.cycles import START_UP_S, Cycles, restarts
-from rack.tools.text_table import table
 
 SHOWN = 10
 """Most cycles in the list of those that broke an equation; the document has them all."""

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from rack.tools.answer import Json, print_json
-from rack.tools.interrupt import INTERRUPT
+from rack.tools.console.answer import Json, print_json
+from rack.tools.console.interrupt import INTERRUPT
 
-bench = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 
 Config = Annotated[str, typer.Option("--config", metavar="CONFIG", help="rack by name, or a path to a .toml file")]
 
@@ -39,7 +39,7 @@ def mailbox(as_json: Json = False) -> None:
 def recording(config: Config = "nasrem", as_json: Json = False) -> None:
     """Misses and lateness of a rack without a recorder, with it, and with a live viewer, interleaved."""
     from rack.tools.bench.recording import lines_of, measure
-    from rack.tools.live_table import terminal_width
+    from rack.tools.console.tables import terminal_width
 
     costs = measure(config)
     _print({"recording": [asdict(cost) for cost in costs]}, lines_of(costs, terminal_width()), as_json)
@@ -72,8 +72,8 @@ def partition(
     model's predictions from the budgets of the config.
     """
     from rack.tools.bench.partition import compare, lines_of
-    from rack.tools.live_table import terminal_width
-    from rack.tools.progress import progress_for
+    from rack.tools.console.progress import progress_for
+    from rack.tools.console.tables import terminal_width
 
     with progress_for(as_json) as progress:
         found = compare(config, seconds, rounds, progress)
@@ -98,8 +98,8 @@ def response(
     on. Exit status 1 if one does not, or exceeds a bound.
     """
     from rack.tools.bench.response import ResponseRuns
-    from rack.tools.live_table import terminal_width
-    from rack.tools.progress import progress_for
+    from rack.tools.console.progress import progress_for
+    from rack.tools.console.tables import terminal_width
     from rack.tools.timing.operator_response import plot
 
     with progress_for(as_json) as progress:
@@ -115,6 +115,6 @@ def response(
 
 def _print(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
     """Print a result: as JSON, or as text for people."""
-    from rack.tools.live_table import print_wrapped
+    from rack.tools.console.tables import print_wrapped
 
     print_json(document) if as_json else print_wrapped("\n".join(lines))

@@ -15,12 +15,12 @@ from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wi
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.levels.timing.response_time import response_times
 from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
-from rack.tools.answer import Failure
-from rack.tools.display import display_for
-from rack.tools.progress import Progress
-from rack.tools.running import run_rack
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.console.tables import table
+from rack.tools.runs.display import display_for
+from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
-from rack.tools.text_table import table
 
 LAUNCH_S = 3.0
 """About how long launching and recording a run take in addition to its time."""

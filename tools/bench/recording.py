@@ -19,10 +19,10 @@ from rack.backplane.trace import Flag, trace_ring
 from rack.boards.config import RackConfig, load
 from rack.boards.rack import Rack
 from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
-from rack.tools.answer import Failure
-from rack.tools.recorder.process import RecorderProcess
-from rack.tools.text_table import table
-from rack.tools.viewer.window import Window, free_port, url
+from rack.tools.console.answer import Failure
+from rack.tools.console.tables import table
+from rack.tools.runs.recorder_process import RecorderProcess
+from rack.tools.runs.window import ViewerWindow, free_port, url
 
 PHASES = ("without", "recording", "live viewer")
 PHASE_S = 6.0
@@ -118,7 +118,7 @@ def _recorder(rack: Rack, phase: str, folder: Path) -> Iterator[int | None]:
     try:
         if not recorder.attach(rack.config.name, folder, port):
             raise Failure(recorder.finish())
-        window = None if port is None else Window(url(port), headless=True)
+        window = None if port is None else ViewerWindow(url(port), headless=True)
         yield recorder.pid
     finally:
         if window is not None:

@@ -22,8 +22,8 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.operating.command import CommandConfig
 from rack.boards.rack import Rack
 from rack.levels.timing.system_response import CommandPath, command_paths
-from rack.tools.answer import Failure
-from rack.tools.progress import Progress
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
 from rack.tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
 from rack.tools.runs.recording import Recording
 from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of

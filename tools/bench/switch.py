@@ -25,7 +25,7 @@ import posix_ipc
 from rack.backplane.process import pin
 from rack.boards.processor import die_with_parent, set_priority
 from rack.levels.timing.trace_times import Distribution, distribution
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 
 PAPER_US = 100.0
 """Task switch on NIST's boards (NISTIR 90-4251, section 4)."""

@@ -15,7 +15,6 @@ from rack.backplane.layout import Layout
 from rack.boards.config import wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.request import injections
-from rack.tools.answer import Failure
 from rack.tools.campaign.draw import Course, fault_plans, kill_plans, needs_real_time, size_plans
 from rack.tools.campaign.instruments import examine
 from rack.tools.campaign.interrupt import Interrupt
@@ -25,7 +24,8 @@ from rack.tools.campaign.results import Faultless, Finding, Results, kept
 from rack.tools.campaign.targets import Targets, kinds_for
 from rack.tools.campaign.trial import restart_s
 from rack.tools.campaign.workers import Job, Workers
-from rack.tools.progress import Progress
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
 
 LAUNCH_S = 2.0
 """What a launch and an end take, about: the progress bar's guess."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.answer import ConfigName, Failure, Json, Settings, print_json
+from rack.tools.console.answer import ConfigName, Failure, Json, Settings, print_json
 
 if TYPE_CHECKING:
     from rack.tools.campaign.campaign import Campaign, Order
@@ -87,8 +87,8 @@ def campaign(
     """
     from rack.tools.campaign.campaign import ORDER, Campaign
     from rack.tools.campaign.interrupt import Interrupt
-    from rack.tools.folders import folder_of
-    from rack.tools.progress import progress_for
+    from rack.tools.console.progress import progress_for
+    from rack.tools.runs.folder import folder_of
 
     order = _order(
         config, settings, injections, seed, kinds, kills, lockstep, realtime, faultless, load, sizes, seconds

@@ -10,7 +10,7 @@ from rack.boards.config.schema import RackConfig
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import STATE, build_cell, sizes
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 
 FACTOR = 2.0
 """How many times its limit the velocity is that the counter must see."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
-from rack.tools.interrupt import INTERRUPT
+from rack.tools.console.interrupt import INTERRUPT
 
 BOUND_S = 30.0
 """A report of hours of trials is worth more than 2 s; a second signal ends the campaign at once."""

@@ -11,8 +11,8 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.faults.kinds import KINDS, Kind
 from rack.boards.faults.request import cycle_ticks
 from rack.levels.level import Executor
-from rack.tools.answer import Failure
 from rack.tools.campaign.plan import EXTERNAL
+from rack.tools.console.answer import Failure
 
 
 @dataclass(frozen=True)

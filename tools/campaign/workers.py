@@ -17,12 +17,12 @@ from typing import Any
 
 from rack.boards.config.schema import RackConfig
 from rack.boards.processor import die_with_parent
-from rack.tools.answer import Failure
 from rack.tools.campaign.interrupt import Interrupt
 from rack.tools.campaign.plan import Plan
 from rack.tools.campaign.results import Judged, keep
 from rack.tools.campaign.trial import run_trial
-from rack.tools.interrupt import INTERRUPT
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
 
 LOOK_S = 0.2
 """How often a campaign that waits for its trials looks whether it is to end."""

@@ -9,13 +9,13 @@ from typing import Any
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, budgets, load, wire
-from rack.tools.answer import Failure
 from rack.tools.charts.letters import column_for, lines
 from rack.tools.charts.measured import TracedRun
 from rack.tools.charts.panel import Panel
 from rack.tools.charts.scheduled import Schedule
 from rack.tools.charts.window import WindowOptions
-from rack.tools.folders import RUNS
+from rack.tools.console.answer import Failure
+from rack.tools.runs.folder import RUNS
 from rack.tools.runs.recording import Recording
 
 NO_BUDGET = "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"

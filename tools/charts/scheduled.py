@@ -10,9 +10,9 @@ from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.timing.schedule import Chart, simulate
 from rack.levels.timing.tasks import Part, Unit
-from rack.tools.answer import Failure
 from rack.tools.charts.panel import Count, Panel
 from rack.tools.charts.patterns import Detail, lanes_of, patterns
+from rack.tools.console.answer import Failure
 
 SLICES = 10
 """Fewest slices of the slowest task over which patterns are counted."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from typer.core import TyperCommand
 
-from rack.tools.text_table import table
+from rack.tools.console.tables import table
 
 
 class KindsCommand(TyperCommand):
@@ -16,7 +16,7 @@ class KindsCommand(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
-        from rack.tools.live_table import terminal_width
+        from rack.tools.console.tables import terminal_width
 
         return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text(terminal_width())])
 

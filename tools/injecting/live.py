@@ -22,8 +22,8 @@ from rack.boards.faults.hog import run_hog
 from rack.boards.faults.request import injection
 from rack.boards.faults.text import describe, document
 from rack.boards.processor import set_priority
-from rack.tools.answer import Failure
-from rack.tools.text_table import table
+from rack.tools.console.answer import Failure
+from rack.tools.console.tables import table
 
 BEGIN_S = 5.0
 """Bound of the wait for a fault that is to begin at once: a clock that gives out a tick begins it."""

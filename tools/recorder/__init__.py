@@ -1,1 +1,1 @@
-"""The recorder: a process of its own that drains a rack's rings into Parquet files."""
+"""The recorder: a separate process that drains a rack's rings into the files of a run."""

@@ -1,6 +1,6 @@
-"""The recorder's process, `python -m rack.tools.recorder`: stdin names rack and folder, and ends when the run is over.
+"""The recorder process, `python -m rack.tools.recorder`: stdin names rack and folder, and closes when the run is over.
 
-On stdout it says "recording" once it has attached; every other line is something that the user should know.
+It prints "recording" once it has attached; every other line is a message for the user.
 """
 
 from __future__ import annotations
@@ -15,30 +15,29 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rack.backplane.segment import Segment
-    from rack.tools.recorder.side_sink import Sink
+    from rack.tools.recorder.recorder import Sink
 
 NICENESS = 10
-"""On a core that it shares, the recorder comes behind boards without real-time priority too."""
+"""On a shared core, boards go first, even those without real-time priority."""
 
 
 def main() -> None:
-    """Attach to the rack that one line of JSON names, say so on stdout, record until stdin ends."""
-    # Ctrl-C and the like reach the whole foreground group; the launcher decides when the recording is complete.
+    """Attach to the rack that one line of JSON names, and record until stdin closes."""
+    # Ctrl-C reaches the whole foreground group; but the launcher decides when the recording is complete.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
     from rack.backplane.segment import Segment
-    from rack.tools.recorder.recorder import Recorder
-    from rack.tools.recorder.side_sink import SideSink
+    from rack.tools.recorder.recorder import Recorder, SafeSink
 
     with suppress(ImportError):
-        import rack.tools.viewer.sink  # noqa: F401  takes a second: spent while the rack is being launched
+        import rack.tools.viewer.sink  # noqa: F401  takes a second, while the rack is being launched
     line = sys.stdin.readline()
     if not line:
         return
     name, folder, port = json.loads(line)
     segment = Segment.attach(name)
-    view = SideSink(lambda: _view(segment, Path(folder), port), _tell)
+    view = SafeSink(lambda: _view(segment, Path(folder), port), _tell)
     with Recorder(segment, Path(folder), view) as recorder:
         _tell("recording")
         recorder.follow(until=sys.stdin.fileno())
@@ -51,7 +50,7 @@ def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
 
 
 def _tell(text: str) -> None:
-    # Nobody may listen any more; the files are finished all the same.
+    # The launcher may be gone; the files are finished all the same.
     with suppress(OSError):
         print(text, flush=True)
 

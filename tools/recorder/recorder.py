@@ -4,36 +4,89 @@ from __future__ import annotations
 
 import os
 import select
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
+
+import numpy as np
 
 from rack.backplane.process import is_alive
 from rack.backplane.ring import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Run, System
-from rack.tools.recorder.files import RunFiles
-from rack.tools.recorder.side_sink import Sink
-from rack.tools.recorder.spool import Frame, Spool
-from rack.tools.recorder.steal import StealMeter
+from rack.tools.runs.spool import Frame, RunFiles, Spool
+from rack.tools.runs.steal import StealMeter
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
 """How often rings are drained. They hold two seconds; lockstep waits for its recorder and runs faster than time."""
 
 
-class Recorder:
-    """Records one rack into `folder`. Use it as a context: leaving it finishes the files.
+class Sink(Protocol):
+    """Takes what a recorder drains."""
 
-    The first recorder of a rack in lockstep is its follower: the clock waits for it. `beside` takes the same rows.
+    def add_cycles(self, task: str, rows: np.ndarray) -> None:
+        """Take trace records of a task, shape (rows,)."""
+
+    def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
+        """Take rows of a mailbox's ring, shape (rows,)."""
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Note that everything before `tick` has been taken; `lost` counts lost rows by ring."""
+
+    def close(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Finish."""
+
+
+class SafeSink:
+    """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the recorder continues."""
+
+    def __init__(self, opened: Callable[[], Sink], tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._sink: Sink | None = None
+        self._guarded(lambda: setattr(self, "_sink", opened()))
+
+    def add_cycles(self, task: str, rows: np.ndarray) -> None:
+        """Pass trace records on."""
+        self._pass(lambda sink: sink.add_cycles(task, rows))
+
+    def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
+        """Pass messages on."""
+        self._pass(lambda sink: sink.add_signals(mailbox, rows))
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Pass the tick on."""
+        self._pass(lambda sink: sink.advance(tick, lost))
+
+    def close(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Finish the sink."""
+        self._pass(lambda sink: sink.close(tick, lost))
+
+    def _pass(self, call: Callable[[Sink], None]) -> None:
+        if (sink := self._sink) is not None:
+            self._guarded(lambda: call(sink))
+
+    def _guarded(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except Exception as error:
+            self._sink = None
+            self._tell(f"run.rrd ends here: {' '.join(str(error).split()) or type(error).__name__}")
+
+
+class Recorder:
+    """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the same rows.
+
+    The first recorder of a rack in lockstep is its follower: the clock waits for it.
     """
 
-    def __init__(self, segment: Segment, folder: Path, beside: Sink | None = None) -> None:
+    def __init__(self, segment: Segment, folder: Path, view: Sink | None = None) -> None:
         layout = segment.layout
-        self._beside = beside
+        self._view = view
         self._segment, self._words = segment, segment.words
-        # The spool first: it is refused where another recorder is at work, whose files stay as they are.
+        # The spool first: it fails where another recorder is running, and leaves that one's files alone.
         self._spool = Spool(folder, layout)
         self._files = RunFiles(folder, layout)
         self._spool.resume(self._files.add)
@@ -42,12 +95,12 @@ class Recorder:
         self._rings = traces | mailboxes
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)
-        # In lockstep nothing is late.
+        # Lockstep has no deadlines that steal could break.
         self._steal = None if self._words[System.LOCKSTEP] else StealMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         self._is_follower = follower == os.getpid() or not is_alive(follower)
-        self._follow_from(self._words[System.TICK])
+        self._report_progress(self._words[System.TICK])
 
     def __enter__(self) -> Self:
         return self
@@ -56,31 +109,31 @@ class Recorder:
         self.close()
 
     def drain(self) -> None:
-        """Take over everything written since the last call."""
+        """Record everything written since the last call."""
         tick = self._words[System.TICK]
         for name, ring in self._rings.items():
             rows, lost = ring.drain()
             self._spool.add(name, rows, lost)
             self._files.add(Frame(name, rows, lost))
-            if self._beside is not None and name in self._files.tasks:
-                self._beside.add_cycles(name, rows)
-            elif self._beside is not None:
-                self._beside.add_signals(name, rows)
+            if self._view is not None and name in self._files.tasks:
+                self._view.add_cycles(name, rows)
+            elif self._view is not None:
+                self._view.add_signals(name, rows)
         self._spool.flush()
         if self._steal is not None:
             self._steal.look()
-        if self._beside is not None:
-            self._beside.advance(tick, self._files.lost)
-        self._follow_from(tick)
+        if self._view is not None:
+            self._view.advance(tick, self._files.lost)
+        self._report_progress(tick)
 
-    def _follow_from(self, tick: int) -> None:
-        """In lockstep, tell the clock how far the recording is; it may have let a follower go that was held up."""
+    def _report_progress(self, tick: int) -> None:
+        """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost after a delay."""
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = tick
             self._words[System.FOLLOWER_PID] = os.getpid()
 
     def follow(self, until: int | None = None) -> None:
-        """Record until the run is over; with a descriptor `until`, until that can be read or its other end is gone."""
+        """Record until the run is over; with a descriptor `until`, until that is readable or closed."""
         period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
         watched = [] if until is None else [until]
         while not select.select(watched, [], [], period_s)[0]:
@@ -91,15 +144,15 @@ class Recorder:
         self.drain()
 
     def stop(self) -> None:
-        """Have `follow` return soon."""
+        """Make `follow` return soon."""
         self._is_stopped = True
 
     def close(self) -> None:
-        """Finish both files; the rack goes on without a follower."""
+        """Finish both files; the rack continues without a follower."""
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
         self._spool.flush(now=True)
         self._files.close([] if self._steal is None else self._steal.stolen)
         self._spool.remove()
-        if self._beside is not None:
-            self._beside.close(self._words[System.TICK] + 1, self._files.lost)
+        if self._view is not None:
+            self._view.close(self._words[System.TICK] + 1, self._files.lost)

@@ -14,7 +14,7 @@ from rack.backplane.message import State
 from rack.backplane.trace import Flag
 from rack.levels.operator import Operation
 from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
-from rack.tools.answer import Failure
+from rack.tools.console.answer import Failure
 from rack.tools.runs.recording import Recording
 
 OWN = "holding"

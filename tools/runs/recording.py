@@ -20,10 +20,10 @@ from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, loads
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
-from rack.tools.answer import Failure
-from rack.tools.recorder.files import mend
-from rack.tools.recorder.signals import HEAD
-from rack.tools.recorder.steal import Stolen
+from rack.tools.console.answer import Failure
+from rack.tools.runs.parquet import HEAD
+from rack.tools.runs.spool import mend
+from rack.tools.runs.steal import Stolen
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """Errors of reading a damaged file, or a file of another kind."""

@@ -12,7 +12,7 @@ from rack.levels.timing.rack import LevelTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
 from rack.levels.timing.verdicts import LOAD, RESPONSE_TIME, EquationVerdict
-from rack.tools.text_table import table
+from rack.tools.console.tables import table
 
 
 def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:

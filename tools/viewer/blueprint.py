@@ -1,34 +1,36 @@
-"""The first look: what the viewer shows of a run, without a click."""
+"""The first view of a run: the blueprint of all views, the place of the eye, and the config as a document."""
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Sequence
 
+import mujoco
+import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.messages import SERVO_STATUS
 from rack.levels.robot.cell import Cell
-from rack.tools.viewer import timing as ages
-from rack.tools.viewer import timing as load
-from rack.tools.viewer.activity import LEVELS, LOG
-from rack.tools.viewer.document import CONFIG
-from rack.tools.viewer.events import EVENTS
-from rack.tools.viewer.eye import eye_on
-from rack.tools.viewer.fields import SIGNALS
-from rack.tools.viewer.geometry import CELL, COLLISION
-from rack.tools.viewer.hierarchy import COLUMN, HIERARCHY, ROW, positions
-from rack.tools.viewer.joints import ERROR, GRIPPER, JOINTS, QUANTITIES
-from rack.tools.viewer.lanes import lanes_view
-from rack.tools.viewer.own import RECORDER
-from rack.tools.viewer.poses import FRAMES
-from rack.tools.viewer.stream import path
-from rack.tools.viewer.timelines import SIM_TIME
+from rack.tools.viewer import timing
+from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
+from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
+from rack.tools.viewer.events import EVENTS, RECORDER
+from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, LOG, ROW, positions
+from rack.tools.viewer.stream import SIM_TIME, Stream, path
+from rack.tools.viewer.style import lanes_view
 from rack.tools.viewer.timing import BOARDS
 
+CONFIG = "config"
 CYCLES_S = 0.022
-"""What the Gantt lanes show before and behind the time that is looked at: some cycles of fast and of slower boards."""
+"""Time before and after the cursor in the Gantt lanes: some cycles of fast and of slower boards."""
+DIRECTION = np.array([0.75, -0.95, 0.55])
+"""From the cell to the eye: from the front right, slightly above."""
+DISTANCE = 1.75
+"""In radii of the cell, so that it fills the view, including a raised arm."""
+ENDLESS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 
 
 def blueprint(layout: Layout, config: RackConfig, cell: Cell | None, live: bool) -> rrb.Blueprint:
@@ -62,7 +64,7 @@ def _cell_view(cell: Cell) -> rrb.View:
 
 
 def _joints(names: Sequence[str]) -> rrb.Container:
-    """Return all joints in one view a quantity, and behind it a view a joint, with its limits."""
+    """Return a view of all joints for each quantity, and in a second tab one of each joint with its limits."""
     views = [
         rrb.Tabs(
             _curves(quantity, [path(JOINTS, name, quantity) for name in names], legend=quantity == "torque"),
@@ -80,15 +82,15 @@ def _joint(name: str, quantity: str) -> rrb.View:
 
 def _load(config: RackConfig) -> rrb.Container | rrb.View:
     if config.clock.mode == "lockstep":
-        return _curves("execution, ms; no deadlines in lockstep", [_all(load.TIMES)])
-    use = _curves("use of the time slice, %", [_all(load.LOAD)])
-    return rrb.Tabs(use, _curves("lateness and execution, ms", [_all(load.TIMES)]))
+        return _curves("execution, ms; no deadlines in lockstep", [_all(timing.TIMES)])
+    use = _curves("use of the time slice, %", [_all(timing.LOAD)])
+    return rrb.Tabs(use, _curves("lateness and execution, ms", [_all(timing.TIMES)]))
 
 
 def _ages(layout: Layout) -> rrb.Container:
-    """Return the ages; a plan may stand for long, and has a scale of its own."""
-    plans = [path(ages.AGES, mailbox.name) for mailbox in layout.mailboxes if mailbox.name.endswith(".plan")]
-    sampled = [_all(ages.AGES), *(f"- {plan}" for plan in plans)]
+    """Return the ages; plans, which may be old, have their own scale."""
+    plans = [path(timing.AGES, mailbox.name) for mailbox in layout.mailboxes if mailbox.name.endswith(".plan")]
+    sampled = [_all(timing.AGES), *(f"- {plan}" for plan in plans)]
     return rrb.Tabs(
         _curves("age of messages read, ms", sampled, legend=False),
         _curves("plans", plans),
@@ -120,3 +122,32 @@ def _curves(name: str, contents: list[str], legend: bool = True) -> rrb.View:
 
 def _all(entity: str) -> str:
     return f"{path(entity)}/**"
+
+
+def eye_on(cell: Cell) -> rrb.EyeControls3D:
+    """Return the place from which the eye sees all of a cell at its start, except the ground."""
+    model, data = cell.model, cell.start()
+    geoms = np.flatnonzero(~np.isin(model.geom_type, ENDLESS))
+    radii = model.geom_rbound[geoms, None]
+    low = (data.geom_xpos[geoms] - radii).min(axis=0, initial=np.inf)
+    high = (data.geom_xpos[geoms] + radii).max(axis=0, initial=-np.inf)
+    if not np.isfinite([low, high]).all():
+        low, high = model.stat.center - model.stat.extent, model.stat.center + model.stat.extent
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
+    return rrb.EyeControls3D(position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1))
+
+
+def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout) -> None:
+    """Log the resolved config, and the properties of the run."""
+    stream.static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))
+    values = rr.AnyValues(
+        rack=layout.rack,
+        mode=config.clock.mode,
+        speed=config.clock.speed,
+        clock_ms=layout.clock_ns * 1e-6,
+        tasks=[task.name for task in layout.tasks],
+        robot=str(config.robot.model.stem) if config.robot else "none",
+        machine=platform.platform(),
+    )
+    stream.property("run", values)

@@ -1,24 +1,26 @@
-"""What happened to the rack, from its event log: log lines, and one lane a board of what holds until the next event."""
+"""Log lines: the rack's events, from its event log, and the recorder's own losses and load.
+
+Each board also has a lane: the kind of its last event, until the next."""
 
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import rerun as rr
 
-from rack.tools.viewer import palette
-from rack.tools.viewer.activity import LOG
-from rack.tools.viewer.hierarchy import Hierarchy
-from rack.tools.viewer.lanes import style_lane, write_span
+from rack.tools.viewer.levels import LOG, Hierarchy
 from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.style import EVENT_COLOURS, style_lane, write_span
 
-EVENTS = "events"
+EVENTS, RECORDER = "events", "recorder"
 UNSHOWN = ("printed", "miss")
-"""Events that are in the log alone: misses have lanes of their own."""
+"""Events without a lane: misses have their own."""
 RACK = "rack"
-"""Lane of events that are of no board."""
+"""Lane of events that belong to no board."""
 LEVELS = {
     "died": "ERROR",
     "detection": "ERROR",
@@ -28,7 +30,7 @@ LEVELS = {
     "miss": "DEBUG",
     "printed": "DEBUG",
 }
-"""Log levels by kind of event; of any other it is INFO."""
+"""Log levels by kind of event; INFO for any other."""
 
 
 class Events:
@@ -45,7 +47,7 @@ class Events:
             return
         with self._path.open("rb") as file:
             file.seek(self._read)
-            # A line that is still being written is read the next time.
+            # A line still being written is read the next time.
             lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
@@ -70,9 +72,34 @@ class Events:
 
     def _show(self, tick: int, stamp_ns: int, board: str, kind: str, code: str) -> None:
         if board not in self._lanes:
-            style_lane(self._stream, (EVENTS, board), palette.EVENTS)
-        # The end of a fault ends its span, and nothing that came of it meanwhile.
+            style_lane(self._stream, (EVENTS, board), EVENT_COLOURS)
+        # The end of a fault ends its own span only, not that of a later event.
         if code == "ends" and self._lanes.get(board) != kind:
             return
         self._lanes[board] = "" if code == "ends" else kind
         write_span(self._stream, tick, stamp_ns, (EVENTS, board), self._lanes[board])
+
+
+class Losses:
+    """Writes how many rows were overwritten before the recorder took them, and its load; logs every loss."""
+
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
+        self._logged: dict[str, int] = {}
+        stream.static((RECORDER, "rows_lost"), rr.SeriesLines(names=["rows lost"], colors=[(230, 50, 50)]))
+        stream.static((RECORDER, "load"), rr.SeriesLines(names=["recorder, % of a core"]))
+        self._cpu_s, self._wall_s = time.process_time(), time.monotonic()
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Write the losses and the load since the last call."""
+        stamp_ns = time.monotonic_ns()
+        for ring, count in lost.items():
+            if count > self._logged.get(ring, 0):
+                line = rr.TextLog(f"recorder: {count - self._logged.get(ring, 0)} rows of {ring} lost", level="ERROR")
+                self._stream.at(tick, stamp_ns, (LOG, "recorder"), line)
+        self._logged = dict(lost)
+        self._stream.at(tick, stamp_ns, (RECORDER, "rows_lost"), rr.Scalars(sum(lost.values())))
+        cpu_s, wall_s = time.process_time(), time.monotonic()
+        share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
+        self._cpu_s, self._wall_s = cpu_s, wall_s
+        self._stream.at(tick, stamp_ns, (RECORDER, "load"), rr.Scalars(100.0 * share))

@@ -16,34 +16,32 @@ from typing import NamedTuple
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from rack.tools.answer import Failure
-from rack.tools.viewer.timelines import SIM_TIME
-from rack.tools.viewer.window import HOST, Window, free_port, url
+from rack.tools.console.answer import Failure
+from rack.tools.runs.window import HOST, ViewerWindow, free_port, url
+from rack.tools.viewer.stream import SIM_TIME
 
 PATIENCE_S = 30.0
 LOOK_S = 0.05
 DYING_S = 2.0
-"""A viewer without a driver listens first, and then ends."""
+"""A viewer without a graphics driver listens at first, then ends."""
 PAUSE_S = 0.4
-"""Two pictures this far apart that are the same: the viewer has drawn all it has."""
-NO_COMPLAINT = ("INFO", "DEBUG", "TRACE")
+"""When two pictures this far apart are equal, the viewer has drawn everything."""
+QUIET_LEVELS = ("INFO", "DEBUG", "TRACE")
 SOFTWARE = "Software rasterizer"
-"""What the viewer remarks where there is no graphics card; it draws all the same."""
-
-
+"""The viewer's remark where there is no graphics card; it draws all the same."""
 PACKAGES = (
     *("mesa-vulkan-drivers", "libvulkan1", "libgl1-mesa-dri", "libegl1", "libxkbcommon0", "libxkbcommon-x11-0"),
     *("libx11-xcb1", "libxcursor1", "libxi6", "libxrandr2"),
 )
-"""Debian's packages that draw where there is no graphics card; .ci/run installs them."""
+"""Debian's packages for drawing without a graphics card; .ci/run installs them."""
 
 
 class NoViewerError(Failure):
-    """No picture can be drawn on this machine; the message says why, and what to install."""
+    """This machine cannot draw pictures; the message says why, and what to install."""
 
 
 class Look(NamedTuple):
-    """A picture (PNG) as it was drawn, and what the viewer complained of, in its views and in its log."""
+    """A picture (PNG), and the complaints of the viewer in its views and its log."""
 
     picture: bytes
     complaints: tuple[str, ...]
@@ -56,7 +54,7 @@ class Screen:
         self._client = client
 
     def look(self, at_s: float, view: str | None = None) -> Look:
-        """Return what is to be seen at a simulated time, s, once it stands still: all, or the view of that name.
+        """Return the picture at a simulated time, s, once it no longer changes: all views, or the one of that name.
 
         Raises `KeyError` when there is no such view.
         """
@@ -74,7 +72,7 @@ class Screen:
         for view in self._client.get_state().views:
             yield from (f"view '{view.name}': {report}" for report in view.reports)
         for entry in self._client.get_logs():
-            if entry.level.upper() not in NO_COMPLAINT and SOFTWARE not in entry.message:
+            if entry.level.upper() not in QUIET_LEVELS and SOFTWARE not in entry.message:
                 yield f"{entry.level.lower()}: {entry.message}"
 
 
@@ -82,8 +80,8 @@ class Screen:
 def opened(recording: Path) -> Iterator[Screen]:
     """Open a recording in a headless viewer. Raises `NoViewerError` where the machine lacks the graphics libraries."""
     port = free_port()
-    # Started here: the viewer that `ViewerClient.spawn` starts listens to every machine around.
-    window = Window(headless=True, port=port)
+    # Not by `ViewerClient.spawn`: that viewer would listen on every network.
+    window = ViewerWindow(headless=True, port=port)
     try:
         client = _connected(window, port)
         try:
@@ -95,7 +93,7 @@ def opened(recording: Path) -> Iterator[Screen]:
         window.close()
 
 
-def _connected(window: Window, port: int) -> ViewerClient:
+def _connected(window: ViewerWindow, port: int) -> ViewerClient:
     deadline = time.monotonic() + PATIENCE_S
     while window.is_open and time.monotonic() < deadline:
         with socket.socket() as probe:
@@ -105,15 +103,15 @@ def _connected(window: Window, port: int) -> ViewerClient:
     raise NoViewerError(_why(window, f"it does not listen after {PATIENCE_S:g} s"))
 
 
-def _why(window: Window, otherwise: object) -> str:
-    """Return why there is no picture, and what helps on a machine without a graphics card."""
+def _why(window: ViewerWindow, otherwise: object) -> str:
+    """Return why there is no picture, and what to install."""
     with suppress(TimeoutError):
         window.await_end(DYING_S)
     return f"{otherwise if window.is_open else window.wait()}; {packages_text()}"
 
 
 def packages_text() -> str:
-    """Return which of the packages that draw without a graphics card are missing."""
+    """Return which packages for drawing without a graphics card are missing."""
     if shutil.which("dpkg-query") is None:
         return f"a machine without a graphics card needs what Debian calls {' '.join(PACKAGES)}"
     asked = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
@@ -123,7 +121,7 @@ def packages_text() -> str:
 
 
 def main() -> int:
-    """Save one picture; return 1 when the viewer complained of anything."""
+    """Save one picture; return 1 if the viewer complained of anything."""
     parser = argparse.ArgumentParser(prog="python -m rack.tools.viewer.pictures", description=__doc__)
     parser.add_argument("recording", type=Path, help="a run.rrd")
     parser.add_argument("out", type=Path, help="PNG file to write")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from rerun.chunk import RrdReader
 
-from rack.tools.viewer.timelines import TICK
+from rack.tools.viewer.stream import TICK
 
 
 class Rows(NamedTuple):

@@ -1,7 +1,8 @@
-"""A recorder's rows as a recording for the viewer: taken as they are drained, written in blocks."""
+"""The recorder's rows as a recording for the viewer: taken as they are drained, written in blocks."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from itertools import chain, count
 from pathlib import Path
@@ -9,42 +10,50 @@ from pathlib import Path
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
-from rack.boards.config import loads, rack_timing
-from rack.tools.viewer.blocks import Block, Part
-from rack.tools.viewer.blueprint import blueprint
-from rack.tools.viewer.document import write_document
-from rack.tools.viewer.events import Events
-from rack.tools.viewer.geometry import write_geometry
-from rack.tools.viewer.hierarchy import Hierarchy
-from rack.tools.viewer.own import Losses
-from rack.tools.viewer.parts import parts_of
-from rack.tools.viewer.stream import Stream
-from rack.tools.viewer.timelines import Timelines
+from rack.boards.config import RackConfig, loads, rack_timing
+from rack.levels.messages import (
+    ARM_STATE,
+    JOINT_SET_POINT,
+    MOVE_PLAN,
+    MOVE_STATUS,
+    SCENE,
+    SERVO_STATUS,
+    TASK_PLAN,
+    WORLD_MODEL,
+)
+from rack.levels.robot.cell import Cell, build_cell
+from rack.tools.viewer.blueprint import blueprint, write_document
+from rack.tools.viewer.cell import CurrentGoal, Goals, PlannedPath, Poses, write_geometry
+from rack.tools.viewer.curves import Fields, Joints
+from rack.tools.viewer.events import Events, Losses
+from rack.tools.viewer.levels import Activity, Commanded, Hierarchy, Moves
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
+SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
+"""Messages whose numbers are not shown as curves."""
 FILE = "run.rrd"
 BLOCK_S = 1.0
-"""Simulated time in one block: a call costs the same for 4 rows and for 400."""
+"""Simulated time in one block: a call costs the same for 4 rows as for 400."""
 
 
 def next_file(folder: Path) -> Path:
-    """Return the file to write: a recorder that was started again leaves run.rrd alone and writes run-2.rrd."""
+    """Return the file to write: a restarted recorder does not overwrite run.rrd, and writes run-2.rrd."""
     names = chain([FILE], (f"run-{part}.rrd" for part in count(2)))
     return next(folder / name for name in names if not (folder / name).is_file())
 
 
 class ViewSink:
-    """Writes run.rrd of one rack into `folder`; with a port, serves it to a viewer of this machine as well."""
+    """Writes run.rrd of one rack into `folder`; with a port, also serves it to a viewer on this machine."""
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
         layout, words = segment.layout, segment.words
         config = loads(segment.config)
         cell = None
         if config.robot is not None:
-            from rack.levels.robot.cell import build_cell
-
             cell = build_cell(config.robot, config.scene, config.clock_ns)
         self._times = Timelines(layout.clock_ns)
         view = blueprint(layout, config, cell, live=port is not None)
@@ -53,11 +62,11 @@ class ViewSink:
         write_document(stream, segment.config, config, layout)
         if cell is not None:
             write_geometry(stream, cell.model, cell.start())
-        self._of_mailbox = parts_of(stream, layout, config, cell)
+        self._of_mailbox = _parts_of(stream, layout, config, cell)
         lockstep, period_ns = bool(words[System.LOCKSTEP]), words[System.PERIOD_NS]
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
-        self._of_task: dict[str, list[Part]] = {
+        self._of_task: dict[str, list[ViewPart]] = {
             task.name: [
                 CycleLanes(stream, task, speed, lockstep),
                 Load(stream, task, slice_ns, lockstep),
@@ -65,7 +74,7 @@ class ViewSink:
             ]
             for task in layout.tasks
         }
-        # An operator's mailbox has no age: commands come now and then.
+        # An operator's mailbox has no age: it is not written periodically.
         periodic = [mailbox for mailbox in layout.mailboxes if mailbox.writer != CLOCK]
         self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
         self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout).hierarchy)
@@ -88,7 +97,7 @@ class ViewSink:
             self._signals[mailbox].append(rows)
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write a block when one is full: everything before `tick` has been taken. `lost` counts rows by ring.
+        """Write a block if one is full; everything before `tick` has been taken. `lost` counts rows by ring.
 
         Raises `RuntimeError` when the file cannot be written.
         """
@@ -108,12 +117,12 @@ class ViewSink:
         if self._fastest in cycles:
             self._times.learn(cycles[self._fastest]["tick"], cycles[self._fastest]["start_ns"])
         for task, rows in cycles.items():
-            block = Block(rows, "start_ns", self._times)
+            block = RowBlock(rows, "start_ns", self._times)
             for part in self._of_task[task]:
                 part.write(block)
             self._hierarchy.write(task, block)
         for mailbox, rows in signals.items():
-            block = Block(rows, "stamp_ns", self._times)
+            block = RowBlock(rows, "stamp_ns", self._times)
             for part in self._of_mailbox[mailbox]:
                 part.write(block)
             if mailbox in self._ages:
@@ -130,3 +139,47 @@ def _taken(waiting: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     for blocks in waiting.values():
         blocks.clear()
     return taken
+
+
+def _parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> Mapping[str, list[ViewPart]]:
+    """Return the parts of the view by mailbox: chosen by message types, so that any rack has a view."""
+    parts: dict[str, list[ViewPart]] = defaultdict(list)
+    for mailbox in layout.mailboxes:
+        parts[mailbox.name] += _of_any(stream, mailbox)
+    if cell is not None and config.robot is not None:
+        goals = Goals(stream, config.scene.bodies)
+        for mailbox in layout.mailboxes:
+            parts[mailbox.name] += _of_arm(stream, mailbox, config, cell, goals)
+    return parts
+
+
+def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
+    names = {field.name for field in mailbox.fields}
+    parts: list[ViewPart] = []
+    if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
+        parts.append(Activity(stream, mailbox))
+    elif mailbox.name.endswith(".command") and "id" in names and mailbox.message != JOINT_SET_POINT.name:
+        parts.append(Commanded(stream, mailbox))
+    if mailbox.message == MOVE_STATUS.name:
+        parts.append(Moves(stream, mailbox))
+    if mailbox.message not in (*SHOWN_IN_3D, SERVO_STATUS.name):
+        parts.append(Fields(stream, mailbox))
+    return parts
+
+
+def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals) -> list[ViewPart]:
+    robot = config.robot
+    assert robot is not None, "there is an arm"
+    match mailbox.message:
+        case ARM_STATE.name:
+            return [Poses(stream, cell, config.clock_ns)]
+        case SERVO_STATUS.name:
+            return [Joints(stream, robot.joints, cell, robot.gripper is not None)]
+        case MOVE_PLAN.name:
+            return [PlannedPath(stream, cell)]
+        case TASK_PLAN.name:
+            return [goals]
+        case MOVE_STATUS.name:
+            return [CurrentGoal(goals)]
+        case _:
+            return []

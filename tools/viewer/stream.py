@@ -1,41 +1,143 @@
-"""The recording as a stream: to a file always, to a viewer on this machine when one is wanted."""
+"""The recording for the viewer, as a stream: to a file always, and to a viewer on this machine if one is wanted.
+
+Its rows have three timelines: simulated time, tick, wall clock. They come in blocks, of one mailbox or one task.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
-from rack.tools.viewer.timelines import SIM_TIME, TICK, WALL, Timelines
+Ints = NDArray[np.int64]
 
+SIM_TIME, TICK, WALL = "sim_time", "tick", "wall"
+KEPT = 4096
+"""Pairs of tick and time kept, to place what has a tick but no time stamp."""
 APPLICATION = "rack"
 FLUSH_S = 0.5
-"""Bound of one wait for the disk: the rings that are not drained meanwhile hold two seconds."""
+"""Longest single wait for the disk: the rings, not drained meanwhile, hold two seconds."""
 SERVER_MEMORY = "200MB"
 """What the server keeps for a viewer that joins later."""
 
 
-class Stream:
-    """One recording being written. Its entities are named by parts, which may hold any character.
+class Moment(NamedTuple):
+    """One moment: simulated time since tick 0, and the wall clock."""
 
-    Files of one `run` show as one recording. Raises `RuntimeError` from `flush` once the file cannot be written.
+    sim_time: np.timedelta64
+    wall: np.datetime64
+
+
+class Timelines:
+    """Converts ticks and CLOCK_MONOTONIC stamps to time columns; all integers, ns."""
+
+    def __init__(self, clock_ns: int) -> None:
+        self.clock_ns = clock_ns
+        # One offset for the whole recording: setting the clock meanwhile must not fold the timeline.
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._ticks: Ints = np.zeros(1, dtype=np.int64)
+        self._stamps: Ints = np.array([time.monotonic_ns()])
+
+    def columns(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> list[rr.TimeColumn]:
+        """Return the columns of rows released at `ticks`, `within_ns` of simulated time later, stamped `stamps_ns`."""
+        return [
+            rr.TimeColumn(SIM_TIME, duration=(ticks * self.clock_ns + within_ns).astype("timedelta64[ns]")),
+            rr.TimeColumn(TICK, sequence=ticks),
+            rr.TimeColumn(WALL, timestamp=(stamps_ns + self._offset_ns).astype("datetime64[ns]")),
+        ]
+
+    def moment(self, tick: int, stamp_ns: int) -> Moment:
+        """Return one moment on the timelines."""
+        return Moment(np.timedelta64(tick * self.clock_ns, "ns"), np.datetime64(stamp_ns + self._offset_ns, "ns"))
+
+    def learn(self, ticks: Ints, stamps_ns: Ints) -> None:
+        """Remember when ticks happened; both are sorted."""
+        new = ticks > self._ticks[-1]
+        self._ticks = np.concatenate((self._ticks, ticks[new]))[-KEPT:]
+        self._stamps = np.concatenate((self._stamps, stamps_ns[new]))[-KEPT:]
+
+    def stamps_of(self, ticks: Ints) -> Ints:
+        """Return approximately when ticks happened, CLOCK_MONOTONIC, ns."""
+        # Relative to the newest, so that the 53 bits of a float suffice.
+        last = self._stamps[-1]
+        return np.asarray(last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64))
+
+    def monotonic(self, time_ns: int) -> int:
+        """Return a CLOCK_REALTIME stamp as CLOCK_MONOTONIC."""
+        return time_ns - self._offset_ns
+
+
+class RowBlock:
+    """Rows of one ring, oldest first, with their times.
+
+    Rows of a mailbox have the fields of `rack.backplane.ring.mailbox_ring`, those of a trace the fields of
+    `rack.backplane.trace.RECORD`.
+    """
+
+    def __init__(self, rows: np.ndarray, stamp: str, timelines: Timelines) -> None:
+        self.rows = rows  # (rows,)
+        self.ticks: Ints = rows["tick"].astype(np.int64)  # (rows,)
+        self.stamps_ns: Ints = rows[stamp].astype(np.int64)  # (rows,), CLOCK_MONOTONIC
+        self._timelines = timelines
+
+    @cached_property
+    def times(self) -> list[rr.TimeColumn]:
+        """The time columns of all rows, made once for all parts that write them."""
+        return self._timelines.columns(self.ticks, self.stamps_ns)
+
+    @property
+    def messages(self) -> np.ndarray:
+        """The messages of a mailbox's rows."""
+        return np.asarray(self.rows["message"])
+
+
+class ViewPart(Protocol):
+    """Writes one aspect of one mailbox or task to the stream."""
+
+    def write(self, block: RowBlock) -> None:
+        """Write a block of rows."""
+
+
+class Changes:
+    """Finds the rows of consecutive blocks in which a value changes."""
+
+    def __init__(self) -> None:
+        self._last: np.ndarray | None = None
+
+    def rows(self, values: np.ndarray) -> Ints:
+        """Return the indices of the rows that differ from the row before; shape of `values` (rows,) or structured."""
+        before = values[:1] if self._last is None else self._last
+        changed = values != np.concatenate((before, values[:-1]))
+        changed[0] |= self._last is None
+        self._last = values[-1:].copy()
+        return np.flatnonzero(changed)
+
+
+class Stream:
+    """One recording being written. Entities are named by parts, which may hold any character.
+
+    Files of one `run` are shown as one recording. `flush` raises `RuntimeError` once the file cannot be written.
     """
 
     def __init__(
         self, name: str, run: str, file: Path, times: Timelines, blueprint: rrb.Blueprint, port: int | None
     ) -> None:
         self.times = times
-        # Else a mistake is a warning on stderr and a hole in the recording.
+        # Otherwise a mistake is a warning on stderr and a gap in the recording.
         rr.set_strict_mode(True)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=run)
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
         sinks: list[rr.FileSink | rr.GrpcServerSink] = [rr.FileSink(str(file))]
         if port is not None:
-            # A server, no client: a client without its viewer would hold up the file as well.
+            # A server, not a client: a client without its viewer would block the file as well.
             sinks.append(rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=SERVER_MEMORY))
         self._recording.set_sinks(*sinks, default_blueprint=blueprint)
         self._recording.send_recording_name(name)
@@ -53,7 +155,7 @@ class Stream:
         self.columns(entity, times, rr.Scalars.columns(scalars=values))
 
     def at(self, tick: int, stamp_ns: int, entity: Sequence[str], archetype: rr.AsComponents) -> None:
-        """Log one rare thing that happened at a tick, at a time of CLOCK_MONOTONIC."""
+        """Log a single item, at a tick and a time of CLOCK_MONOTONIC."""
         moment = self.times.moment(tick, stamp_ns)
         self._recording.set_time(SIM_TIME, duration=moment.sim_time)
         self._recording.set_time(TICK, sequence=tick)
@@ -65,7 +167,7 @@ class Stream:
         self._recording.send_property(name, values)
 
     def flush(self) -> None:
-        """Hand everything to the file. Raises `RuntimeError` when it cannot be written."""
+        """Write everything to the file. Raises `RuntimeError` when that fails."""
         self._recording.flush(timeout_sec=FLUSH_S)
 
     def close(self) -> None:

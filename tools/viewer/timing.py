@@ -7,12 +7,9 @@ import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 from rack.levels.timing.trace_times import execution_ns, is_missed, lateness_ns, newest_visible, response_ns
-from rack.tools.viewer.activity import LEVELS, LOG
-from rack.tools.viewer.blocks import Block
-from rack.tools.viewer.lanes import style_lane, write_spans
-from rack.tools.viewer.palette import LIMIT, PHASES, of_joint
-from rack.tools.viewer.stream import Stream
-from rack.tools.viewer.timelines import Ints
+from rack.tools.viewer.levels import LEVELS, LOG
+from rack.tools.viewer.stream import Ints, RowBlock, Stream
+from rack.tools.viewer.style import LIMIT, PHASES, of_joint, style_lane, write_spans
 
 BOARDS, LOAD, TIMES, AGES = "boards", "load", "times", "ages"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
@@ -40,7 +37,7 @@ class CycleLanes:
         self._work = "process" if task.role == "executor" else "plan"
         style_lane(stream, self._lane, PHASES, quiet=["wait"])
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Write four spans a cycle."""
         rows = block.rows
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
@@ -68,7 +65,7 @@ class Load:
         stream.static((TIMES, task.name), rr.SeriesLines(names=curves, colors=[of_joint(1), of_joint(0), LIMIT]))
         stream.static((LOAD, task.name), rr.SeriesLines(names=[f"{task.name}, %"]))
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Write every cycle; 100 % is the deadline."""
         rows = block.rows
         curves = np.column_stack((lateness_ns(rows), execution_ns(rows), np.full(len(rows), self._slice_ns))) * 1e-6
@@ -92,7 +89,7 @@ class Misses:
         self._span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
         self._is_styled = False
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Write the cycles that were missed."""
         missed = np.flatnonzero(is_missed(block.rows))
         if not len(missed):
@@ -129,7 +126,7 @@ class Age:
         self._upto = -1
         stream.static(self._lane, rr.SeriesLines(names=[f"{mailbox.name}, ms"]))
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Take messages; they count from the tick at which they become visible."""
         self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
         self._made = np.concatenate((self._made, block.ticks))

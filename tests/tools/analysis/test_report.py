@@ -18,8 +18,8 @@ from rack.boards.config import load
 from rack.levels.timing.equations import response_ticks
 from rack.tools.analysis.report import report_of, task_times, write_report
 from rack.tools.analysis.report_markdown import markdown, show
-from rack.tools.display import SilentDisplay
-from rack.tools.running import run_rack
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands

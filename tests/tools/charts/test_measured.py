@@ -10,9 +10,9 @@ import pytest
 
 from rack.boards.config import load
 from rack.levels.timing.schedule import Chart
-from rack.tools.answer import Failure
 from rack.tools.charts.measured import TracedRun
 from rack.tools.charts.panel import union, without
+from rack.tools.console.answer import Failure
 from rack.tools.runs.recording import Recording
 from tests.tools.recordings import EPOCH_NS, cycle, recorded
 

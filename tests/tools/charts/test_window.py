@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rack.levels.timing.tasks import TimedTask
-from rack.tools.answer import Failure
 from rack.tools.charts.window import WindowOptions, times_of, window_options
+from rack.tools.console.answer import Failure
 
 MS = 1_000_000
 

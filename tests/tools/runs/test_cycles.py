@@ -12,10 +12,10 @@ import pytest
 from rack.backplane.trace import Flag
 from rack.boards.config import RackConfig, load
 from rack.levels.timing.tasks import Budget
-from rack.tools.answer import Failure
-from rack.tools.display import SilentDisplay
-from rack.tools.running import run_rack
+from rack.tools.console.answer import Failure
 from rack.tools.runs.cycles import cycles_of, measured_budgets
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 from tests.tools.recordings import MS, Cycle, recorded
 

@@ -14,10 +14,10 @@ import pytest
 from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.report import write_report
-from rack.tools.answer import Failure
 from rack.tools.charts.gantt import subject_of
-from rack.tools.display import SilentDisplay
-from rack.tools.running import run_rack
+from rack.tools.console.answer import Failure
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 from tests.conftest import SMALL
 

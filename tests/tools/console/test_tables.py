@@ -1,0 +1,51 @@
+"""Tables: they fit the terminal, and in a pipe nothing is cut or coloured."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.tools.console.tables import table
+
+HEAD = ("task", "count", "what it says of itself")
+ROWS = (("servo", "12", "torque of j3 is NaN, and rejected"), ("elemental_move", "7", "idle"))
+
+
+def test_numbers_stand_to_the_right_and_texts_to_the_left() -> None:
+    assert list(table(HEAD, ROWS)) == [
+        "task            count  what it says of itself",
+        "servo              12  torque of j3 is NaN, and rejected",
+        "elemental_move      7  idle",
+    ]
+
+
+@pytest.mark.parametrize("width", [30, 40, 55, 56, 80])
+def test_a_table_fits_its_width_with_long_cells_wrapped(width: int) -> None:
+    lines = list(table(HEAD, ROWS, width))
+    assert max(map(len, lines)) <= width
+    assert (len(lines) == 3) == (width >= 56)
+    assert " ".join(" ".join(lines).split()).count("12") == 1
+
+
+def test_columns_that_may_be_missing_go_before_anything_is_wrapped() -> None:
+    assert list(table(HEAD, ROWS, 40, ("what it says of itself", "count"))) == [
+        "task            count",
+        "servo              12",
+        "elemental_move      7",
+    ]
+    assert list(table(HEAD, ROWS, 56, ("count",))) == list(table(HEAD, ROWS))
+    assert next(table(HEAD, ROWS, 55, ("count",))).split() == ["task", "what", "it", "says", "of", "itself"]
+
+
+def test_a_table_without_rows_is_its_head() -> None:
+    assert list(table(HEAD, [], 80)) == ["task  count  what it says of itself"]
+
+
+def test_in_a_pipe_a_table_is_neither_cut_nor_coloured_nor_read_as_markup() -> None:
+    rows = [["[red]a[/red]", "x" * 5000, ":smile:"]]
+    assert list(table(("a", "b", "c"), rows))[1].split() == rows[0]
+
+
+def test_no_word_is_lost_where_a_column_is_narrower_than_it() -> None:
+    lines = list(table(("name", "what"), [["a" * 30, "b" * 30]], 20))
+    assert max(map(len, lines)) <= 20
+    assert ["".join(lines).count(letter) for letter in "ab"] == [30 + 2, 30]

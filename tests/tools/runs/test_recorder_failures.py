@@ -1,0 +1,222 @@
+"""Recordings that fail: the run continues, what was written stays readable, and the user gets a message."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rerun.chunk import RrdReader
+
+from rack.boards.config import RackConfig, load
+from rack.boards.events import Event
+from rack.boards.rack import Rack
+from rack.tools.analysis.report import write_report
+from rack.tools.console.answer import Failure
+from rack.tools.recorder.recorder import Recorder, SafeSink
+from rack.tools.runs import recorder_process
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import NO_RECORDER, run_rack
+from rack.tools.runs.recording import Recording
+from rack.tools.runs.snapshot import Snapshot
+from rack.tools.runs.spool import SPOOL, mend
+from rack.tools.runs.window import executable
+from rack.tools.viewer.reading import read
+from tests.processes import children_of
+
+WATCHDOG_S = 30.0
+FIRST_BLOCK = 400
+"""Ticks after which there is something on disk."""
+LONG_S = 12.0
+"""Simulated time that the recorder does not outrun."""
+
+
+@pytest.fixture
+def config(small: Path, rack_name: str) -> RackConfig:
+    """A rack of two levels that count, without an arm."""
+    return load(small, [f"name={rack_name}"])
+
+
+class Failing:
+    """A sink that fails at the second block."""
+
+    def __init__(self) -> None:
+        self.blocks = 0
+
+    def add_cycles(self, task: str, rows: np.ndarray) -> None:
+        """Take anything."""
+
+    def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
+        """Take anything."""
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Fail once there was one block."""
+        self.blocks += 1
+        if self.blocks > 1:
+            raise RuntimeError("the disk\nis full")
+
+    def close(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Never come here."""
+        raise AssertionError("a sink that failed is not asked again")
+
+
+def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
+    notes: list[str] = []
+    sink = Failing()
+    safe = SafeSink(lambda: sink, notes.append)
+    for tick in range(5):
+        safe.add_cycles("servo", np.zeros(1))
+        safe.advance(tick, {})
+    safe.close(5, {})
+    assert notes == ["run.rrd ends here: the disk is full"]
+    assert sink.blocks == 2
+
+
+def test_a_rack_without_an_arm_is_recorded_too(config: RackConfig, tmp_path: Path) -> None:
+    run_rack(config, 3.0, tmp_path / "run", SilentDisplay())
+    recording = Recording(tmp_path / "run")
+    for field, mailbox in (("count", "lower.status"), ("goal", "upper.command")):
+        rows = read(tmp_path / "run" / "run.rrd", f"/signals/{mailbox}/{field}")
+        assert np.array_equal(rows.values.ravel(), recording.signal(mailbox, field))
+        assert np.array_equal(rows.ticks, recording.signal(mailbox, "tick"))
+
+
+def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "run.rrd").symlink_to("/dev/full")
+    result = run_rack(config, 5.0, folder, SilentDisplay())
+    recording = Recording(folder)
+    assert result.worked
+    assert result.recording == "complete"
+    assert len(recording.cycles["lower"]) == 2000
+    lines = [event["text"] for event in recording.events if event["kind"] == "recorder"]
+    assert len(lines) == 1
+    assert lines[0].startswith("run.rrd ends here: ")
+
+
+class Keeping(SilentDisplay):
+    """Keeps the texts of events."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def show_event(self, event: Event) -> None:
+        """Keep the text."""
+        self.texts.append(event.text)
+
+
+def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: Path) -> None:
+    folder, display = tmp_path / "run", Keeping()
+    folder.mkdir()
+    (folder / "events.jsonl").symlink_to("/dev/full")
+    assert run_rack(config, 0.5, folder, display).worked
+    assert display.texts.count("events.jsonl ends here: No space left on device") == 1
+
+
+class AtTick(SilentDisplay):
+    """Sends a signal to the recorder of the run, once, when that has got to some tick."""
+
+    period_s = 0.05
+
+    def __init__(self, number: signal.Signals, tick: int = FIRST_BLOCK) -> None:
+        self._number, self._tick = number, tick
+        self.struck: list[int] = []
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Look at the tick."""
+        if snapshot.tick > self._tick and not self.struck:
+            self.struck = [pid for pid in children_of(os.getpid()) if b"rack.tools.recorder" in command_of(pid)]
+            os.kill(self.struck[0], self._number)
+
+
+def command_of(pid: int) -> bytes:
+    return Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
+def notes_of(recording: Recording) -> list[str]:
+    return [event["text"] for event in recording.events if event["kind"] == "recorder"]
+
+
+def realtime(config: RackConfig) -> RackConfig:
+    return config.model_copy(update={"clock": config.clock.model_copy(update={"mode": "realtime"})})
+
+
+def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config: RackConfig, tmp_path: Path) -> None:
+    display = AtTick(signal.SIGKILL)
+    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    assert display.struck
+    assert (result.worked, result.recording) == (True, "complete")
+    recording = Recording(tmp_path / "run")
+    assert notes_of(recording)[0] == "the recorder ended with status -9; restarted, 1 of at most 3 times"
+    # In lockstep the clock waits for the next one as it did for the first: not one row is missing.
+    serials = recording.signal("lower.status", "serial")
+    assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
+    assert len(recording.cycles["lower"]) == result.outcome.ticks
+    assert not any(recording.lost.values())
+    assert result.outcome.digest == run_rack(config, LONG_S, None, SilentDisplay()).outcome.digest
+    # The viewer's file is not written over.
+    assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_what_a_killed_recorder_took_is_readable(
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_process, "RESTARTS", 0)
+    result = run_rack(realtime(config), 3.0, tmp_path / "run", AtTick(signal.SIGKILL))
+    assert result.worked
+    assert result.recording == "the recorder ended with status -9"
+    report, _ = write_report(tmp_path / "run")
+    assert report["worked"]
+    assert notes_of(Recording(tmp_path / "run")) == ["the recorder ended with status -9; the run continues, unrecorded"]
+    ticks = pq.read_table(tmp_path / "run" / "signals.parquet", columns=["tick"])["tick"].to_numpy()
+    assert ticks.max() > FIRST_BLOCK / 2
+    repaired = tmp_path / "repaired.rrd"
+    for command in (["optimize", tmp_path / "run" / "run.rrd", "-o", repaired], ["verify", repaired]):
+        subprocess.run([executable(), "rrd", *command], check=True, capture_output=True, timeout=WATCHDOG_S)
+    assert RrdReader(str(repaired)).stream().filter(content="/boards/**").to_chunks()
+
+
+def test_a_recorder_that_is_stopped_delays_no_end(config: RackConfig, tmp_path: Path) -> None:
+    result = run_rack(realtime(config), 2.0, tmp_path / "run", AtTick(signal.SIGSTOP))
+    assert result.worked
+    assert result.recording == "the recorder ended with status -9"
+    assert Recording(tmp_path / "run").signal("lower.status", "tick")[-1] > FIRST_BLOCK / 2
+
+
+def test_a_recorder_that_comes_late_delays_no_run(
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
+    result = run_rack(realtime(config), 3.0, tmp_path / "run", SilentDisplay())
+    assert (result.worked, result.recording) == (True, "complete")
+    assert notes_of(Recording(tmp_path / "run"))[:1] == [NO_RECORDER]
+
+
+def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path: Path) -> None:
+    with Rack(config) as rack, Recorder(rack.segment, tmp_path):
+        with pytest.raises(Failure, match="another recorder is running there"):
+            Recorder(rack.segment, tmp_path)
+        with pytest.raises(Failure, match="another recorder is running there"):
+            mend(tmp_path)
+
+
+def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(config: RackConfig, tmp_path: Path) -> None:
+    with Rack(config) as rack, Recorder(rack.segment, tmp_path) as recorder:
+        rack.run(0.5)
+        recorder.drain()
+        whole = (tmp_path / SPOOL).read_bytes()
+    found = []
+    for size in (len(whole), len(whole) - 1, len(whole) * 2 // 3, len(whole) // 2):
+        folder = tmp_path / str(size)
+        folder.mkdir()
+        (folder / SPOOL).write_bytes(whole[:size])
+        assert mend(folder)
+        found.append(pq.read_metadata(folder / "signals.parquet").num_rows)
+    assert found == sorted(found, reverse=True)
+    assert found[0] > 200 > found[-1]

@@ -1,0 +1,49 @@
+"""Missed cycles in the recording: none where none was, and each one where it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun.blueprint as rrb
+
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import RECORD, Flag
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines
+from rack.tools.viewer.timing import Misses
+
+TICK_NS = 2_500_000
+SPAN = 100
+TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 4)
+
+
+def recorded(folder: Path, missed: list[list[int]]) -> Path:
+    """Write blocks of 400 cycles with misses at those ticks."""
+    times = Timelines(TICK_NS)
+    stream = Stream("misses", "run", folder / "run.rrd", times, rrb.Blueprint(), None)
+    part = Misses(stream, TASK)
+    for number, ticks in enumerate(missed):
+        rows = np.zeros(400, dtype=RECORD)
+        rows["tick"] = np.arange(400) + 400 * number
+        rows["start_ns"] = rows["tick"] * TICK_NS
+        rows["flags"][np.array(ticks, dtype=int) - 400 * number] = Flag.MISSED
+        part.write(RowBlock(rows, "start_ns", times))
+    stream.flush()
+    stream.close()
+    return folder / "run.rrd"
+
+
+def test_a_missed_cycle_marks_its_quarter_of_a_second_and_is_in_the_log(tmp_path: Path) -> None:
+    file = recorded(tmp_path, [[5, 120, 130], [], [1199]])
+    lane = read(file, "/levels/servo/executor_missed", "StateChange:state")
+    assert lane.ticks.tolist() == [0, SPAN, 2 * SPAN, 11 * SPAN, 12 * SPAN]
+    assert lane.values.ravel().tolist() == ["missed", "missed", "", "missed", ""]
+    log = read(file, "/log/misses", "TextLog:text").values.ravel().tolist()
+    assert log == ["missed: servo: 3 cycles, ticks 5 to 130", "missed: servo: tick 1199"]
+
+
+def test_a_task_that_never_misses_has_no_lane(tmp_path: Path) -> None:
+    with pytest.raises(KeyError, match="executor_missed"):
+        read(recorded(tmp_path, [[], []]), "/levels/servo/executor_missed", "StateChange:state")

@@ -1,0 +1,175 @@
+"""The recording for the viewer, read back: one short run of the whole rack."""
+
+from __future__ import annotations
+
+import subprocess
+
+import mujoco
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from rack.boards.config import load, loads
+from rack.levels.robot.cell import STATE, Cell, build_cell
+from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.launch import run_rack
+from rack.tools.runs.recording import Recording
+from rack.tools.runs.window import executable
+from rack.tools.viewer.pictures import NoViewerError, opened
+from rack.tools.viewer.reading import read
+
+SECONDS = 6.5
+"""The first way is planned, and some of it gone."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder = tmp_path_factory.mktemp("run")
+    config = load("nasrem", [f"name=viewer-{folder.parent.name}", "clock.mode=lockstep"])
+    assert run_rack(config, SECONDS, folder, SilentDisplay()).recording == "complete"
+    return Recording(folder)
+
+
+@pytest.fixture(scope="module")
+def cell(run: Recording) -> Cell:
+    config = loads(run.config)
+    assert config.robot is not None
+    return build_cell(config.robot, config.scene, config.clock_ns)
+
+
+def test_the_file_is_whole(run: Recording) -> None:
+    verified = subprocess.run([executable(), "rrd", "verify", run.folder / "run.rrd"], capture_output=True, text=True)
+    assert verified.returncode == 0, verified.stderr
+
+
+def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
+    ticks = run.signal("servo.status", "tick")
+    for at, joint in enumerate(load("nasrem").robot.joints):
+        for quantity, fields in {"position": ["target", "position"], "torque": ["torque"]}.items():
+            rows = read(run.folder / "run.rrd", f"/joints/{joint}/{quantity}")
+            assert np.array_equal(rows.ticks, ticks)
+            expected = np.column_stack([run.signal("servo.status", field)[:, at] for field in fields])
+            assert np.array_equal(rows.values, expected)
+
+
+def test_limits_are_the_arms(run: Recording, cell: Cell) -> None:
+    rows = read(run.folder / "run.rrd", "/joints/j2/position/limits")
+    assert np.array_equal(rows.values, np.tile(cell.bounds.position[1], (len(rows.values), 1)))
+    assert rows.ticks[0] == 0
+    assert rows.ticks[-1] == run.signal("servo.status", "tick")[-1]
+
+
+def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
+    states = dict(zip(run.signal("servo.state", "tick").tolist(), run.signal("servo.state", "state"), strict=True))
+    file, data = run.folder / "run.rrd", mujoco.MjData(cell.model)
+    frames = read(file, "/frames", "Transform3D:child_frame")
+    places = read(file, "/frames", "Transform3D:translation").values[:, 0]
+    turns = read(file, "/frames", "Transform3D:quaternion").values[:, 0]
+    for tick in np.unique(frames.ticks)[::37]:
+        mujoco.mj_setState(cell.model, data, states[tick], STATE)
+        mujoco.mj_kinematics(cell.model, data)
+        for row in np.flatnonzero(frames.ticks == tick):
+            body = data.body(frames.values[row, 0].removeprefix("body/"))
+            assert places[row] == pytest.approx(body.xpos, abs=1e-6)
+            assert turns[row][[3, 0, 1, 2]] == pytest.approx(body.xquat, abs=1e-6)
+    assert {"body/link6", "body/finger_left", "body/block1", "body/peg"} <= set(frames.values[:, 0])
+
+
+def test_the_planned_path_begins_where_the_tool_is(run: Recording) -> None:
+    file = run.folder / "run.rrd"
+    line = read(file, "/cell/planned_path", "LineStrips3D:strips").values[0][0]
+    points = read(file, "/cell/way_points", "Points3D:positions")
+    tool = run.signal("servo.scene", "tool_position")[0]
+    assert line[0] == pytest.approx(tool, abs=2e-3)
+    assert line[-1] == pytest.approx(points.values[0][-1], abs=1e-6)
+
+
+def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
+    for task in run.layout.tasks:
+        rows = read(run.folder / "run.rrd", f"/boards/{task.slot}-{task.board}/{task.role}", "StateChange:state")
+        cycles = run.cycles[task.name]
+        work = "process" if task.role == "executor" else "plan"
+        assert np.array_equal(rows.ticks, np.repeat(cycles["tick"], 4))
+        assert rows.values.ravel().tolist() == ["read", work, "write", "wait"] * len(cycles)
+
+
+def test_spans_of_a_lane_follow_one_another_and_stay_in_their_slices(run: Recording) -> None:
+    for task in run.layout.tasks:
+        times = sim_times(run, f"/boards/{task.slot}-{task.board}/{task.role}")
+        slice_ns = task.every * task.within_cycles * run.layout.clock_ns
+        assert (np.diff(times) >= 0).all()
+        assert (times < np.repeat(run.cycles[task.name]["tick"], 4) * run.layout.clock_ns + slice_ns).all()
+
+
+def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
+    made, visible = run.signal("elemental_move.status", "tick"), run.signal("elemental_move.status", "visible_at")
+    rows = read(run.folder / "run.rrd", "/ages/elemental_move.status")
+    expected = [(tick - made[visible <= tick].max()) * run.layout.clock_ns * 1e-6 for tick in rows.ticks]
+    assert rows.values.ravel() == pytest.approx(expected)
+    # Read at once by a board of its own rate or by a slower one: the age is the sampling delay of the paper.
+    assert rows.values.min() == pytest.approx(250.0)
+
+
+def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> None:
+    end_ns = round(SECONDS * 1e9)
+    for chunk in RrdReader(str(run.folder / "run.rrd")).stream().filter(is_static=False).to_chunks():
+        if chunk.entity_path.startswith("/__"):
+            continue
+        assert {"sim_time", "tick", "wall"} <= set(chunk.timeline_names), chunk.entity_path
+        times = chunk.to_record_batch().column("sim_time").to_numpy().astype(np.int64)
+        assert times.min() >= 0, chunk.entity_path
+        # A plan shows from the tick at which it can be used, which may be after the end.
+        assert times.max() <= end_ns + 2 * 10**9, chunk.entity_path
+
+
+def test_config_and_events_are_in_it(run: Recording) -> None:
+    file = run.folder / "run.rrd"
+    document = RrdReader(str(file)).stream().filter(content="/config").to_chunks()[0].to_record_batch()
+    assert run.config in document.column("TextDocument:text")[0].as_py()[0]
+    lines = read(file, "/log/events", "TextLog:text").values.ravel().tolist()
+    shown = [e for e in run.events if "tick" in e]
+    assert len(lines) == len(shown)
+    assert [line.partition(":")[0] for line in lines] == [e["kind"] for e in shown]
+
+
+def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
+    reader = RrdReader(str(run.folder / "run.rrd"))
+    recorded = {path.replace("\\", "") for path in reader.store().schema().entity_paths()}
+    chunks = reader.stream(store=reader.blueprints()[0]).to_chunks()
+    queries = [
+        line
+        for chunk in chunks
+        for name in chunk.to_record_batch().schema.names
+        if name == "ViewContents:query"
+        for row in chunk.to_record_batch().column(name).to_pylist()
+        for line in row
+    ]
+    assert len(queries) > 40
+    for query in queries:
+        entity = query.replace("\\", "").removeprefix("+").strip()
+        if not entity.startswith(("-", "/signals", "/cell/collision")):
+            stem = entity.removesuffix("/**").replace("$origin", "/")
+            assert any(path == stem or path.startswith(stem.rstrip("/") + "/") for path in recorded), query
+
+
+def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
+    try:
+        with opened(run.folder / "run.rrd") as screen:
+            look = screen.look(at_s=SECONDS - 0.5)
+    except NoViewerError as error:
+        pytest.skip(str(error))
+    assert look.complaints == ()
+    assert look.picture.startswith(b"\x89PNG")
+
+
+def sim_times(run: Recording, entity: str) -> np.ndarray:
+    chunks = RrdReader(str(run.folder / "run.rrd")).stream().filter(content=entity, has_timeline="tick").to_chunks()
+    return np.concatenate([c.to_record_batch().column("sim_time").to_numpy().astype(np.int64) for c in chunks])
+
+
+def test_lockstep_shows_no_time_that_is_held_against_the_clock(run: Recording) -> None:
+    lateness, execution, deadline = read(run.folder / "run.rrd", "/times/servo").values.T
+    assert np.isnan([lateness, deadline]).all()
+    assert (execution > 0.0).all()
+    with pytest.raises(KeyError):
+        read(run.folder / "run.rrd", "/load/servo")

@@ -1,1 +1,0 @@
-"""Commanding a rack that runs: its levels, what they can be told, and their answers."""

@@ -1,0 +1,78 @@
+"""What every command shares: its common arguments, how it prints its answer, and how it fails."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from rack.boards.errors import one_line
+
+MAX_LINE = 1300
+"""Characters of one line of an error message, at most."""
+
+
+class Failure(Exception):
+    """A command that did not work. The message is one line for the user, `status` the exit status."""
+
+    def __init__(self, reason: str, status: int = 1) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
+def print_json(document: Any) -> None:
+    """Print the answer to --json."""
+    print(json.dumps(document, indent=2))
+
+
+def fail(reason: str, status: int) -> NoReturn:
+    """End the command: print the reason on stderr and, with --json, as a JSON document on stdout."""
+    lines = [
+        line if line.isprintable() and len(line) <= MAX_LINE else one_line(line, MAX_LINE)
+        for line in reason.splitlines()
+    ]
+    print(*lines, sep="\n", file=sys.stderr)
+    if "--json" in sys.argv[1:]:
+        print_json({"error": lines})
+    sys.exit(status)
+
+
+def config_names(start: str) -> list[str]:
+    """Return the shipped configs whose names begin with `start`, for shell completion."""
+    from rack.boards.config import names
+
+    return [name for name in names() if name.startswith(start)]
+
+
+def rack_names(start: str) -> list[str]:
+    """Return the racks in shared memory whose names begin with `start`, for shell completion."""
+    from rack.backplane.segment import racks
+
+    return [name for name in racks() if name.startswith(start)]
+
+
+def named(rack: str | None) -> str | None:
+    """Return the name of a rack. Raises `Failure` when it is empty."""
+    if rack == "":
+        raise Failure('RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2)
+    return rack
+
+
+Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout, and nothing else")]
+ConfigName = Annotated[
+    str, typer.Argument(metavar="CONFIG", help="config by name, or path to a .toml file", autocompletion=config_names)
+]
+RackName = Annotated[
+    str,
+    typer.Argument(
+        metavar="RACK", help="running rack by name, as 'rack list' shows it", autocompletion=rack_names, callback=named
+    ),
+]
+Settings = Annotated[
+    list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")
+]
+Faults = Annotated[
+    str | None, typer.Option(metavar="FILE", help="fault script, by name or path; added to the config's own faults")
+]

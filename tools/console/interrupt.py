@@ -1,0 +1,168 @@
+"""SIGINT, SIGTERM and SIGHUP end a command within 2 s, with exit status 128 + signal, and nothing left behind.
+
+A command with nothing to finish ends inside the signal handler. Python's own way, an exception raised there, was
+rejected: it may strike after a segment is created and before its owner is recorded, and libraries turn it into errors
+of their own while they are being imported. A command with something to finish uses `orderly`, and gets BOUND_S.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple, NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+BOUND_S = 1.7
+"""Longest time from the first signal to the end of the process."""
+GONE_S = 0.25
+"""Longest wait for killed children."""
+SHOW_CURSOR = b"\x1b[?25h\n"
+
+
+class Interrupted(BaseException):
+    """Raised in a waiting command, so that it withdraws its request."""
+
+
+class _Way(NamedTuple):
+    stop: Callable[[], object]
+    unfinished: str = ""
+    bound_s: float = BOUND_S
+
+
+class Interrupt:
+    """The signals of this process. `number` is the first one received, 0 before that."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._ways: list[_Way] = [_Way(self.end)]
+
+    @property
+    def name(self) -> str:
+        """Name of the signal received, such as SIGINT; empty before that."""
+        return signal.Signals(self.number).name if self.number else ""
+
+    def catch(self) -> None:
+        """Handle the signals. Until then they kill the process, with the same exit status for a shell."""
+        for number in SIGNALS:
+            # Under nohup a command outlives its terminal.
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self._receive)
+        signal.signal(signal.SIGALRM, lambda number, frame: self.end())
+
+    @contextmanager
+    def orderly(
+        self, stop: Callable[[], object] = lambda: None, unfinished: str = "", bound_s: float = BOUND_S
+    ) -> Iterator[None]:
+        """In this context the first signal calls `stop`, in its handler; the command then ends by itself.
+
+        It has `bound_s` for that; otherwise `unfinished` is printed, which says what the user can do.
+        """
+        self._ways.append(_Way(stop, unfinished, bound_s))
+        try:
+            if self.number:
+                stop()
+            yield
+        finally:
+            self._ways.pop()
+
+    def at_once(self) -> AbstractContextManager[None]:
+        """In this context a signal ends the process in its handler, even inside `orderly`."""
+        return self.orderly(self.end)
+
+    def raising(self) -> AbstractContextManager[None]:
+        """In this context the first signal raises `Interrupted`: for waits, and where contexts clean up files."""
+        return self.orderly(_interrupted)
+
+    def settle(self) -> None:
+        """End the process with the signal's exit status, if one was received. Call it when the command has finished."""
+        if self.number:
+            for stream in (sys.stdout, sys.stderr):
+                with suppress(OSError, ValueError):
+                    stream.flush()
+            self._ways = [_Way(self.end)]
+            self.end()
+
+    def end(self) -> NoReturn:
+        """Kill this process's children, remove its racks, and end at once."""
+        try:
+            signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
+            for step in (_kill_family, _remove_racks, self._take_leave):
+                # A step that fails must not prevent the others, nor the end.
+                with suppress(Exception):
+                    step()
+        finally:
+            os._exit(128 + self.number)
+
+    def _take_leave(self) -> None:
+        if os.isatty(1):
+            os.write(1, SHOW_CURSOR)
+        if unfinished := self._ways[-1].unfinished:
+            os.write(2, f"{unfinished}\n".encode())
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGHUP:
+            _leave_terminal()
+        if self.number:
+            self.end()
+        self.number = number
+        signal.setitimer(signal.ITIMER_REAL, self._ways[-1].bound_s)
+        self._ways[-1].stop()
+
+
+INTERRUPT = Interrupt()
+"""The only one: signals belong to the process."""
+
+
+def _interrupted() -> None:
+    raise Interrupted
+
+
+def _leave_terminal() -> None:
+    """Discard what is still printed: writing to a terminal that is gone is an error."""
+    for fd in (1, 2):
+        with suppress(OSError):
+            if stat.S_ISCHR(os.fstat(fd).st_mode):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, fd)
+                os.close(nowhere)
+
+
+def _kill_family() -> None:
+    """Kill every descendant in this session and wait for it; a viewer window has its own session and stays."""
+    family = list(_descendants(os.getpid(), os.getsid(0)))
+    for pid in family:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    deadline = time.monotonic() + GONE_S
+    while any(Path(f"/proc/{pid}/exe").exists() for pid in family) and time.monotonic() < deadline:
+        # Reap our own children; others are adopted and reaped elsewhere.
+        with suppress(ChildProcessError):
+            os.waitpid(-1, os.WNOHANG)
+        time.sleep(0.002)
+
+
+def _descendants(pid: int, session: int) -> Iterator[int]:
+    # A process that ends meanwhile leaves nothing to read.
+    children: list[int] = []
+    with suppress(OSError):
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            children += map(int, (thread / "children").read_text().split())
+    for child in children:
+        with suppress(OSError):
+            if os.getsid(child) == session:
+                yield from _descendants(child, session)
+                yield child
+
+
+def _remove_racks() -> None:
+    # Looked up, not imported: in a handler a module may be half imported. Not loaded, it has made no racks.
+    remove_own = getattr(sys.modules.get("rack.boards.clean"), "remove_own", None)
+    if remove_own is not None:
+        remove_own()

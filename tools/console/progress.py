@@ -1,0 +1,59 @@
+"""Progress of a command that makes many runs: a bar on a terminal, plain lines elsewhere, nothing with --json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
+
+from rack.tools.console.tables import console
+
+
+class Progress:
+    """The progress of a series of runs, measured in the seconds that each is expected to take.
+
+    It shows a `bar`, or prints lines, or neither.
+    """
+
+    def __init__(self, bar: RichProgress | None = None, prints_lines: bool = False) -> None:
+        self._bar, self._prints_lines = bar, prints_lines
+        self._task = None if bar is None else bar.add_task("", total=None)
+
+    def total(self, seconds: float) -> None:
+        """Set the expected time of the whole series."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, total=seconds)
+        self._print(f"about {seconds / 60.0:.0f} minutes")
+
+    def begin(self, text: str) -> None:
+        """Show which run begins."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, description=text)
+        self._print(text)
+
+    def end(self, seconds: float, ended: str, shortfalls: Sequence[str]) -> None:
+        """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its shortfalls."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, advance=seconds)
+            for line in shortfalls:
+                self._bar.console.print(line, style="red", highlight=False, markup=False)
+        for line in (ended, *shortfalls):
+            self._print(f"  {line}")
+
+    def _print(self, line: str) -> None:
+        if self._prints_lines:
+            print(line, flush=True)
+
+
+@contextmanager
+def progress_for(silent: bool) -> Iterator[Progress]:
+    """Give the progress display that suits stdout."""
+    terminal = console()
+    if silent or not terminal.is_terminal:
+        yield Progress(prints_lines=not silent)
+        return
+    columns = (BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with RichProgress(*columns, console=terminal) as bar:
+        yield Progress(bar)

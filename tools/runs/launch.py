@@ -1,0 +1,174 @@
+"""One run: launched, watched, recorded, and ended in order however it ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Event
+from rack.boards.outcome import Outcome
+from rack.boards.rack import Rack
+from rack.tools.campaign.ending import Strike, strikes
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.runs.display import Display
+from rack.tools.runs.folder import EventLog
+from rack.tools.runs.holds import Standstill
+from rack.tools.runs.recorder_process import RecorderProcess
+from rack.tools.runs.snapshot import RackMonitor
+from rack.tools.runs.window import ViewerWindow, free_port, url
+
+COUNTED = (
+    *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),
+    *("READS", "READ_BYTES", "WRITES", "WRITE_BYTES", "CORRUPT", "BUS_ERRORS"),
+)
+"""Words of a task's control block that a result keeps."""
+NO_TIME = "no time for the report: 'rack report {}' makes it"
+NO_RECORDER = "the recorder has not begun yet: the run begins without it"
+
+News = Callable[[], list[str]]
+"""Returns messages for the user since the last call, of the recorder or the viewer."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run: its outcome, the counts of every task's control block, and the faults injected into it.
+
+    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events.
+    """
+
+    rack: str
+    outcome: Outcome
+    wall_s: float
+    clock_skipped: int
+    tasks: dict[str, dict[str, int]]
+    recording: str
+    faults: tuple[Strike, ...]
+    clock_offset_ns: int
+
+    @property
+    def worked(self) -> bool:
+        """Whether the run succeeded."""
+        return self.outcome.worked
+
+    def failure(self) -> str:
+        """Return in one line why the run did not succeed."""
+        end = self.outcome
+        return f"{self.rack}: {end.cause}: {'; '.join(end.faults) or end.reason or f'after {end.ticks} ticks'}"
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {**asdict(self), "worked": self.worked}
+
+    def text(self) -> str:
+        """Return the outcome as readable text."""
+        end = self.outcome
+        lines = [f"{self.rack}: {end.cause} after {end.ticks} ticks{': ' + end.reason if end.reason else ''}"]
+        lines += [f"fault: {fault}" for fault in end.faults]
+        return "\n".join([*lines, f"digest {end.digest}"])
+
+
+def run_rack(
+    config: RackConfig,
+    seconds: float | None,
+    folder: Path | None,
+    display: Display,
+    *,
+    view: bool = False,
+    share: bool = True,
+) -> RunResult:
+    """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder` unless that is None.
+
+    With `view`, open a viewer on what the recorder serves; it may be closed at any time. `share` is as in `Rack`.
+
+    Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that fails does not
+    change how the run ends.
+    """
+    log = EventLog(display)
+    news: list[News] = []
+    with closing(log), ExitStack() as stack:
+        # Until the run has begun there is nothing to keep.
+        with INTERRUPT.at_once():
+            recorder = stack.enter_context(_recorder(folder))
+            rack = stack.enter_context(Rack(config, log.add, share))
+            if folder is not None and recorder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / "config.toml").write_text(config.text())
+                log.open(folder / "events.jsonl")
+                port = free_port() if view else None
+                if not recorder.attach(config.name, folder, port, rack.segment.words):
+                    log.add(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
+                news = [recorder.news, *([] if port is None else [_viewer(port)])]
+        unfinished = NO_TIME.format(folder) if folder else ""
+        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
+            started = time.monotonic()
+            outcome = _watch(rack, seconds, display, log, news)
+            wall_s, segment = time.monotonic() - started, rack.segment
+        rack.close()
+        recording = recorder.finish() if recorder is not None else "none"
+        _log_news(news, segment, log)
+        result = RunResult(
+            rack=config.name,
+            outcome=outcome,
+            wall_s=wall_s,
+            clock_skipped=segment.words[System.CLOCK_SKIPPED],
+            tasks=_counters(segment),
+            recording=recording,
+            faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
+            clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+        )
+        log.end(result.document())
+    return result
+
+
+@contextmanager
+def _recorder(folder: Path | None) -> Iterator[RecorderProcess | None]:
+    recorder = RecorderProcess() if folder is not None else None
+    try:
+        yield recorder
+    finally:
+        if recorder is not None:
+            recorder.finish()
+
+
+def _viewer(port: int) -> News:
+    """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs all the same."""
+    try:
+        return ViewerWindow(url(port)).news
+    except Failure as failure:
+        news = [f"no viewer: {failure}"]
+        return lambda: [news.pop()] if news else []
+
+
+def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, news: list[News]) -> Outcome:
+    """Run the rack to its end; show it, and log what only the host side can see."""
+    rack.start(seconds)
+    monitor, standstill = RackMonitor(rack.segment), Standstill(rack.segment)
+    while rack.watch(display.period_s):
+        display.show(monitor.look())
+        _log_news(news, rack.segment, log)
+        for event in standstill.look():
+            log.add(event)
+    display.show(monitor.look())
+    if rack.outcome is None:
+        raise Failure("the run ended without an outcome")
+    return rack.outcome
+
+
+def _log_news(news: list[News], segment: Segment, log: EventLog) -> None:
+    for text in [text for source in news for text in source()]:
+        log.add(Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text))
+
+
+def _counters(segment: Segment) -> dict[str, dict[str, int]]:
+    return {
+        task.name: {name.lower(): segment.block(task.name)[Block[name]] for name in COUNTED}
+        for task in segment.layout.tasks
+    }

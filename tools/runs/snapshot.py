@@ -1,0 +1,184 @@
+"""A snapshot of a running rack, from the host side: one row a task, what holds the rack, the progress of its task."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+
+from rack.backplane.fault_table import FaultTable, Stage
+from rack.backplane.layout import TaskSpec
+from rack.backplane.lines import UtilityLines
+from rack.backplane.message import State
+from rack.backplane.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.trace import trace_ring
+from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
+from rack.boards.faults.text import describe
+from rack.tools.runs.holds import Hold, Holds
+
+LOST = "lost"
+"""State of a task that died or does not respond, until its new process has rejoined."""
+DEAD = "dead"
+"""State of a run whose launcher is gone: 'rack clean' removes it."""
+TASK_STATUS = "task_status"
+"""Message type of the level that reports the progress of the whole task."""
+
+
+@dataclass(frozen=True)
+class TaskRow:
+    """One task now. Times are the longest of the newest cycles, in ms; None before the first.
+
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling.
+    """
+
+    task: str
+    slot: int
+    core: int
+    priority: int
+    rate_hz: float
+    state: str
+    tick: int
+    cycles: int
+    plans: int
+    missed: int
+    skipped: int
+    restarts: int
+    exec_ms: float | None
+    lateness_ms: float | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class TaskProgress:
+    """Progress of the task: elemental moves and actions done, of how many."""
+
+    moves_done: int
+    moves: int
+    actions_done: int
+    actions: int
+    state: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
+
+    `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
+    the arm, that are kept from their work.
+    """
+
+    rack: str
+    run: str
+    tick: int
+    time_s: float
+    clock_skipped: int
+    lines: tuple[str, ...]
+    demand: str
+    faults: tuple[str, ...]
+    tasks: tuple[TaskRow, ...]
+    progress: TaskProgress | None
+    holds: tuple[Hold, ...] = ()
+
+
+class RackMonitor:
+    """Takes snapshots of one rack; each covers the cycles since the one before."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._lines = UtilityLines(segment)
+        self._faults = FaultTable(segment)
+        self._holds = Holds(segment)
+        self._joints = joint_names(segment.config)
+        self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+        self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
+        written = {m.name: m.message for m in segment.layout.mailboxes}
+        self._statuses = {
+            task.name: open_observer(segment, f"{task.name}.status")
+            for task in segment.layout.tasks
+            if f"{task.name}.status" in written
+        }
+        whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
+        self._whole = open_observer(segment, whole) if whole else None
+
+    def look(self) -> Snapshot:
+        """Return the rack as it is now."""
+        words, layout = self._segment.words, self._segment.layout
+        tick = words[System.TICK]
+        return Snapshot(
+            rack=layout.rack,
+            run=Run(words[System.STATE]).name.lower() if self._segment.launcher_is_alive else DEAD,
+            tick=tick,
+            time_s=tick * layout.clock_ns * 1e-9,
+            clock_skipped=words[System.CLOCK_SKIPPED],
+            lines=tuple(self._asserted()),
+            demand=Demand(words[System.DEMAND]).name.lower(),
+            faults=tuple(describe(fault, layout, self._joints) for fault in self._faults.staged((Stage.ACTIVE,))),
+            tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
+            progress=self._progress(),
+            holds=self._holds.look(),
+        )
+
+    def _asserted(self) -> list[str]:
+        lines = self._lines
+        held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
+        single = {"ACFAIL": lines.acfail, "SYSRESET": lines.sysreset, "EMERGENCY STOP": lines.emergency_stop}
+        return held + [name for name, asserted in single.items() if asserted] + self._without_priority()
+
+    def _without_priority(self) -> list[str]:
+        """Return a warning when tasks were refused their real-time priority."""
+        blocks = {task.name: self._segment.block(task.name) for task in self._segment.layout.tasks if task.priority}
+        refused = [name for name, block in blocks.items() if block[Block.PID] and not block[Block.PRIORITY]]
+        is_up = self._segment.words[System.STATE] != Run.STARTING
+        return [f"NO REAL-TIME PRIORITY: {', '.join(refused)}"] if refused and is_up else []
+
+    def _row(self, task: TaskSpec) -> TaskRow:
+        block = self._segment.block(task.name)
+        exec_ms, lateness_ms = self._times_ms(task.name)
+        state, reason = TaskState(block[Block.STATE]).name.lower(), ""
+        if block[Block.LOST]:
+            state = LOST
+        elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
+            state, reason = State(status.value.state).name.lower(), status.value.reason
+        return TaskRow(
+            task=task.name,
+            slot=task.slot,
+            core=block[Block.CORE],
+            priority=block[Block.PRIORITY],
+            rate_hz=1e9 / (task.every * self._segment.layout.clock_ns),
+            state=state,
+            tick=block[Block.DONE],
+            cycles=block[Block.CYCLES],
+            plans=block[Block.PLANS],
+            missed=block[Block.MISSED],
+            skipped=block[Block.SKIPPED],
+            restarts=self._restarts(task.name),
+            exec_ms=exec_ms,
+            lateness_ms=lateness_ms,
+            reason=reason,
+        )
+
+    def _restarts(self, task: str) -> int:
+        """Return how often a new process took over the task's mailboxes: each writes in a new epoch."""
+        segment = self._segment
+        heads = [segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == task]
+        return max([0, *(segment.words[head + Box.EPOCH] - 1 for head in heads)])
+
+    def _times_ms(self, task: str) -> tuple[float | None, float | None]:
+        """Return the longest execution and lateness of the cycles since the last look that saw any."""
+        cycles = self._traces[task].drain().rows
+        if len(cycles):
+            execution, lateness = cycles["process_ns"] - cycles["read_ns"], cycles["start_ns"] - cycles["release_ns"]
+            self._times[task] = float(execution.max()) * 1e-6, float(lateness.max()) * 1e-6
+        return self._times[task]
+
+    def _progress(self) -> TaskProgress | None:
+        if self._whole is None or not (status := self._whole.peek()).is_there:
+            return None
+        at = status.value
+        return TaskProgress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
+
+
+def joint_names(config: str) -> tuple[str, ...]:
+    """Return the joints of the arm in a resolved config, from base to tool; empty without an arm."""
+    return tuple(tomllib.loads(config).get("robot", {}).get("joints", ()))

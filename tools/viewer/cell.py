@@ -1,0 +1,203 @@
+"""The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; the planned path; goals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from rack.levels.messages import SegmentKind, Verb
+from rack.levels.robot.cell import STATE, Cell
+from rack.tools.viewer.shapes import shape_of, xyzw
+from rack.tools.viewer.stream import Changes, RowBlock, Stream
+from rack.tools.viewer.style import CURRENT, GOAL, PLANNED
+
+CELL, COLLISION, FRAMES = "cell", "collision", "frames"
+WORLD = "world"
+SHOWN_GROUPS = 3
+"""MuJoCo's own viewer shows groups 0, 1, 2; by convention those above hold collision shapes."""
+POSES_S = 0.02
+"""Time between poses: the rate of a screen."""
+TOOL = (CELL, "tool")
+TOOL_COLOUR = (230, 60, 200)
+PATH, WAYPOINTS = (CELL, "planned_path"), (CELL, "way_points")
+GOALS, CURRENT_GOAL = (CELL, "goals"), (CELL, "current_goal")
+STEP_RAD = 0.03
+"""A straight line in joint space is a curve of the tool: it is drawn in pieces of at most this length."""
+POINT_M, LINE_M = 0.008, 0.003
+
+
+def frame_of(model: mujoco.MjModel, body: int) -> str:
+    """Return the name of a body's frame."""
+    return WORLD if body == 0 else f"body/{model.body(body).name or body}"
+
+
+def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
+    """Return the bodies moved by joints or as mocap bodies, and all attached to them."""
+    moves = np.zeros(model.nbody, dtype=bool)
+    for body in range(1, model.nbody):  # parents come first
+        own = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
+        moves[body] = own or moves[model.body_parentid[body]]
+    return np.flatnonzero(moves)
+
+
+def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Log all geoms, and the frames that never move with their poses in `data`."""
+    stream.static((CELL,), rr.CoordinateFrame(WORLD))
+    shown = {geom: _is_shown(model, geom) for geom in range(model.ngeom)}
+    for geom in shown:
+        shape = shape_of(model, geom)
+        if shape is not None:
+            entity = _entity(model, geom, shown[geom] or not any(shown.values()))
+            stream.static(entity, shape, rr.CoordinateFrame(frame_of(model, int(model.geom_bodyid[geom]))))
+    for body in set(range(1, model.nbody)) - set(moving_bodies(model).tolist()):
+        pose = rr.Transform3D(
+            translation=data.xpos[body],
+            quaternion=rr.Quaternion(xyzw=xyzw(data.xquat[body])),
+            parent_frame=WORLD,
+            child_frame=frame_of(model, body),
+        )
+        stream.static((FRAMES, frame_of(model, body)), pose)
+
+
+def _is_shown(model: mujoco.MjModel, geom: int) -> bool:
+    return bool(model.geom_group[geom] < SHOWN_GROUPS)
+
+
+def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
+    body = model.body(int(model.geom_bodyid[geom])).name or f"body {model.geom_bodyid[geom]}"
+    name = model.geom(geom).name or f"geom {geom}"
+    return (CELL, *(() if shown else (COLLISION,)), body, name)
+
+
+class Poses:
+    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the way of the tool."""
+
+    def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
+        self._stream, self._cell, self._data = stream, cell, cell.start()
+        self._bodies = moving_bodies(cell.model)
+        self._frames = [frame_of(cell.model, int(body)) for body in self._bodies]
+        self._every = max(1, round(POSES_S * 1e9 / clock_ns))
+        self._last = -1
+        stream.static(TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), rr.CoordinateFrame(WORLD))
+
+    def write(self, block: RowBlock) -> None:
+        """Write poses, one every 20 ms of simulated time."""
+        if not len(self._bodies):
+            return
+        slots, first = np.unique(block.ticks // self._every, return_index=True)
+        chosen = first[slots > self._last]
+        self._last = int(slots[-1])
+        if len(chosen):
+            self._write(block, chosen)
+
+    def _write(self, block: RowBlock, chosen: np.ndarray) -> None:
+        model, data, bodies = self._cell.model, self._data, self._bodies
+        positions = np.empty((len(chosen), len(bodies), 3))
+        quaternions = np.empty((len(chosen), len(bodies), 4))
+        tool = np.empty((len(chosen), 3))
+        for row, state in enumerate(block.messages["state"][chosen]):
+            mujoco.mj_setState(model, data, np.ascontiguousarray(state), STATE)
+            mujoco.mj_kinematics(model, data)
+            positions[row], quaternions[row] = data.xpos[bodies], data.xquat[bodies]
+            tool[row] = data.site_xpos[self._cell.tool]
+        times, count = self._stream.times, len(bodies)
+        ticks, stamps = block.ticks[chosen], block.stamps_ns[chosen]
+        self._stream.columns(TOOL, times.columns(ticks, stamps), rr.Points3D.columns(positions=tool))
+        poses = rr.Transform3D.columns(
+            translation=positions.reshape(-1, 3),
+            quaternion=xyzw(quaternions).reshape(-1, 4),
+            parent_frame=[WORLD] * (len(chosen) * count),
+            child_frame=self._frames * len(chosen),
+        )
+        self._stream.columns((FRAMES,), times.columns(np.repeat(ticks, count), np.repeat(stamps, count)), poses)
+
+
+class PlannedPath:
+    """Writes `MOVE_PLAN`s as a line of the tool point with its way points, from the tick at which they are visible."""
+
+    def __init__(self, stream: Stream, cell: Cell) -> None:
+        self._stream, self._cell, self._data = stream, cell, cell.start()
+        for entity in (PATH, WAYPOINTS):
+            stream.static(entity, rr.CoordinateFrame(WORLD))
+
+    def write(self, block: RowBlock) -> None:
+        """Write every plan; a plan for the gripper clears the path."""
+        for row in range(len(block.rows)):
+            plan, tick = block.messages[row], int(block.rows["visible_at"][row])
+            moves = plan["kind"] == SegmentKind.PATH and not plan["error"]
+            corners = plan["waypoints"][: plan["count"]] if moves else np.empty((0, len(self._cell.qpos)))
+            line = [self._tool(joints) for joints in in_pieces(corners)]
+            points = [self._tool(joints) for joints in corners]
+            stamp_ns = int(block.stamps_ns[row])
+            strips = rr.LineStrips3D([line] if line else [], radii=LINE_M, colors=[PLANNED])
+            self._stream.at(tick, stamp_ns, PATH, strips)
+            self._stream.at(tick, stamp_ns, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED]))
+
+    def _tool(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the position of the tool at joint positions, (3,), m."""
+        self._data.qpos[self._cell.qpos] = joints
+        mujoco.mj_kinematics(self._cell.model, self._data)
+        return np.array(self._data.site_xpos[self._cell.tool])
+
+
+def in_pieces(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points of a joint path, (points, joints), with no piece longer than `STEP_RAD`."""
+    if len(corners) < 2:
+        return corners
+    counts = [max(1, int(np.ceil(np.abs(step).max() / STEP_RAD))) for step in np.diff(corners, axis=0)]
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(corners, corners[1:], counts, strict=False)]
+    return np.concatenate((*pieces, corners[-1:]))
+
+
+class Goals:
+    """Writes the places where a `TASK_PLAN` puts its objects down, and the goal of the current move."""
+
+    def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
+        self._stream, self._objects = stream, objects
+        self._moves: dict[int, tuple[list[float], str]] = {}
+        self._plans, self._current = Changes(), Changes()
+        for entity in (GOALS, CURRENT_GOAL):
+            stream.static(entity, rr.CoordinateFrame(WORLD))
+
+    def write(self, block: RowBlock) -> None:
+        """Write the goals of every new plan."""
+        for row in self._plans.rows(block.messages["id"]):
+            plan = block.messages[row]
+            moves = plan["moves"][: plan["count"]]
+            self._moves |= {int(move["id"]): (move["position"].tolist(), self._name(move)) for move in moves}
+            ends = [move for move in moves if move["verb"] == Verb.RELEASE]
+            points = rr.Points3D(
+                [move["position"] for move in ends],
+                radii=POINT_M,
+                colors=[GOAL],
+                labels=[self._object(move) for move in ends],
+                show_labels=False,
+            )
+            self._stream.at(int(block.rows["visible_at"][row]), int(block.stamps_ns[row]), GOALS, points)
+
+    def write_status(self, block: RowBlock) -> None:
+        """Write the goal of the move that each `MOVE_STATUS` names."""
+        for row in self._current.rows(block.messages["current"]):
+            move = self._moves.get(int(block.messages["current"][row]))
+            positions, labels = ([move[0]], [move[1]]) if move else ([], [])
+            point = rr.Points3D(positions, radii=1.5 * POINT_M, colors=[CURRENT], labels=labels)
+            self._stream.at(int(block.ticks[row]), int(block.stamps_ns[row]), CURRENT_GOAL, point)
+
+    def _name(self, move: np.void) -> str:
+        verb = Verb(int(move["verb"])).name.lower().replace("_", " ")
+        return f"{verb} {self._object(move)}".strip()
+
+    def _object(self, move: np.void) -> str:
+        row = int(move["object"])
+        return self._objects[row] if 0 <= row < len(self._objects) else ""
+
+
+class CurrentGoal:
+    """The side of `Goals` that reads statuses."""
+
+    def __init__(self, goals: Goals) -> None:
+        self.write = goals.write_status

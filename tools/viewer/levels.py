@@ -1,0 +1,165 @@
+"""The levels: state, command and move of each as lanes, errors as log lines, and all of them as a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+
+import numpy as np
+import rerun as rr
+
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.message import State
+from rack.backplane.trace import Flag
+from rack.levels.messages import Verb
+from rack.tools.viewer.stream import Changes, RowBlock, Stream
+from rack.tools.viewer.style import STATES, style_lane, write_spans
+
+LEVELS, LOG = "levels", "log"
+HIERARCHY = "hierarchy"
+ROW, COLUMN = 45.0, 110.0
+"""Distance between nodes, in the graph's units; a letter is about 7 wide."""
+
+
+class Activity:
+    """Writes the state in a level's statuses, and each error once."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
+        self._stream, self._board = stream, mailbox.name.partition(".")[0]
+        self._lane = (LEVELS, self._board, "state")
+        self._states, self._errors = Changes(), Changes()
+        style_lane(stream, self._lane, STATES)
+
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        messages = block.messages
+        rows = self._states.rows(messages["state"])
+        if len(rows):
+            names = [State(int(state)).name.lower() for state in messages["state"][rows]]
+            write_spans(self._stream, self._lane, _times(self._stream, block, rows), names)
+        for row in self._errors.rows(messages["error"]):
+            if messages["error"][row]:
+                reason = messages["reason"][row].decode("ascii", "replace")
+                line = rr.TextLog(f"{self._board}: {reason or 'error ' + str(messages['error'][row])}", level="ERROR")
+                self._stream.at(int(block.ticks[row]), int(block.stamps_ns[row]), (LOG, "levels"), line)
+
+
+class Commanded:
+    """Writes the serial of the command in a mailbox."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
+        board, _, port = mailbox.name.partition(".")
+        self._stream, self._lane, self._serials = stream, (LEVELS, board, port), Changes()
+
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        serials = block.messages["id"]
+        rows = self._serials.rows(serials)
+        if len(rows):
+            names = [f"command {serial}" if serial else "" for serial in serials[rows].tolist()]
+            write_spans(self._stream, self._lane, _times(self._stream, block, rows), names)
+
+
+class Moves:
+    """Writes the current elemental move of `MOVE_STATUS`es, by its verb."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
+        self._stream, self._lane = stream, (LEVELS, mailbox.name.partition(".")[0], "move")
+        self._moves = Changes()
+
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        messages = block.messages
+        rows = self._moves.rows(messages["current"])
+        if len(rows):
+            names = [_verb(int(verb)) if at else "" for at, verb in messages[["current", "verb"]][rows].tolist()]
+            write_spans(self._stream, self._lane, _times(self._stream, block, rows), names)
+
+
+def _verb(verb: int) -> str:
+    return Verb(verb).name.lower().replace("_", " ")
+
+
+def _times(stream: Stream, block: RowBlock, rows: np.ndarray) -> list[rr.TimeColumn]:
+    return stream.times.columns(block.ticks[rows], block.stamps_ns[rows])
+
+
+class Hierarchy:
+    """Writes the tasks as nodes of a graph, coloured by state, whenever a state changes.
+
+    Levels are above each other, other boards to the left. Edges go down with commands, and from planners with plans.
+    """
+
+    def __init__(self, stream: Stream, layout: Layout, levels: tuple[str, ...]) -> None:
+        self._stream = stream
+        self._tasks = [task.name for task in layout.tasks]
+        self._states = dict.fromkeys(self._tasks, "idle")
+        self._positions = positions(layout, levels)
+        self._changes: list[tuple[int, int, str, str]] = []
+        downward = list(pairwise(levels))
+        plans = [(task.name, task.board) for task in layout.tasks if task.role == "planner"]
+        stream.static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
+        self._log(0, int(stream.times.stamps_of(np.zeros(1, dtype=np.int64))[0]))
+
+    def write(self, task: str, block: RowBlock) -> None:
+        """Note where a task's state changes."""
+        names = _names(block.rows)
+        before = np.concatenate(([self._states[task]], names[:-1]))
+        for row in np.flatnonzero(names != before):
+            self._changes.append((int(block.ticks[row]), int(block.stamps_ns[row]), task, str(names[row])))
+        self._states[task] = str(names[-1])
+
+    def lose(self, tick: int, stamp_ns: int, board: str) -> None:
+        """Note that a board died or does not respond."""
+        if board in self._states:
+            self._changes.append((tick, stamp_ns, board, "lost"))
+            self._states[board] = "lost"
+
+    def recover(self, tick: int, stamp_ns: int, board: str) -> None:
+        """Note that a lost board is back; its state follows from its cycles."""
+        if self._states.get(board) == "lost":
+            self._changes.append((tick, stamp_ns, board, "idle"))
+            self._states[board] = "idle"
+
+    def advance(self) -> None:
+        """Write what was noted, in the order of time."""
+        if not self._changes:
+            return
+        shown = dict(self._shown)
+        for tick, stamp_ns, task, state in sorted(self._changes):
+            shown[task] = state
+            self._log(tick, stamp_ns, shown)
+        self._changes.clear()
+
+    def _log(self, tick: int, stamp_ns: int, states: Mapping[str, str] | None = None) -> None:
+        self._shown = dict(states or self._states)
+        nodes = rr.GraphNodes(
+            self._tasks,
+            positions=[self._positions[task] for task in self._tasks],
+            colors=[STATES[self._shown[task]] for task in self._tasks],
+            labels=[_label(task) for task in self._tasks],
+        )
+        self._stream.at(tick, stamp_ns, (HIERARCHY,), nodes)
+
+
+def _label(task: str) -> str:
+    """Return the label of a task's node; a planner's node is next to its board's."""
+    return task.partition(".")[2] or task
+
+
+def _names(rows: np.ndarray) -> np.ndarray:
+    """Return the state of the level in each trace record, or "missed"."""
+    names = np.array([state.name.lower() for state in State] + ["missed"])
+    shown = np.where((rows["flags"] & Flag.MISSED) > 0, len(names) - 1, rows["state"])
+    return np.asarray(names[shown])
+
+
+def positions(layout: Layout, levels: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Return the places of the tasks: levels in the middle, their planners to the right, other boards to the left."""
+    others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in levels]
+    rows = {board: row for row, board in enumerate(levels)} | {board: row for row, board in enumerate(others)}
+    columns = dict.fromkeys(levels, 0) | dict.fromkeys(others, -1)
+    return {
+        task.name: ((columns[task.board] + (task.role == "planner")) * COLUMN, rows[task.board] * ROW)
+        for task in layout.tasks
+    }
