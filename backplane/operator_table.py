@@ -81,11 +81,6 @@ class OperatorTable:
         self._segment, self._words = segment, segment.words
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
-    @property
-    def requested(self) -> int:
-        """Requests added so far: whoever has seen this number need not look again."""
-        return self._words[System.REQUESTED]
-
     def add(self, request: Request) -> RequestEntry:
         """Fill an entry, a free one or that of the command given longest ago; the clock gives it when it is due.
 

@@ -6,22 +6,20 @@ from dataclasses import dataclass
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import State
-from rack.backplane.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand, System
-from rack.boards.clock_wiring import ClockWiring
 from rack.boards.config import context, shared_out, wire
 from rack.boards.config.cores import obtained_core
 from rack.boards.config.ports import TaskPorts, all_ports
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import is_critical
 from rack.boards.errors import LaunchError
+from rack.boards.events import Cause
 from rack.boards.faults.kinds import KINDS
 from rack.boards.faults.request import injections
-from rack.boards.outcome import Cause
-from rack.boards.transfer import Transfer
-from rack.boards.wiring import TaskWiring
+from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
 from rack.levels.messages import TASK_STATUS
 
 LINGER_S = 0.5
@@ -168,5 +166,5 @@ def _task(config: RackConfig, layout: Layout, ports: TaskPorts, fails_self_test:
         critical_priority=board.priority if critical else 0,
         guards_clock=spec.role == "executor" and spec.every == min(task.every for task in layout.tasks),
         fails_self_test=fails_self_test,
-        transfer=Transfer(**{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}),
+        transfer=BusTimes(**{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}),
     )

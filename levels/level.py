@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
-from rack.backplane.alarms import Alarm
-from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
+from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.operator import Commands
 from rack.levels.robot import RobotConfig, Table

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.mailbox import Reading
+from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.operator import Answer, Commands, Goal, What, listed, told
 

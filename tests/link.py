@@ -8,16 +8,16 @@ from time import monotonic_ns
 from typing import NamedTuple
 
 from rack.backplane import semaphores
-from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
-from rack.backplane.lock import LockReader
-from rack.backplane.ring import mailbox_ring
+from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.protocols import LockReader
 from rack.backplane.segment import SHM_FOLDER, Segment, unlink
 from rack.backplane.trace import FIELDS, Flag, TraceWriter
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block
 from rack.boards.faults.kinds import KINDS, NUMBERS
-from rack.boards.ports import InputPorts, OutputPorts
+from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
 

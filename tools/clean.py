@@ -10,7 +10,7 @@ def clean(as_json: Json = False) -> None:
 
     A rack in use is never touched, nor what only has the name of one: a directory, a symbolic link.
     """
-    from rack.boards.clean import clean as remove
+    from rack.boards.crate.clean import clean as remove
 
     removed, in_use, strange = remove()
     if as_json:

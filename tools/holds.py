@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
-from rack.backplane.protocols import open_observer
-from rack.backplane.ring import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.events import Event

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
-from rack.backplane.clock import ticks_of
+from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Protocol
 from rack.boards.config.text import portable, to_toml
 from rack.boards.faults.config import FaultConfig

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from rack.backplane.layout import Layout
+from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import Request
-from rack.backplane.slots import message_dtype
 from rack.boards.config.commands import command_mistakes, command_places
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.schema_mistakes import mistakes_of

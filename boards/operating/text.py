@@ -1,16 +1,13 @@
-"""An operator's command in words, and as an event."""
+"""An operator's command in words."""
 
 from __future__ import annotations
-
-import time
 
 import numpy as np
 
 from rack.backplane.layout import Layout
+from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry, RequestWord
-from rack.backplane.slots import message_dtype
-from rack.boards.events import Event
 from rack.levels.operator import Goal, What
 
 
@@ -37,15 +34,6 @@ def describe(message: Message) -> str:
     if goal == Goal.DIRECTION:
         return f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
     return f"{what} home" if goal == Goal.HOME else what
-
-
-def command_event(row: np.void, entry: RequestEntry, layout: Layout) -> Event:
-    """Return the event that the giving of a command makes; `row` is of `rack.backplane.alarms.RECORD`."""
-    level, message, serial = level_of(entry, layout), message_of(entry, layout), int(row["value"])
-    text = f"{describe(message)} (command {serial})"
-    realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
-    code = What(message.what).name.lower()
-    return Event(realtime_ns, int(row["tick"]), "command", level, text, code, subject=level, value=serial)
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm.arm import Sensed
 from rack.levels.arm.brake import Brake
 from rack.levels.arm.coarse_sensors import CoarseSensors

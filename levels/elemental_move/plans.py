@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.mailbox import Reading
+from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.messages import WINDOW, Error, Verb
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Arm
 from rack.levels.level import Finding
 

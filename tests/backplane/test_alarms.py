@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from rack.backplane.address_map import ALARM_DEPTH
-from rack.backplane.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
 from tests.backplane.conftest import MakeBus
 
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from rack.backplane.clock import SystemClock, ticks_of
+from rack.backplane.clock.system_clock import SystemClock, ticks_of
 from rack.backplane.errors import ClockError
 from rack.backplane.words import Run, System
 from tests.backplane.conftest import MakeBus

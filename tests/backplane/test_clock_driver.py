@@ -8,10 +8,9 @@ from itertools import pairwise
 
 import pytest
 
-from rack.backplane.clock_driver import ClockDriver, Ended
-from rack.backplane.lockstep_driver import LockstepDriver
-from rack.backplane.realtime_driver import RealtimeDriver
-from rack.backplane.released_task import by_priority
+from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.released_task import by_priority
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block, Head, Run, System

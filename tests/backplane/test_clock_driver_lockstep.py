@@ -9,10 +9,10 @@ import time
 
 import pytest
 
-from rack.backplane.lockstep_driver import LockstepDriver
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.wake import NextCycle
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import clock_semaphore
-from rack.backplane.wake import NextCycle
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -96,7 +96,7 @@ def test_a_task_that_waits_long_for_its_turn_does_not_begin_before_it(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Waits end many times within one turn of the other task.
-    monkeypatch.setattr("rack.backplane.wake.CHECK_S", 0.001)
+    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", 0.001)
     segment = make_bus(task("first", slot=9), task("second", slot=10))
     log, _ = lockstep(segment, 3, True)
     names = [name for what, name, _ in log if what == "begin"]
@@ -130,8 +130,8 @@ def test_lockstep_waits_for_its_recorder(make_bus: MakeBus) -> None:
 def test_a_recorder_that_takes_nothing_over_is_not_waited_for_long(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch, number: signal.Signals | None
 ) -> None:
-    monkeypatch.setattr("rack.backplane.lockstep_driver.IDLE_S", 0.05 if number else 60.0)
-    monkeypatch.setattr("rack.backplane.lockstep_driver.SLOW_S", 60.0 if number else 0.05)
+    monkeypatch.setattr("rack.backplane.clock.lockstep.IDLE_S", 0.05 if number else 60.0)
+    monkeypatch.setattr("rack.backplane.clock.lockstep.SLOW_S", 60.0 if number else 0.05)
     segment = make_bus(task("fast"))
     with forked(signal.pause) as follower:
         if number is not None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rack.backplane.digest import chains, digest
-from rack.backplane.protocols import open_writer
+from rack.backplane.mailbox.history import chains, digest
+from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System
 from rack.boards.faults.masquerade import masquerade

@@ -8,9 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
-from rack.backplane.lock import MailboxLock
-from rack.backplane.mailbox import Verdict
-from rack.backplane.protocols import open_reader, open_writer
+from rack.backplane.mailbox.mailbox import Verdict
+from rack.backplane.mailbox.protocols import MailboxLock, open_reader, open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import lock_semaphore
 from tests.backplane.bus import NAME, mailbox
@@ -59,7 +58,7 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
         cut_off = reader.read(1)
         assert (cut_off.value.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
         assert not writer.write(1, now=1)
-    assert (reader.bus_errors, writer.bus_errors, writer.serial) == (1, 1, 1)
+    assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (1, 1, 1)
     assert writer.write(2, now=2)
     assert reader.read(2).is_new
 
@@ -69,7 +68,7 @@ def test_what_was_never_read_is_not_there_behind_a_bus_error(bus: Segment) -> No
     with forked(lambda: hold(bus)):
         wait_until(lambda: bus.words[TOLD])
         assert reader.read(0).verdict is Verdict.NONE
-    assert reader.bus_errors == 1
+    assert reader.statistics.bus_errors == 1
 
 
 def compete(segment: Segment, word: int) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from rack.backplane.errors import MailboxError
-from rack.backplane.mailbox import Reader, Verdict, Writer
-from rack.backplane.protocols import open_reader, open_writer
+from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
+from rack.backplane.mailbox.protocols import open_reader, open_writer
+from rack.backplane.mailbox.slots import Slots
 from rack.backplane.segment import Segment
-from rack.backplane.slots import Slots
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork
@@ -37,7 +37,6 @@ def test_nothing_has_come_before_the_first_message(make_bus: MakeBus) -> None:
     _, reader = ends(make_bus(mailbox()))
     assert seen(reader, 100) == (0, NONE)
     assert not reader.read(100).is_there
-    assert reader.age_ticks(100) is None
 
 
 def test_a_message_becomes_visible_at_the_end_of_its_slice(make_bus: MakeBus) -> None:
@@ -45,7 +44,7 @@ def test_a_message_becomes_visible_at_the_end_of_its_slice(make_bus: MakeBus) ->
     assert write(writer, 4, now=6)
     assert [seen(reader, tick) for tick in (6, 11)] == [(0, NONE), (0, NONE)]
     assert [seen(reader, tick) for tick in (12, 13)] == [(1, NEW), (1, OLD)]
-    assert reader.age_ticks(13) == 9
+    assert reader.newest == 4
 
 
 @pytest.mark.parametrize(("every", "delay"), [(1, 1), (2, 2), (2, 6), (4, 4)])
@@ -111,7 +110,7 @@ def test_a_damaged_message_is_counted_and_the_last_good_one_kept(make_bus: MakeB
     write(writer, 1)
     segment.bytes[message_address(segment, 2) + 3] ^= 0x10
     assert seen(reader, 2) == (1, OLD)
-    assert (reader.corrupt, reader.bus_errors) == (1, 0)
+    assert (reader.statistics.corrupt, reader.statistics.bus_errors) == (1, 0)
     write(writer, 2)
     assert seen(reader, 3) == (3, NEW)
 
@@ -125,7 +124,7 @@ def test_every_bit_of_a_message_is_checked(make_bus: MakeBus) -> None:
         segment.bytes[at] ^= 1
         assert seen(reader, 1) == (0, NONE)
         segment.bytes[at] ^= 1
-    assert reader.corrupt == writer.spec.size
+    assert reader.statistics.corrupt == writer.spec.size
     assert seen(reader, 1) == (1, NEW)
 
 
@@ -138,7 +137,7 @@ def test_what_is_overwritten_before_its_reader_comes_is_a_bus_error(make_bus: Ma
         write(writer, tick)
     # Tick 10 saw message 10, and the slots reach back to 23 only: a later message would be the future's.
     assert seen(reader, 10) == (1, BUS_ERROR)
-    assert (reader.bus_errors, reader.corrupt) == (1, 0)
+    assert (reader.statistics.bus_errors, reader.statistics.corrupt) == (1, 0)
     assert seen(reader, 28) == (28, NEW)
 
 
@@ -148,7 +147,7 @@ def test_a_bus_error_before_any_message_shows_no_message(make_bus: MakeBus) -> N
         write(writer, tick)
     assert seen(reader, 10) == (0, NONE)
     assert not reader.read(10).is_there
-    assert reader.bus_errors == 2
+    assert reader.statistics.bus_errors == 2
 
 
 @pytest.mark.parametrize("depth", [4, 8, 32])

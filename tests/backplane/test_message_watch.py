@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.alarms import Alarm
-from rack.backplane.episodes import CLEAN
 from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from tests.backplane.bus import NAME, message_address
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
 
@@ -149,7 +148,7 @@ def test_an_episode_rings_once_and_a_later_one_again(link: MakeLink) -> None:
         rack.fault("corrupt", 0.7)
         rack.run(first, first + 100)
         rack.heal()
-        rack.run(first + 100, first + 102 + CLEAN)
+        rack.run(first + 100, first + 102 + CLEAN_READS)
     assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED] * 2
 
 

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 import rack.backplane
-from rack.backplane.alarms import Alarm
 from rack.backplane.layout import Protocol
-from rack.backplane.slots import Slots
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.watch.alarms import Alarm
 from tests.backplane.bus import NAME
 from tests.link import Link, MakeLink, links
 

@@ -11,11 +11,11 @@ import pytest
 
 from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.layout import PROTOCOLS, Protocol
-from rack.backplane.mailbox import Reader, Verdict
-from rack.backplane.protocols import open_observer, open_reader, open_writer
+from rack.backplane.mailbox.mailbox import Reader, Verdict
+from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
+from rack.backplane.mailbox.slots import CHAIN_AT, CHAIN_FROM, Slots
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import lock_semaphore
-from rack.backplane.slots import CHAIN_AT, CHAIN_FROM, Slots
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
@@ -68,7 +68,7 @@ def test_an_observer_reads_as_its_protocol_shows_and_waits_for_nobody(make_bus: 
     expected = Verdict.NONE if protocol == "time-slice" else Verdict.NEW
     assert observer.read(0).verdict is expected
     assert observer.read(4).is_there
-    assert observer.bus_errors == 0
+    assert observer.statistics.bus_errors == 0
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -77,11 +77,11 @@ def test_a_reader_never_gets_half_a_message(make_bus: MakeBus, protocol: Protoco
     reader, latest, fresh = open_reader(segment, NAME), np.iinfo(np.int64).max, 0
     with forked(lambda: hammer(segment)):
         deadline = time.monotonic() + BOUND_S
-        while reader.accesses < READS or fresh < READS // 100:
+        while reader.statistics.accesses < READS or fresh < READS // 100:
             fresh += reader.read(latest).is_new
             assert is_whole(reader)
             assert time.monotonic() < deadline
-    assert reader.corrupt == 0
+    assert reader.statistics.corrupt == 0
 
 
 def follows(slots: Slots, serial: int) -> bool:
@@ -116,6 +116,6 @@ def test_a_writer_killed_anywhere_leaves_its_last_whole_message(make_bus: MakeBu
         assert follows(slots, reader.serial + 1)
         assert reader.read(latest).is_new
     # A hammering writer may overtake a reader: a bus error. It never shows a damaged message.
-    assert reader.corrupt == 0
+    assert reader.statistics.corrupt == 0
     assert slots.fetch(reader.serial)
     assert slots.epoch == 2 * KILLS

@@ -7,11 +7,12 @@ import os
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox import Writer
-from rack.backplane.protocols import open_writer
-from rack.backplane.ring import Ring, mailbox_ring
+from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.mailbox.slots import claim
+from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
-from rack.backplane.slots import claim
 from rack.boards.faults.masquerade import masquerade
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from rack.backplane import semaphores
-from rack.backplane.lock import MailboxLock
-from rack.backplane.lockstep_driver import LockstepDriver
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.wake import NextCycle
+from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.segment import SHM_FOLDER, Segment
-from rack.backplane.wake import NextCycle
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, layout, mailbox, task
 from tests.backplane.conftest import MakeBus

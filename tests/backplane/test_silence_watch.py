@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.layout import PROTOCOLS, Protocol
-from rack.backplane.lock import MailboxLock
+from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.process import state_of
 from rack.backplane.trace import Flag
+from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME
 from tests.link import MakeLink, ReadingTask, WritingTask, links

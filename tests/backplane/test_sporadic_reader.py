@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.mailbox import Writer
+from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.slots import claim
 from rack.backplane.segment import Segment
-from rack.backplane.silence_watch import Witness
-from rack.backplane.slots import claim
-from rack.backplane.watched_reader import SporadicReader, WatchedReader, watched
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.silence_watch import ReadingTask
+from rack.backplane.watch.watched_reader import SporadicReader, WatchedReader, watched
 from rack.backplane.words import Slot
 from tests.backplane.bus import mailbox, message_address
 from tests.backplane.conftest import MakeBus
@@ -33,7 +33,7 @@ def writer(segment: Segment) -> Iterator[Writer]:
 
 
 def open_reader(segment: Segment, name: str = BOX) -> WatchedReader | SporadicReader:
-    return watched(segment, name, AlarmWriter(segment, "reader"), Witness())
+    return watched(segment, name, AlarmWriter(segment, "reader"), ReadingTask())
 
 
 def rung(segment: Segment) -> list[Alarm]:

@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import pytest
 
-from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.clock.wake import NextCycle
 from rack.backplane.process import state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
-from rack.backplane.wake import NextCycle
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, Head, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -138,9 +138,9 @@ def busy() -> None:
 def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
     bus: Segment, monkeypatch: pytest.MonkeyPatch, clock: Callable[[], None], rung: list[Alarm]
 ) -> None:
-    monkeypatch.setattr("rack.backplane.wake.CLOCK_SILENT_S", 0.05)
+    monkeypatch.setattr("rack.backplane.clock.wake.CLOCK_SILENT_S", 0.05)
     looks: list[int] = []
-    monkeypatch.setattr("rack.backplane.wake.state_of", lambda pid: looks.append(pid) or state_of(pid))
+    monkeypatch.setattr("rack.backplane.clock.wake.state_of", lambda pid: looks.append(pid) or state_of(pid))
     bus.words[System.PERIOD_NS], bus.words[System.EPOCH_NS] = 2_500_000, time.monotonic_ns()
     cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))
     release(bus, 0)

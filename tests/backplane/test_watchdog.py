@@ -8,11 +8,10 @@ import time
 
 import pytest
 
-from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.clock.released_task import LEAST_NS, RELEASES_MISSED, ReleasedTask, Watchdog
 from rack.backplane.process import state_of
-from rack.backplane.released_task import ReleasedTask
 from rack.backplane.segment import Segment
-from rack.backplane.watchdog import BEATS, LEAST_NS, Watchdog
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, TaskState
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, forked, wait_until
@@ -62,9 +61,9 @@ def test_a_late_answer_is_one_miss(make_bus: MakeBus) -> None:
 def test_a_process_that_could_run_is_starved_and_not_lost(make_bus: MakeBus) -> None:
     watched = Watched(make_bus(), os.getpid())
     watched.release(True)
-    rung = [watched.release(False) for _ in range(3 * BEATS)]
+    rung = [watched.release(False) for _ in range(3 * RELEASES_MISSED)]
     assert [alarms for alarms in rung if alarms] == [[Alarm.LATE], [Alarm.STARVED]]
-    assert rung[BEATS - 1] == [Alarm.STARVED]
+    assert rung[RELEASES_MISSED - 1] == [Alarm.STARVED]
     assert (watched.losses, watched.task.lost_tick) == (0, -1)
 
 
@@ -100,10 +99,10 @@ def test_a_process_that_gets_no_processor_time_is_never_lost(make_bus: MakeBus) 
 def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rack.backplane.watchdog.LEAST_NS", 4 * BEATS * PERIOD_NS)
+    monkeypatch.setattr("rack.backplane.clock.released_task.LEAST_NS", 4 * RELEASES_MISSED * PERIOD_NS)
     watched = Watched(make_bus(), os.getpid())
     watched.release(True)
-    rung = [watched.release(False) for _ in range(5 * BEATS)]
+    rung = [watched.release(False) for _ in range(5 * RELEASES_MISSED)]
     assert not any(Alarm.HANG in alarms for alarms in rung)
     burn(0.1)
     assert watched.release(False) == [Alarm.HANG]
@@ -117,7 +116,7 @@ def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> Non
         watched.release(True)
         os.kill(pid, signal.SIGSTOP)
         wait_until(lambda: state_of(pid) == "T")
-        rung = [watched.release(False) for _ in range(BEATS)]
+        rung = [watched.release(False) for _ in range(RELEASES_MISSED)]
     assert rung == [[Alarm.LATE], [], [], [Alarm.HANG]]
     assert watched.losses == 1
     assert not watched.task.is_due(watched.tick + 1, watched.tick)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rack.backplane.ring import mailbox_ring
+from rack.backplane.mailbox.history import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, trace_ring
 

@@ -9,13 +9,13 @@ from functools import partial
 import pytest
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.segment import Segment, unlink
+from rack.backplane.watch.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Demand
-from rack.boards.alarm_text import MISSES, event_of
 from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
+from rack.boards.crate.alarm_events import AlarmEvents
 from rack.boards.events import Event
 from rack.boards.faults.request import injections
 from rack.levels.cell import build_cell
@@ -60,7 +60,7 @@ def heard(
     """Ring an alarm at tick 400 and return the event that it makes."""
     AlarmWriter(segment, owner).ring(400, alarm, subject, value, since)
     row = alarm_ring(segment, owner).drain().rows[-1]
-    return event_of(row, owner, segment.layout, FaultTable(segment), JOINTS)
+    return AlarmEvents(segment, JOINTS).of(row, owner)
 
 
 # What an operator says is told from the operator table: test_operator.py.
@@ -87,21 +87,23 @@ def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
 @pytest.mark.parametrize(
     ("owner", "alarm", "subject", "value", "text"),
     [
-        (CLOCK, Alarm.HANG, 2, 4, "'watch' hangs: 4 releases unanswered since tick 360"),
-        (CLOCK, Alarm.LATE, 0, 1, "'wave' has not finished before its next release"),
-        (CLOCK, Alarm.STARVED, 1, 4, "'wave.planner' does not get its core: 4 releases unanswered since tick 360"),
-        ("watch", Alarm.STALE, 0, 12, "'wave.status' is 12 ticks (30 ms) old: its writer 'wave' is dead or stopped"),
-        ("watch", Alarm.MUTE, 0, 3, "'wave.status' is 3 ticks (7.5 ms) old: its writer 'wave' cycles and writes"),
-        ("watch", Alarm.GAP, 0, 2, "'wave.status' lacks 2 message(s)"),
-        ("watch", Alarm.MASQUERADE, 0, 4711, "'wave.status': a message names process 4711, which does not hold"),
-        ("wave", Alarm.CLOCK_STOPPED, -1, 3, "the clock has given out no tick for 3 ticks (7.5 ms)"),
-        ("wave", Alarm.CLOCK_LATE, -1, 1_300_000, "a tick came 1.300 ms late"),
-        ("driven", Alarm.SENSOR_RANGE, 1, float("nan"), "sensor of elbow: nan rad is no position it can have"),
-        ("driven", Alarm.SENSOR_MODEL, -1, 0.05, "sensor of all joints: off the model's motion by 0.05"),
-        ("driven", Alarm.ACTUATOR, 7, 0.5, "joint 7 does not do what its torque should: off by 0.5"),
-        ("driven", Alarm.COMMAND_LIMIT, 0, 512.25, "torque of shoulder, 512 N m, is beyond its limit: cut"),
+        (CLOCK, Alarm.HANG, 2, 4, "'watch' is not responding: 4 releases missed since tick 360"),
+        (CLOCK, Alarm.LATE, 0, 1, "'wave' missed its deadline: still running at its next release"),
+        (CLOCK, Alarm.STARVED, 1, 4, "'wave.planner' is not getting its core: 4 releases missed since tick 360"),
+        ("watch", Alarm.STALE, 0, 12, "'wave.status' is stale, 12 ticks (30 ms): its writer 'wave' is dead or stopped"),
+        ("watch", Alarm.MUTE, 0, 3, "'wave.status' is stale, 3 ticks (7.5 ms): 'wave' is running but not writing"),
+        ("watch", Alarm.GAP, 0, 2, "'wave.status': 2 messages lost, serials are missing"),
+        ("watch", Alarm.MASQUERADE, 0, 4711, "'wave.status': a message comes from process 4711, which is not"),
+        ("wave", Alarm.CLOCK_STOPPED, -1, 3, "clock stopped: no tick for 3 ticks (7.5 ms)"),
+        ("wave", Alarm.CLOCK_SKIPPED, -1, 1, "clock skipped 1 tick"),
+        ("wave", Alarm.CLOCK_SKIPPED, -1, 3, "clock skipped 3 ticks"),
+        ("wave", Alarm.CLOCK_LATE, -1, 1_300_000, "clock late: a tick came 1.300 ms late"),
+        ("driven", Alarm.SENSOR_RANGE, 1, float("nan"), "sensor elbow out of range: nan rad"),
+        ("driven", Alarm.SENSOR_MODEL, -1, 0.05, "sensor all joints disagrees with the model: off by 0.05"),
+        ("driven", Alarm.ACTUATOR, 7, 0.5, "actuator joint 7 does not follow its torque: off by 0.5"),
+        ("driven", Alarm.COMMAND_LIMIT, 0, 512.25, "torque of shoulder cut to its limit: 512 N m was commanded"),
         ("driven", Alarm.BRAKES_CLOSED, -1, 0, "brakes engaged"),
-        ("driven", Alarm.BRAKES_CLOSED, -1, 4, "brakes engaged: 4 ticks (10 ms) without torque"),
+        ("driven", Alarm.BRAKES_CLOSED, -1, 4, "brakes engaged: no torque for 4 ticks (10 ms)"),
         ("driven", Alarm.BRAKES_OPENED, -1, 40, "brakes released after 40 ticks (100 ms)"),
     ],
 )
@@ -122,7 +124,7 @@ def test_subjects_have_names_for_programs_too(segment: Segment) -> None:
 
 def test_a_return_is_told_of_who_is_back(segment: Segment) -> None:
     event = heard(segment, CLOCK, Alarm.REJOINED, 2, 200)
-    assert (event.board, event.subject, event.text) == ("watch", "watch", "back on the grid after 200 ticks (500 ms)")
+    assert (event.board, event.subject, event.text) == ("watch", "watch", "'watch' rejoined after 200 ticks (500 ms)")
     assert heard(segment, CLOCK, Alarm.REJOINED, -1, 4).board == CLOCK
 
 
@@ -130,8 +132,8 @@ def test_a_return_is_told_of_who_is_back(segment: Segment) -> None:
     ("subject", "demand", "kind", "text"),
     [
         (0, Demand.STOP, "reaction", "the arm must ramp to rest, then brake: 'wave' is lost"),
-        (-1, Demand.BRAKE, "reaction", "the arm must brake at once: the latch is set"),
-        (-1, Demand.NONE, "recovery", "nothing is demanded of the arm any more"),
+        (-1, Demand.BRAKE, "reaction", "the arm must brake at once: the emergency stop is latched"),
+        (-1, Demand.NONE, "recovery", "arm released: no stop is requested"),
     ],
 )
 def test_a_demand_is_a_reaction_and_its_end_a_recovery(
@@ -158,7 +160,7 @@ def test_a_fault_is_told_of_whom_it_strikes(segment: Segment, fault: int, board:
 def test_the_end_of_a_fault_tells_how_often_it_acted(segment: Segment) -> None:
     FaultTable(segment).entries[2].acted(400, 1)
     event = heard(segment, CLOCK, Alarm.FAULT_ENDS, 2, 1.0)
-    assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; it acted 1 time(s)")
+    assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; acted 1 time")
 
 
 def test_a_collision_names_both_geoms(segment: Segment) -> None:
@@ -169,7 +171,6 @@ def test_a_collision_names_both_geoms(segment: Segment) -> None:
     post, palm = (cell.model.geom(name).id for name in ("post", "palm"))
     AlarmWriter(segment, "wave").ring(400, Alarm.COLLISION, post, palm)
     row = alarm_ring(segment, "wave").drain().rows[-1]
-    geom = partial(geom_name, robot, scene, clock_ns)
-    event = event_of(row, "wave", segment.layout, FaultTable(segment), JOINTS, geom)
+    event = AlarmEvents(segment, JOINTS, partial(geom_name, robot, scene, clock_ns)).of(row, "wave")
     assert (event.code, event.subject) == ("collision", "post")
     assert event.text == "unintended contact: 'post' touches 'palm'"

@@ -16,7 +16,7 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
 from rack.backplane.segment import SHM_FOLDER, VERSION, Segment, racks, shm_path, unlink
 from rack.backplane.words import Head, System
-from rack.boards.clean import clean, remove_dead, remove_own
+from rack.boards.crate.clean import clean, remove_dead, remove_own
 from tests.backplane.bus import layout, mailbox
 from tests.processes import FORKS, descriptors, exit_status, fork, kill, wait_until
 

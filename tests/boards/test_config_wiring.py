@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.layout import depth_for
-from rack.backplane.slots import message_dtype
+from rack.backplane.mailbox.slots import message_dtype
 from rack.boards.config import context, load, shared_out, task_ports, wire
 from rack.boards.config.cores import obtained_core
 from rack.boards.config.fields import field_specs

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from rack.backplane.words import Block
-from rack.boards.rack import Rack
+from rack.boards import Rack
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
 from tests.machine import needs_fifo

@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
-import socket
 import struct
 import sys
 from collections.abc import Iterator
+from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
 
-from rack.boards.channel import Channel
-from rack.boards.crate_line import CrateLine
-from rack.boards.crate_messages import Preload
+from rack.boards.crate.line import CrateLine, Preload, received
 from rack.boards.errors import LaunchError
 from tests.processes import descriptors, runs, wait_until
 
 PATH = (*sys.path, str(Path(__file__).parent))
-
-
-@pytest.fixture
-def pair() -> Iterator[tuple[Channel, socket.socket]]:
-    ours, theirs = socket.socketpair()
-    yield Channel(ours), theirs
-    ours.close()
-    theirs.close()
 
 
 @pytest.fixture
@@ -37,31 +26,15 @@ def line() -> Iterator[CrateLine]:
     line.close(0)
 
 
-def test_objects_arrive_in_order_however_large(pair: tuple[Channel, socket.socket]) -> None:
-    channel, end = pair
-    other = Channel(end)
-    sent = [Preload(("a", "b"), ()), None, {"x": 1}, "y" * 50_000]
-    for message in sent:
-        channel.send(message)
-    assert [other.receive() for _ in sent] == sent
-
-
-def test_half_a_message_is_waited_for_and_its_senders_end_ends_it(pair: tuple[Channel, socket.socket]) -> None:
-    channel, end = pair
-    data = pickle.dumps("whole")
-    whole = struct.pack("<Q", len(data)) + data
-    end.sendall(whole + whole[:-2])
-    end.shutdown(socket.SHUT_WR)
-    assert channel.receive() == "whole"
-    assert channel.receive() is None
-
-
-def test_a_line_without_its_other_end_says_so(pair: tuple[Channel, socket.socket]) -> None:
-    channel, end = pair
-    end.close()
-    assert channel.receive() is None
-    with pytest.raises(OSError, match="Broken pipe"):
-        channel.send("anything")
+def test_a_line_says_when_its_other_end_is_gone_even_in_half_a_message() -> None:
+    ours, theirs = Pipe()
+    theirs.send("whole")
+    # The length of a message that never comes whole.
+    os.write(theirs.fileno(), struct.pack("!i", 100) + b"half")
+    theirs.close()
+    assert received(ours) == "whole"
+    assert received(ours) is None
+    assert received(ours) is None
 
 
 def test_the_crate_ends_when_its_line_is_closed() -> None:

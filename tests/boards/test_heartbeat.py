@@ -12,8 +12,8 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.process import state_of
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Run, System
-from rack.boards import heartbeat
-from rack.boards.heartbeat import LOCKSTEP_S, Heartbeat
+from rack.boards.crate import heartbeat
+from rack.boards.crate.heartbeat import LOCKSTEP_S, Heartbeat
 from tests.backplane.bus import layout, task
 from tests.processes import FORKS, forked, wait_until
 

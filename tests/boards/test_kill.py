@@ -13,9 +13,9 @@ import pytest
 
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import Block, System
-from rack.boards.clean import remove_dead
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
+from rack.boards import Rack
+from rack.boards.crate.clean import remove_dead
+from rack.boards.events import Outcome
 from tests.boards.conftest import LOOSE, NEVER, MakeConfig
 from tests.boards.programs import launcher
 from tests.processes import BOUND_S, children_of, named, parent_of, runs, wait_until
@@ -82,7 +82,7 @@ def test_a_process_killed_before_the_start_ends_the_run_too(config: MakeConfig, 
 def test_a_stopped_process_is_told_as_hanging(
     config: MakeConfig, victim: str, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rack.boards.heartbeat.LOCKSTEP_S", 0.5)
+    monkeypatch.setattr("rack.boards.crate.heartbeat.LOCKSTEP_S", 0.5)
     with Rack(config(f"clock.mode={mode}", NEVER)) as rack:
         running(rack)
         os.kill(process_of(rack, victim), signal.SIGSTOP)
@@ -94,7 +94,7 @@ def test_a_stopped_process_is_told_as_hanging(
 
 
 def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rack.boards.rack.LEAVE_S", 0.2)
+    monkeypatch.setattr("rack.boards.crate.rack.LEAVE_S", 0.2)
     with Rack(config(REALTIME)) as rack:
         rack.start(0.25)
         wait_until(lambda: rack.segment.words[System.TICK] > 5)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
-from rack.boards.rack import Rack
 from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
 from tests.machine import needs_fifo, needs_two_cores
 from tests.processes import RACK
@@ -33,7 +33,7 @@ executor = "wave_levels:Wave"
 @pytest.fixture
 def first(config: MakeConfig, rack_name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rack]:
     """A rack whose wave holds core 0; no other test's racks are seen."""
-    monkeypatch.setattr("rack.boards.neighbours.racks", lambda: [rack_name])
+    monkeypatch.setattr("rack.boards.crate.neighbours.racks", lambda: [rack_name])
     with Rack(config(*FIFO, "board.wave.core=0", text=PLAIN)) as rack:
         yield rack
 

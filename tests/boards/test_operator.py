@@ -8,19 +8,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox import Reading
+from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.mailbox import Reading
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
-from rack.backplane.protocols import open_observer
-from rack.backplane.ring import mailbox_ring
 from rack.backplane.words import Run, System
+from rack.boards import Rack
 from rack.boards.config import load, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
-from rack.boards.events import Event
+from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.operating.text import message_of
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
 from rack.levels.operator import Answer, Goal, What
 from tests.boards.conftest import MakeConfig
 from tests.boards.told_racks import TOLD, commands

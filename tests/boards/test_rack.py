@@ -12,9 +12,8 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment, racks, shm_path
 from rack.backplane.words import Block, Run, System, TaskState
-from rack.boards.events import Event
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
+from rack.boards import Rack
+from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import descriptors
 

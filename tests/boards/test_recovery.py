@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, System
+from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.events import Event
+from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
 from tests.boards.conftest import LOOSE, NEVER, MakeConfig
 from tests.boards.messages import Written
 

@@ -11,7 +11,7 @@ from types import FrameType
 import pytest
 
 from rack.backplane.layout import PROTOCOLS, Protocol
-from rack.backplane.protocols import open_observer
+from rack.backplane.mailbox.protocols import open_observer
 from tests.backplane.bus import CLOCK_NS, NAME
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
 from tests.processes import FORKS, exit_status, fork

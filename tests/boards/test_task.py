@@ -12,17 +12,15 @@ import pytest
 
 from rack.backplane import semaphores
 from rack.backplane.errors import MailboxError
-from rack.backplane.lock import MailboxLock
-from rack.backplane.protocols import open_writer
+from rack.backplane.mailbox.protocols import MailboxLock, open_writer
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.process import die_with_parent, set_priority, take_processor
 from rack.backplane.segment import Segment, unlink
-from rack.backplane.slots import Slots
 from rack.backplane.trace import Flag, trace_ring
 from rack.backplane.words import Block, System
 from rack.boards.config.classes import find_class
-from rack.boards.executor_task import ExecutorTask
 from rack.boards.launch import Launch
-from rack.boards.planner_task import PlannerTask
-from rack.boards.processor import die_with_parent, set_priority, take_processor
+from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
 from tests.backplane.bus import task as task_spec
 from tests.boards.conftest import MakeConfig
@@ -48,12 +46,12 @@ class Bench:
         """Set the clock to the middle of a tick."""
         self.segment.words[System.EPOCH_NS] = time.monotonic_ns() - tick * HOUR_NS - HOUR_NS // 2
 
-    def task(self, name: str) -> ExecutorTask | PlannerTask:
+    def task(self, name: str) -> VirtualControlLoop | PlannerLoop:
         """Return a task, ready to cycle."""
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == name)
         if name.endswith(".planner"):
-            return PlannerTask(self.segment, wiring, find_class(wiring.target, Planner)(wiring.context))
-        return ExecutorTask(self.segment, wiring, find_class(wiring.target, Executor)(wiring.context))
+            return PlannerLoop(self.segment, wiring, find_class(wiring.target, Planner)(wiring.context))
+        return VirtualControlLoop(self.segment, wiring, find_class(wiring.target, Executor)(wiring.context))
 
     def flags(self, name: str) -> list[Flag]:
         """Return the trouble in every cycle of a task so far."""

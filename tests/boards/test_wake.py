@@ -8,7 +8,7 @@ import pytest
 
 from rack.backplane.layout import PROTOCOLS, Protocol
 from rack.backplane.words import Block
-from rack.boards.rack import Rack
+from rack.boards import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.boards.messages import Written
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, status
 from rack.levels.operator import ANSWER, OPERATOR_COMMAND, Answer, Goal, What
 from rack.levels.orders import Orders, joints_of

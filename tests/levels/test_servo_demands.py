@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Demand
 from tests.levels.arms import config
 from tests.levels.servo_rig import TICK_S, Course, ServoRig

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.rack import Rack
 from rack.tools.answer import Failure
 from rack.tools.recording import Recording
 from rack.tools.replay import replay

@@ -14,8 +14,8 @@ import numpy as np
 
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, trace_ring
+from rack.boards import Rack
 from rack.boards.config import RackConfig, load
-from rack.boards.rack import Rack
 from rack.tools.answer import Failure
 from rack.tools.recorder.process import RecorderProcess
 from rack.tools.reporting.statistics import Distribution, distribution

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.ring import mailbox_ring
+from rack.backplane.mailbox.history import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.levels.operator import Answer
 from rack.tools.commanding.told import Told

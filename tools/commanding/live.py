@@ -7,8 +7,8 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
-from rack.backplane.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads

@@ -8,8 +8,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from rack.backplane.mailbox.history import mailbox_ring
 from rack.backplane.process import is_alive
-from rack.backplane.ring import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Run, System

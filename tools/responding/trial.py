@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.operating.config import CommandConfig
-from rack.boards.rack import Rack
 from rack.tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
 from rack.tools.recording import Recording
 
