@@ -1,4 +1,4 @@
-"""The system controller's side of the clock: gives out ticks and releases the tasks that are due."""
+"""The system controller's side of the clock: makes the ticks and releases the tasks that are due."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ Ended = Callable[[int], int | None]
 
 
 class Controller(Protocol):
-    """What the system controller does at every tick besides releasing tasks."""
+    """The system controller's work at every tick besides releasing tasks."""
 
     def begin(self, tick: int) -> None:
-        """Do what is due before the tasks of `tick` are released."""
+        """Do the work due before the tasks of `tick` are released."""
 
     def released(self, tick: int) -> None:
-        """Do what is due after they were released."""
+        """Do the work due after the release."""
 
 
 class ClockDriver(ABC):
-    """What both modes share: the tick, the releases, the end of the run.
+    """The part common to both modes: the tick, the releases, the end of the run.
 
-    `controller` is set by the clock's board, when it has one. `leave_out` ticks are left out next.
+    `controller` is set by the clock's board, if it has one. The next `skip` ticks are skipped.
     """
 
     def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
         self.words = segment.words
         self.tasks = [ReleasedTask(segment, task) for task in by_priority(segment.layout)]
         self.controller: Controller | None = None
-        self.leave_out = 0
+        self.skip = 0
         self.alarms = alarms or AlarmWriter(segment, CLOCK)
         self.watchdog = Watchdog(self.alarms, self.words[System.PERIOD_NS])
         self._ended = ended
@@ -50,13 +50,13 @@ class ClockDriver(ABC):
         return {task.spec.name: task for task in self.tasks}[name]
 
     def begin(self, tick: int) -> bool:
-        """Publish `tick` and do what is due before its releases; False when it is left out."""
+        """Publish `tick` and do the work due before its releases; False when the tick is skipped."""
         self.words[System.TICK] = tick
         if self.controller is not None:
             self.controller.begin(tick)
-        if not self.leave_out:
+        if not self.skip:
             return True
-        self.leave_out -= 1
+        self.skip -= 1
         self.words[System.CLOCK_SKIPPED] += 1
         return False
 
@@ -66,33 +66,33 @@ class ClockDriver(ABC):
         for task in self.tasks:
             if task.is_due(tick, last):
                 task.release(tick)
-                if task.unanswered:
-                    self.watchdog.look(task, tick)
+                if task.missed:
+                    self.watchdog.check(task, tick)
         if self.controller is not None:
             self.controller.released(tick)
 
     @property
     def first_tick(self) -> int:
-        """The tick to begin with: a new clock begins with 0, a restarted one does the last one again.
+        """First tick to do: 0 for a new clock; a restarted one repeats the last tick.
 
-        No task is released twice for a tick: its deadline says that it was.
+        No task is released twice for a tick: its deadline shows that it was.
         """
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @abstractmethod
     def settle(self) -> None:
-        """Where time waits for tasks, wait until each has finished what it was released for, plans too.
+        """In lockstep, wait until each task has finished what it was released for, plans too.
 
-        To be called before anything changes that tasks look at whenever they run, and not as of a tick.
+        To be called before a change of anything that tasks read at any time rather than as of a tick.
         """
 
     @abstractmethod
     def await_state(self, condition: Callable[[], bool]) -> None:
-        """Where time waits for tasks, wait until `condition` holds."""
+        """In lockstep, wait until `condition` holds."""
 
     @abstractmethod
     def run(self) -> None:
-        """Give out ticks until the run is over or the launcher is gone."""
+        """Make ticks until the run is over or the launcher is gone."""
 
     def is_over(self, tick: int) -> bool:
         """Say whether the run ends before `tick`."""
@@ -106,26 +106,26 @@ class ClockDriver(ABC):
 
     @property
     def launcher_is_alive(self) -> bool:
-        """Whether anybody is left to run for."""
+        """Whether the launcher still lives."""
         return is_alive(*self._launcher)
 
     def end(self) -> None:
-        """End the run: wake everybody to see it."""
+        """End the run, and wake every task to see it."""
         self.words[System.STATE] = Run.STOPPED
         for task in self.tasks:
             task.wake()
 
 
 class RealtimeDriver(ClockDriver):
-    """Ticks on the grid of CLOCK_MONOTONIC. A late clock leaves ticks out and counts them."""
+    """The clock in real time, on an absolute grid of CLOCK_MONOTONIC. A late clock skips ticks and counts them."""
 
     def run(self) -> None:
-        """Give out ticks until the run is over or the launcher is gone."""
+        """Make ticks until the run is over or the launcher is gone."""
         words = self.words
         period, epoch = words[System.PERIOD_NS], words[System.EPOCH_NS]
         beat = max(1, int(CHECK_S * 1e9) // period)
         last = self.first_tick - 1
-        # The grid begins a little after the clock: tick 0 has its grid point too.
+        # The grid begins a little after the clock's start, so that tick 0 has its grid point too.
         tick = self._sleep_until_next(last, epoch, period)
         words[System.STATE] = Run.RUNNING
         while not self.is_over(tick):
@@ -138,10 +138,10 @@ class RealtimeDriver(ClockDriver):
         self.end()
 
     def settle(self) -> None:
-        """Wait for nobody: in real time a task is met wherever it is."""
+        """Do not wait: in real time a change meets a task wherever it is."""
 
     def await_state(self, condition: Callable[[], bool]) -> None:
-        """Wait for nothing: time does not."""
+        """Do not wait: time does not."""
 
     def _sleep_until_next(self, tick: int, epoch: int, period: int) -> int:
         """Sleep to the next grid point; return the newest tick of the run that has come by then, or the one after."""
@@ -150,7 +150,7 @@ class RealtimeDriver(ClockDriver):
             time.sleep(wait * 1e-9)
         now = (time.monotonic_ns() - epoch) // period
         if stop := self.words[System.STOP_TICK]:
-            # A late clock gives out the run's last tick all the same: who was to work in it is seen to be late.
+            # Even a late clock makes the run's last tick: tasks that are late for it are seen.
             now = min(now, stop - 1)
         # Never early: the wait may end a rounding error before its grid point.
         next_tick = max(tick + 1, now)

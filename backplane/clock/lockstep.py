@@ -1,4 +1,4 @@
-"""The clock in lockstep: a tick begins when every task due by then has finished. Exact, repeatable, and fast."""
+"""The clock in lockstep: a tick begins when every task due before it has finished. Exact, repeatable, and fast."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rack.backplane.words import Run, System
 IDLE_S = 5.0
 """Bound of the wait for a recorder that is stopped, or dead and not restarted."""
 SLOW_S = 30.0
-"""Bound of the wait for one that runs and takes nothing over: it may be a new one that still imports its libraries."""
+"""Bound of the wait for a recorder that runs but takes no rows: a new one may still be importing its libraries."""
 
 
 class LockstepDriver(ClockDriver):
-    """A tick begins when every task due by then has finished.
+    """The driver of the clock in lockstep.
 
-    `one_at_a_time` releases the tasks of a tick one after the other, each until it is done, planners
-    too: exact with protocols that show a message at once.
+    `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for each: this keeps
+    protocols exact whose messages are visible at once.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class LockstepDriver(ClockDriver):
         self._history_ticks = history_ticks
 
     def run(self) -> None:
-        """Give out ticks until the run is over or the launcher is gone."""
+        """Make ticks until the run is over or the launcher is gone."""
         tick = self.first_tick
         last = tick - 1
         self.words[System.STATE] = Run.RUNNING
@@ -60,8 +60,8 @@ class LockstepDriver(ClockDriver):
         for task in self.tasks:
             if task.is_due(tick, last):
                 task.release(tick)
-                if task.unanswered:
-                    self.watchdog.look(task, tick)
+                if task.missed:
+                    self.watchdog.check(task, tick)
                 if not self._wait(task.is_settled):
                     return False
         return True
@@ -80,13 +80,13 @@ class LockstepDriver(ClockDriver):
                 continue
             if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
                 return False
-            # Somebody may have stopped one with a signal: time must not wait for that.
+            # A signal may have stopped a task: time must not wait for it.
             for task in self.tasks:
-                task.look_whether_stopped()
+                task.check_stopped()
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:
-        """Wait for a recorder before its rings run over: in lockstep time stands still meanwhile."""
+        """Wait for a recorder before its rings overflow: in lockstep time stands still meanwhile."""
         words = self.words
         seen, since = words[System.FOLLOWER_TICK], time.monotonic()
         while (pid := words[System.FOLLOWER_PID]) and tick - words[System.FOLLOWER_TICK] > self._history_ticks:
@@ -97,6 +97,6 @@ class LockstepDriver(ClockDriver):
                 words[System.FOLLOWER_PID] = 0
             if words[System.STOP_REQUEST] or not self.launcher_is_alive:
                 return False
-            # The recorder posts nothing: it must never be able to disturb the clock in real time.
+            # Polled, since the recorder posts no semaphore: it must not be able to disturb the clock in real time.
             time.sleep(0.001)
         return True

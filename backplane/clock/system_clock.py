@@ -1,4 +1,4 @@
-"""The system clock as every board sees it: an integer tick on one absolute grid (eq. 3.7)."""
+"""The system clock as every board reads it: an integer tick on one absolute grid (eq. 3.7)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _STATE, _TICK, _EPOCH, _PERIOD, _LOCKSTEP = (
 
 
 class SystemClock:
-    """Read access to the clock: the current tick, and where ticks lie on CLOCK_MONOTONIC."""
+    """Read access to the clock: the current tick, and the times of ticks on CLOCK_MONOTONIC."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
@@ -23,7 +23,7 @@ class SystemClock:
 
     @property
     def tick(self) -> int:
-        """The newest tick that the clock board has given out."""
+        """The newest tick of the clock board."""
         return self._words[_TICK]
 
     @property
@@ -32,10 +32,7 @@ class SystemClock:
         return self._words[_STATE] == Run.STOPPED
 
     def now(self) -> int:
-        """Return the tick that has come by time; in lockstep, the newest tick given out.
-
-        In real time the grid decides, not the clock board, which may itself be late.
-        """
+        """Return the current tick: in real time by the grid, as the clock board may be late; else the newest tick."""
         if self.is_lockstep:
             return self._words[_TICK]
         return (monotonic_ns() - self._words[_EPOCH]) // self._words[_PERIOD]
@@ -54,7 +51,7 @@ def ticks_of(rate_hz: float, clock_ns: int, what: str) -> int:
     """Return the period, in ticks, of a rate. Raises `ClockError` with the nearest rates when off the grid."""
     clock_hz = 1e9 / clock_ns
     if not rate_hz > 0:
-        raise ClockError(f"{what}: {rate_hz:g} Hz is no rate; permitted: {clock_hz:g} Hz or a whole part of it")
+        raise ClockError(f"{what}: {rate_hz:g} Hz is not a rate; permitted: {clock_hz:g} Hz divided by a whole number")
     ticks = clock_hz / rate_hz
     every = round(ticks)
     if every >= 1 and abs(ticks - every) <= 1e-6 * ticks:

@@ -1,7 +1,7 @@
 """Waiting for the next cycle: `waituntil(next-cycle)` of the paper's pseudo-code.
 
-A board blocks on its semaphore ("signal"), or busy-waits on its release ("poll") where a context switch is
-too large a part of its cycle and it has a core of its own.
+A board blocks on its semaphore ("signal"). A board with its own core may busy-wait for its release ("poll") instead, if
+a context switch is too large a part of its cycle.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from rack.backplane.words import Block, Head, System
 _RELEASED = int(Block.RELEASED)
 _TICK = int(System.TICK)
 CLOCK_TICKS = 2
-"""Ticks behind a release that does not come after which the clock is looked at."""
+"""Ticks after a missing release before the clock is checked."""
 CLOCK_SILENT_S = 0.5
-"""Time without a tick after which the clock is called stopped when its process waits: for no tick, by then."""
+"""Time without a tick before the clock counts as stopped while its process waits: it cannot be waiting for a tick."""
 CHECK_S = 0.25
-"""A wait that takes longer looks whether the launcher still lives."""
+"""A longer wait checks whether the launcher is still alive."""
 SPINS = 100_000
-"""Looks at a release between two looks at the rest of the world: some milliseconds."""
+"""Polls of the release between two checks of the launcher: some milliseconds."""
 
 
 class NextCycle:
     """The releases of one task, on the grid. A late task skips the releases that passed, and counts them.
 
-    An executor's release has passed when the next one has come. A planner's has passed with the time slice of its
-    plan: until then it is taken late, as of its own tick, for its result depends on ticks alone all the same.
+    An executor's release has passed when the next one comes. A planner's has passed at the end of its plan's time
+    slice: until then it is taken late, as of its own tick, since its result depends on ticks alone.
     """
 
     def __init__(
         self, segment: Segment, task: str, poll: bool = False, clock_alarms: AlarmWriter | None = None
     ) -> None:
-        """Wait for the releases of `task`; with `clock_alarms` look at a clock that is silent, and tell there."""
+        """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and ring there."""
         self._spec = segment.layout.task(task)
         self._clock = SystemClock(segment)
         self._block = segment.block(task)
@@ -49,7 +49,7 @@ class NextCycle:
         self._clock_alarms = None if self._clock.is_lockstep else clock_alarms
         self._clock_is_silent = False
         self._waited_at = -1
-        # A restarted planner takes nothing that was released before its time.
+        # A restarted planner takes no release from before its start.
         self._slack = 0
         self._last = self._block[Block.RELEASED]
         self._not_before = 0
@@ -61,7 +61,7 @@ class NextCycle:
         Sets `skipped` to the releases that passed since the last one.
         """
         while True:
-            # Looked at first: who is late for the run's last release still takes it, so that the miss is seen.
+            # Read first: a task that is late for the run's last release still takes it, so that the miss is seen.
             is_over = self._clock.is_stopped
             # The task's own release, not the clock's tick: in lockstep its turn may come later in a tick.
             newest = self._block[_RELEASED]
@@ -89,7 +89,7 @@ class NextCycle:
         if not self._semaphore.wait():
             return True
         if self._clock_alarms is not None and self._last >= 0:
-            self._look_at_clock(self._clock_alarms)
+            self._check_clock(self._clock_alarms)
         return is_alive(*self._launcher)
 
     def _patience_s(self) -> float:
@@ -101,8 +101,8 @@ class NextCycle:
         again = CLOCK_TICKS * self._clock.period_ns
         return min((late if late > 0 else again) * 1e-9, CHECK_S)
 
-    def _look_at_clock(self, alarms: AlarmWriter) -> None:
-        """Tell, once, of a clock that gives out no ticks: its process is stopped or dead, or silent for too long."""
+    def _check_clock(self, alarms: AlarmWriter) -> None:
+        """Ring once for a clock that makes no ticks: its process is stopped, dead, or silent for too long."""
         now, newest = self._clock.now(), self._words[_TICK]
         if now - newest < CLOCK_TICKS:
             self._clock_is_silent = False
@@ -110,12 +110,12 @@ class NextCycle:
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
         state = state_of(clock)
-        # One that could run is only late. Seen twice: after a pause of the whole machine it is about to be woken.
+        # A clock that could run is only late. Seen twice: after a pause of the whole machine it is about to wake.
         waits = silent_s > CLOCK_SILENT_S and state in WAITING
-        is_proof = state in STOPPED + GONE or (waits and self._waited_at == newest)
+        has_stopped = state in STOPPED + GONE or (waits and self._waited_at == newest)
         self._waited_at = newest if waits else -1
-        # What the clock has done meanwhile, or the end of the run, makes the look void.
-        if is_proof and not self._clock_is_silent and self._words[_TICK] == newest and not self._clock.is_stopped:
+        # A tick meanwhile, or the end of the run, disproves it.
+        if has_stopped and not self._clock_is_silent and self._words[_TICK] == newest and not self._clock.is_stopped:
             self._clock_is_silent = True
             alarms.ring(now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest)
 
@@ -128,11 +128,11 @@ class NextCycle:
         return is_alive(*self._launcher)
 
     def _take_posts(self, count: int) -> None:
-        """Take what a task that does not wait on its semaphore is sent all the same: over weeks it would overflow."""
-        # The newest post may be a moment behind its release: the next cycle takes it.
+        """Take the posts that a polling task does not wait for: over weeks the semaphore would overflow."""
+        # The newest post may come a moment after its release: the next cycle takes it.
         while count and self._semaphore.acquire(0):
             count -= 1
 
     def hold_until(self, tick: int) -> None:
-        """Take no release before `tick`: a planner that works on a plan keeps its time slice."""
+        """Take no release before `tick`: a planner keeps the time slice of its plan."""
         self._not_before = tick

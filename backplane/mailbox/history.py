@@ -22,9 +22,9 @@ from rack.backplane.words import Box, Slot, System
 
 
 class MailboxRing(Ring):
-    """The messages of a mailbox as a ring: `words.Slot` fields in lower case, then `message`.
+    """The messages of a mailbox as a ring: fields of `words.Slot` in lower case, then `message`.
 
-    What no reader takes is left out here too: messages that are lost or damaged, and those of an intruder.
+    It leaves out what every reader rejects: lost and damaged messages, and those of an intruder.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -44,7 +44,7 @@ class MailboxRing(Ring):
         holder, signatures = self._box[Box.CLAIMANT], rows["epoch"]
         lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < epoch_of(holder))
         if not lawful[-1]:
-            # Its writer does not know of it, and will write its own message in that place.
+            # The writer does not know of this message, and will write its own in that place.
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
         crcs = (crc32(part.tobytes()) for part in covered)
@@ -58,7 +58,7 @@ def mailbox_ring(segment: Segment, name: str) -> Ring:
 
 
 def row_dtype(spec: MailboxSpec) -> np.dtype:
-    """Return the type of one row of a mailbox's ring, padding and all."""
+    """Return the type of one row of a mailbox's ring, padding included."""
     return np.dtype(
         {
             "names": [word.name.lower() for word in Slot] + ["message"],
@@ -76,7 +76,7 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, bytes]]:
         slots = Slots(segment, spec)
         serial = head = slots.box[Box.HEAD]
         oldest = max(0, head - slots.depth)
-        # A message that is lost, damaged or forged has no hash to show: the one before it has.
+        # A lost, damaged or forged message has no valid hash: the one before it has.
         while serial > oldest and not (slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)):
             serial -= 1
         found[spec.name] = (serial, slots.chain if serial > oldest else bytes(8))

@@ -1,8 +1,12 @@
-"""Mailboxes: one writer, many readers, three protocols behind one interface.
+"""Mailboxes under logical execution time: one writer, many readers.
 
-The writer fills `writer.message` and calls `write(tick)`; a reader calls `read(tick)` and gets a
-`Reading`: the message and a verdict. `tick` is the release tick of the cycle that calls, so that
-under time-slice what is read depends on ticks alone, never on how fast a process happened to run.
+The writer fills `writer.message` and calls `write(tick)`. A reader calls `read(tick)` and gets a `Reading`: message and
+verdict. `tick` is the release tick of the calling cycle. A message written in the cycle released at tick T becomes
+visible at T + delay, the end of that cycle, however early it was written. Reads therefore depend on ticks alone.
+
+Alternatives considered: a sequence lock (a writer killed inside a write leaves its readers spinning for ever), a kernel
+lock (the paper's, 3 to 4 times the cost: protocol `lock`), the newest whole message (not a function of ticks alone:
+protocol `double-buffer`). For the memory order that readers rely on see `slots`.
 """
 
 from __future__ import annotations
@@ -20,25 +24,25 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
 NOT_YET = 1 << 62
-"""Tick of the newest message before there is any: its age is below zero, so that nobody finds it too old."""
+"""Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
-"""Messages that a read tries before a bad one: its work stays bounded."""
+"""Messages that a read tries before a bad one, so that its work stays bounded."""
 
 
 class Verdict(IntEnum):
-    """What a read found."""
+    """Result of a read."""
 
     NONE = 0  # no message has come yet
-    OLD = 1  # the message of an earlier read again
+    OLD = 1  # the same message as in an earlier read
     NEW = 2  # a message not read before
-    BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one, and there is one
+    BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one
 
 
 class Reading(NamedTuple):
-    """What a read gave: the message, all zero before the first one, and the verdict.
+    """A message, all zero before the first one, and the verdict of the read.
 
-    `is_lost`: its writer is dead, hangs, or has been silent for longer than a writer of its period may be. `earlier`:
-    where every message counts, those before it that have not been read yet, oldest first.
+    `is_lost`: its writer is dead, hangs, or has been silent for too long for its period. `earlier`: in a mailbox where
+    every message counts, the unread ones before this one, oldest first.
     """
 
     value: Message
@@ -48,20 +52,20 @@ class Reading(NamedTuple):
 
     @property
     def is_new(self) -> bool:
-        """True in the one cycle that reads the message first."""
+        """Whether this is the first cycle that reads the message."""
         return self.verdict is Verdict.NEW
 
     @property
     def is_there(self) -> bool:
-        """True once any message has come."""
+        """Whether any message has come yet."""
         return self.verdict is not Verdict.NONE
 
 
 class Writer:
-    """The one writer of a mailbox; its base protocol is time-slice.
+    """The one writer of a mailbox, under protocol time-slice.
 
-    Opening claims the mailbox: a second writer is refused with `MailboxError` as long as the first
-    one's process lives. A new writer goes on after the last whole message, in a new epoch.
+    Opening claims the mailbox: a second writer is refused with `MailboxError` while the process of the first one lives.
+    A new writer continues after the last whole message, in a new epoch.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -70,9 +74,9 @@ class Writer:
         self.message = self._slots.message
         self.bus_errors = 0
         self.held_up = 0
-        """Accesses so far for which a dead or stopped process had the lock."""
+        """Accesses so far for which a dead or stopped process held the lock."""
         self.intruder = 0
-        """Process that has published in the mailbox since the last message but one of this writer; 0: none."""
+        """Another process that has published since this writer's last message but one; 0: none."""
         self._claim = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.CLAIM)
         if not self._claim.take():
             pid = self._slots.box[Box.WRITER_PID]
@@ -86,10 +90,10 @@ class Writer:
         self._slots.resume(box[Box.CLAIMANT])
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish `message`, released at `tick`; return False when it comes too late.
+        """Publish `message`, released at `tick`; return False when it is too late.
 
-        It becomes visible at `tick` + delay. When the clock, `now`, has passed that tick, it becomes
-        visible from the next boundary of the writer's period.
+        It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes visible at the next
+        boundary of the writer's period.
         """
         written = self.publish(tick, self.visible_at(tick, now), tick if basis is None else basis)
         return written and (now is None or now < tick + self.spec.delay)
@@ -103,7 +107,7 @@ class Writer:
         return (now // every + 1) * every
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
-        """Publish `message`, visible at that tick; return False when a bound cut it off.
+        """Publish `message`, visible at that tick; return False when its bound cut it off.
 
         `damage`: see `Slots.publish`.
         """
@@ -141,7 +145,7 @@ class ReadStatistics:
 
 
 class Reader:
-    """A reader of a mailbox; its base protocol is time-slice. Reads are bounded by the mailbox's depth."""
+    """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the mailbox's depth."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
@@ -169,9 +173,9 @@ class Reader:
         return self._take(serial, tick)
 
     def _newest_visible(self, head: int, tick: int) -> int:
-        """Walk back from the newest message to the newest that is visible, or to the one already read."""
+        """Return the newest serial visible at `tick`; stop at the last one read."""
         visible_at = self._fetched.visible_at
-        # Past the last slot nothing is visible any more: what was, is overwritten, and taking it fails.
+        # Older messages are overwritten: a serial beyond the slots fails when it is taken.
         oldest, serial = max(self._serial, head - self._fetched.depth), head
         while serial > oldest and visible_at(serial) > tick:
             serial -= 1
@@ -180,15 +184,15 @@ class Reader:
     def _take(self, serial: int, tick: int) -> Reading:
         if self._obtain(serial):
             return self._readings[Verdict.NEW]
-        self.statistics.bad_reads += 1
-        # The reader came later than the slots reach back.
+        # The reader came too late: the slot is being overwritten.
         if not self._fetched.keeps(serial):
             return self._cut_off()
+        self.statistics.bad_reads += 1
         self._blame(serial)
         return self._step_back(serial, tick)
 
     def _step_back(self, serial: int, tick: int) -> Reading:
-        """Take the newest good message before one that was lost, damaged or forged, if it has not been read yet."""
+        """Take the newest good message before a lost, damaged or forged one, if it is unread."""
         fetched, tries = self._fetched, MAX_STEP_BACK
         for older in range(serial - 1, max(self._serial, serial - fetched.depth), -1):
             if fetched.holds(older) and fetched.visible_at(older) <= tick:
@@ -201,7 +205,7 @@ class Reader:
         return self._readings[Verdict.OLD if self._serial else Verdict.NONE]
 
     def _obtain(self, serial: int) -> bool:
-        """Take a message over as the last good one; False when it is none."""
+        """Take a message over as the last good one; False when it is not good."""
         self.statistics.transfers += 1
         fetched = self._fetched
         if not fetched.fetch(serial) or not (
@@ -213,12 +217,12 @@ class Reader:
         return True
 
     def _blame(self, serial: int) -> None:
-        """Count what is wrong with the message that was fetched last. Another one in its place: it was lost."""
+        """Count the fault of the message fetched last. Another message in its place is a loss: not counted."""
         fetched = self._fetched
         if not fetched.keeps(serial):
             return
         if not fetched.is_sound:
-            # An empty slot, as at first.
+            # Serial 0: an empty slot, as at the start.
             self.statistics.corrupt += fetched.serial != 0
         elif fetched.serial == serial:
             self.statistics.forged += 1
@@ -226,6 +230,7 @@ class Reader:
 
     def _cut_off(self) -> Reading:
         self.statistics.bus_errors += 1
+        self.statistics.bad_reads += 1
         return self._readings[Verdict.BUS_ERROR if self._serial else Verdict.NONE]
 
     @property
@@ -244,7 +249,7 @@ class Reader:
         return self._good.chain
 
     def peek(self) -> Reading:
-        """Return the newest whole message at once, whatever the protocol: for the host side."""
+        """Return the newest whole message at once, under any protocol: for the host side."""
         return self._newest()
 
     def _newest(self) -> Reading:
@@ -255,7 +260,7 @@ class Reader:
 
 
 class DoubleBufferWriter(Writer):
-    """A writer whose message is visible as soon as it is whole."""
+    """A writer under protocol double-buffer: its message is visible as soon as it is whole."""
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick at which the message is written: it is visible at once."""
@@ -263,7 +268,10 @@ class DoubleBufferWriter(Writer):
 
 
 class DoubleBufferReader(Reader):
-    """A reader of the newest whole message."""
+    """A reader under protocol double-buffer (section 3.3 of the paper): gets the newest whole message.
+
+    It reacts faster than time-slice; in real time it no longer depends on ticks alone.
+    """
 
     def read(self, tick: int) -> Reading:
         """Return the newest whole message, with its verdict."""

@@ -1,9 +1,8 @@
-"""Protocol lock: the paper's pseudo-code, `lock; read; unlock`, made safe against dead holders.
+"""The mailbox protocols by name, and protocol lock: the paper's `lock; read; unlock`, made safe against dead holders.
 
-A semaphore whose holder was killed stays down for good, and whose it is cannot be read off it. So the
-semaphore is what one waits on, within a bound; the critical section belongs to who has the kernel's lock on
-the mailbox, which ends with its process. An access that its bound cut off is a bus error: a verdict, never
-a hang.
+A semaphore whose holder was killed stays down for ever, and does not show who held it. So processes wait on the
+semaphore, within a bound, but the critical section belongs to the one that holds the kernel's lock on the mailbox,
+which ends with its process. An access cut off by its bound is a bus error: a verdict, never a hang.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from rack.backplane.semaphores import lock_semaphore
 from rack.backplane.words import Box
 
 LOCK_WAIT_S = 0.002
-"""Bound of one wait: an access is a microsecond or two, a holder that loses its core some hundred."""
+"""Bound of one wait: an access takes a microsecond or two, a preempted holder some hundred."""
 
 
 _OWNER = int(Box.OWNER)
@@ -29,8 +28,8 @@ _OWNER = int(Box.OWNER)
 class MailboxLock:
     """Mutual exclusion on one mailbox, with a bounded wait.
 
-    `held_up` counts the waits that ran out while a dead or stopped process had the lock: that is a fault, where a
-    holder that merely lost its core is none.
+    `held_up` counts the waits that ran out while a dead or stopped process held the lock: a fault, unlike a holder that
+    has lost its core.
     """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
@@ -43,24 +42,24 @@ class MailboxLock:
         self.held_up = 0
 
     def acquire(self) -> bool:
-        """Take the lock within its bound; False when its holder lives and keeps it."""
+        """Take the lock within its bound; False when a living holder keeps it."""
         if not self._semaphore.acquire(self._wait_s):
-            self._look_at_holder()
-        # After a wait that ran out: free when whoever took the semaphore is dead: of several waiters one gets it. Else
-        # not free when such a waiter came between the two steps: it is the owner then.
+            self._check_holder()
+        # After a wait that ran out, the kernel's lock is free if the semaphore's holder is dead; one of several waiters
+        # gets it. After a successful wait it may be taken: such a waiter came between the two steps and is the owner.
         if not self._owner.take():
             return False
         self._box[_OWNER] = self._pid
         return True
 
-    def _look_at_holder(self) -> None:
+    def _check_holder(self) -> None:
         holder = self._box[_OWNER]
-        # It may have given the lock back, and ended, since.
+        # It may have released the lock, and ended, since.
         if holder and state_of(holder) in GONE + STOPPED and self._box[_OWNER] == holder:
             self.held_up += 1
 
     def release(self) -> None:
-        """Give the lock back. Only its owner may."""
+        """Release the lock. Only its owner may."""
         self._box[_OWNER] = 0
         self._owner.give_back()
         self._semaphore.release()
@@ -103,7 +102,7 @@ class LockReader(Reader):
         self.lock = MailboxLock(segment, name)
 
     def read(self, tick: int) -> Reading:
-        """Return the newest message, or BUS_ERROR with the last good one when the bound cut the wait off."""
+        """Return the newest message; BUS_ERROR with the last good one when the wait ran out."""
         statistics = self.statistics
         statistics.accesses += 1
         obtained = self.lock.acquire()
@@ -141,6 +140,6 @@ def open_reader(segment: Segment, name: str) -> Reader:
 
 
 def open_observer(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading without ever taking its lock: for the clock and the host side."""
+    """Open a mailbox for reading that never takes its lock: for the clock and the host side."""
     is_locked = segment.layout.mailbox(name).protocol == "lock"
     return DoubleBufferReader(segment, name) if is_locked else open_reader(segment, name)

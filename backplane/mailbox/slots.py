@@ -1,8 +1,17 @@
-"""The slots of one mailbox: how a message gets into shared memory whole, and out of it.
+"""The slots of one mailbox: the way of a whole message into shared memory, and out again.
 
-A message is built in a local record, copied into the slot after the newest one, and published by one
-store of its serial in the mailbox's head. A writer killed at any instruction leaves every published
-message as it was. A reader checks serial and CRC of its copy, so it never gives out half a message.
+A message is built in a local record, copied into the slot after the newest one, and published by one store of its
+serial in the mailbox's head. A writer killed at any instruction leaves every published message intact. A reader checks
+the serial and the CRC of its copy, so it never returns half a message.
+
+Memory order: the one writer fills the slot before it stores the head's serial. On x86-64 other cores see stores in that
+order. On weaker machines a reader may see the serial first: the CRC, or the serial in the slot, then does
+not fit its copy, and the read steps back to the message before. Words are aligned to 8 bytes, so they are never torn.
+
+Why a chained hash as well as a CRC: the CRC covers one message and tells a reader, in well under a microsecond, whether
+its copy is whole and undamaged. The hash covers this message and the hash before it, so the newest one stands for all
+that was ever written: one comparison shows whether two runs are equal (`history.digest`). It is longer than a CRC, so
+that no two runs agree by chance, and leaves out epoch and basis, which are not content. No reader checks it.
 """
 
 from __future__ import annotations
@@ -31,7 +40,7 @@ EPOCH_MASK = (1 << EPOCH_BITS) - 1
 
 
 def claim(epoch: int, pid: int) -> int:
-    """Return how a writer signs: the epoch of its claim, and above it its process, in one number."""
+    """Return a writer's signature: the epoch of its claim and, in the upper half, its process id."""
     return epoch | pid << EPOCH_BITS
 
 
@@ -92,7 +101,7 @@ class Slots:
     def resume(self, signature: int) -> int:
         """Take the writer's place after the newest published message; return its serial."""
         head = whole = self.box[Box.HEAD]
-        # A serial may have been lost: the chain goes on from the newest message that has its slot.
+        # A serial may have been lost: the chain continues from the newest message that is in its slot.
         while whole > max(0, head - self.depth) and not self.holds(whole):
             whole -= 1
         self._words[_SERIAL] = head
@@ -104,8 +113,8 @@ class Slots:
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an intruder, 0: none.
 
-        An intruder has published since this writer's last message; its message is overwritten. `damage` are bits of
-        the message that are flipped in the slot.
+        An intruder has published since this writer's last message; its message is overwritten. `damage`: bits of the
+        message to flip in the slot.
         """
         words, box = self._words, self.box
         serial = words[_SERIAL] + 1
@@ -114,7 +123,7 @@ class Slots:
         words[_SERIAL] = serial
         words[_TICK] = tick
         words[_VISIBLE] = visible_at
-        # The word still holds the chain of the message before: hashed in, then replaced.
+        # The word still holds the hash of the message before: it is hashed in, then replaced.
         self._chain[:] = blake2b(self._chain_part, digest_size=8).digest()
         words[_CRC] = crc32(self._crc_part)
         words[_STAMP] = monotonic_ns()
@@ -138,7 +147,7 @@ class Slots:
         return self._slot_words[serial & self.mask][_EPOCH]
 
     def holds(self, serial: int) -> bool:
-        """Say whether that serial's slot holds its message, and not an older or a newer one."""
+        """Say whether that serial's slot holds its message, not an older or a newer one."""
         return self._slot_words[serial & self.mask][_SERIAL] == serial
 
     def head_words(self, serial: int) -> memoryview:
@@ -146,7 +155,7 @@ class Slots:
         return self._slot_words[serial & self.mask]
 
     def keeps(self, serial: int) -> bool:
-        """Say whether that serial's slot is still its own: what was copied from it until now is of no later message."""
+        """Say whether that serial's slot was not reused until now: a copy made before is of that message."""
         return serial >= oldest_kept(self.box[0], self.depth)
 
     def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
@@ -158,12 +167,12 @@ class Slots:
         return self._slot_words[serial & self.mask][_VISIBLE]
 
     def fetch(self, serial: int) -> bool:
-        """Copy a message into the local record; False when it is not that message, whole."""
+        """Copy a message into the local record; False when it is not whole, or another one."""
         self.record[:] = self._slots[serial & self.mask]
         return self._words[_SERIAL] == serial and self._words[_CRC] == crc32(self._crc_part)
 
     def copy(self, serial: int) -> bool:
-        """Copy that serial's slot, whatever it holds, into the local record; False when it did not stay its own."""
+        """Copy that serial's slot, whatever it holds, into the local record; False when it was reused meanwhile."""
         self.record[:] = self._slots[serial & self.mask]
         return self.keeps(serial)
 
@@ -188,9 +197,9 @@ class Slots:
         return epoch_of(self._words[_EPOCH])
 
     def is_lawful(self, known: int) -> bool:
-        """Say whether that message is of the writer that holds the claim, or of an earlier one.
+        """Say whether that message comes from the writer that holds the claim, or from an earlier holder.
 
-        `known` is the signature of the last lawful message, 0 before the first: epochs do not go back.
+        `known` is the signature of the last lawful message, 0 before the first: epochs only rise.
         """
         signature, holder = self._words[_EPOCH], self.box[_CLAIMANT]
         return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(holder)

@@ -122,7 +122,7 @@ class Strikes:
 
     def _skip(self, entry: FaultEntry, tick: int) -> None:
         self._acts(entry, tick)
-        self._driver.leave_out = int(entry.parameters[0])
+        self._driver.skip = int(entry.parameters[0])
 
     def _delay(self, entry: FaultEntry, tick: int) -> None:
         self._acts(entry, tick)

@@ -56,6 +56,11 @@ class InputPorts:
             self._by_port[port] = reading
 
     @property
+    def bad_reads(self) -> int:
+        """Reads so far with anything wrong."""
+        return sum([statistics.bad_reads for statistics in self._statistics])
+
+    @property
     def bus_errors(self) -> int:
         """Reads so far that their bound cut off."""
         return sum([statistics.bus_errors for statistics in self._statistics])
@@ -92,6 +97,7 @@ class OutputPorts:
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
         self._faulty: dict[str, FaultyWriter] = {}
         self._held_up = dict.fromkeys(self.writers, 0)
+        self._writers = list(self.writers.values())
         self._counted = self._traffic
         self._route()
 
@@ -116,7 +122,7 @@ class OutputPorts:
     @property
     def bus_errors(self) -> int:
         """Writes so far that their bound cut off."""
-        return sum([writer.bus_errors for writer in self.writers.values()])
+        return sum([writer.bus_errors for writer in self._writers])
 
     def write(self, tick: int, now: int, inputs: InputPorts) -> bool:
         """Write every mailbox; False when a message came too late.

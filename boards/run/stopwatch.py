@@ -37,7 +37,7 @@ class Stopwatch:
         self._trace = TraceWriter(segment, task)
         self._record = self._trace.record
         self._lockstep_clock = clock_semaphore(segment.rack) if self._clock.is_lockstep else None
-        self._bus_errors = self._corrupt = self._skipped = 0
+        self._troubles = self._bus_errors = self._corrupt = self._skipped = 0
         self._processor_ns = 0  # used before the next record begins
 
     def begin(self) -> None:
@@ -71,14 +71,13 @@ class Stopwatch:
 
         `in_time`: no message came too late. `deadline` is a tick.
         """
-        block, record, clock, skipped = self._block, self._record, self._clock, self._skipped
-        tick = record[_TICK]
+        block, record, skipped = self._block, self._record, self._skipped
+        tick, missed = record[_TICK], not in_time
         if self._lockstep_clock is not None:
             record[_RELEASE] = record[_START]
-            missed = not in_time
         else:
-            record[_RELEASE] = clock.time_of(tick)
-            missed = not in_time or record[_END] > clock.time_of(deadline)
+            record[_RELEASE] = release = self._clock.time_of(tick)
+            missed = missed or record[_END] > release + (deadline - tick) * self._clock.period_ns
         record[_FLAGS] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT | self._trouble()
         state = self._status.state if self._status is not None else 0
         if state != block[_LEVEL_STATE]:
@@ -110,9 +109,11 @@ class Stopwatch:
 
     def _trouble(self) -> int:
         """Count the failed accesses since the last cycle; return them as trace flags."""
-        bus_errors, corrupt = self._inputs.bus_errors + self._outputs.bus_errors, self._inputs.corrupt
-        if bus_errors == self._bus_errors and corrupt == self._corrupt:
+        troubles = self._inputs.bad_reads + self._outputs.bus_errors
+        if troubles == self._troubles:
             return 0
+        self._troubles = troubles
+        bus_errors, corrupt = self._inputs.bus_errors + self._outputs.bus_errors, self._inputs.corrupt
         new_errors, new_corrupt = bus_errors - self._bus_errors, corrupt - self._corrupt
         self._bus_errors, self._corrupt = bus_errors, corrupt
         self._block[_BUS_ERRORS] += new_errors

@@ -36,8 +36,8 @@ class Watched:
         if answered:
             self.task.block[Block.DONE] = self.task.block[Block.RELEASED]
         self.task.release(self.tick)
-        if self.task.unanswered:
-            self._watchdog.look(self.task, self.tick)
+        if self.task.missed:
+            self._watchdog.check(self.task, self.tick)
         return [Alarm(code) for code in self._ring.drain().rows["code"]]
 
     @property
@@ -133,7 +133,7 @@ def test_a_lost_task_is_due_again_when_it_has_rejoined(make_bus: MakeBus) -> Non
     task.block[Block.STATE] = TaskState.READY
     assert task.is_ready
     task.rejoin()
-    assert (task.lost_tick, task.unanswered, task.is_idle()) == (-1, 0, True)
+    assert (task.lost_tick, task.missed, task.is_idle()) == (-1, 0, True)
     assert task.is_due(3, 2)
 
 
