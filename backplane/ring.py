@@ -1,4 +1,4 @@
-"""Reading a ring in blocks: for the host side, which must never slow a writer down."""
+"""Reading a ring in blocks, for the host side: it never slows the writer down."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from rack.backplane.address_map import oldest_kept
 
 
 class Drained(NamedTuple):
-    """Rows taken from a ring, oldest first, and how many were overwritten before they could be taken."""
+    """Rows read from a ring, oldest first, and the number of rows overwritten before they were read."""
 
     rows: np.ndarray
     lost: int
 
 
 class Ring:
-    """A ring of fixed records that another process writes; `count` records written stand in `head`."""
+    """A ring of fixed records that another process writes; `head` holds the number of records written."""
 
     def __init__(self, memory: memoryview, dtype: np.dtype, head: memoryview) -> None:
-        # As plain bytes: copied field by field, what lies between fields would be left out, and no CRC fit.
+        # As plain bytes: a copy by fields would leave out the padding, and CRCs would not fit.
         self._rows, self._dtype = np.frombuffer(memory, dtype=f"V{dtype.itemsize}"), dtype
         self._head = head
         self._depth = len(self._rows)
@@ -28,19 +28,19 @@ class Ring:
 
     @property
     def waiting(self) -> int:
-        """Records written and not yet taken."""
+        """Records written and not yet read."""
         return self._head[0] - self._taken
 
     def resume(self, taken: int) -> None:
-        """Go on after the first `taken` records: another reader had them."""
+        """Continue after the first `taken` records, which another reader has read."""
         self._taken = taken
 
     def drain(self) -> Drained:
-        """Take every record written since the last call."""
+        """Read every record written since the last call."""
         head = self._head[0]
         first = max(self._taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
-        # What the writer reached while we copied.
+        # Rows that the writer reached during the copy.
         torn = max(0, oldest_kept(self._head[0], self._depth) - first)
         lost = first - self._taken - 1 + min(torn, len(rows))
         self._taken = head

@@ -1,4 +1,4 @@
-"""Removing what killed racks left behind, and never a rack that is in use."""
+"""Removal of what killed racks have left behind; a rack in use is never removed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rack.backplane.words import Head
 
 
 def remove_dead(rack: str) -> bool:
-    """Remove a rack's segment when nobody runs it; return whether there was one to remove.
+    """Remove the segment of a rack that is not running; return whether there was one.
 
-    Raises `SegmentError` when its launcher lives, or it is another user's, or no file at all.
+    Raises `SegmentError` when its launcher lives, or it is another user's, or not a file.
     """
     if rack not in racks():
         return False
@@ -24,7 +24,7 @@ def remove_dead(rack: str) -> bool:
     except SegmentError:
         if stranger(rack) is not None:
             raise
-        # Too small for a head: nobody can be running it.
+        # Too small for a head: no process can be running it.
         unlink(rack)
         return True
     try:
@@ -37,12 +37,12 @@ def _remove(segment: Segment) -> bool:
     rack = segment.rack
     if segment.launcher_is_alive:
         raise SegmentError(
-            f"rack '{rack}' runs already, launched by process {segment.launcher}; stop it, or choose another name"
+            f"rack '{rack}' is already running, launched by process {segment.launcher}; stop it, or choose another name"
         )
     removal = ByteLock(segment, 8 * Head.MAGIC)
     try:
-        # Of two programs that find the same dead rack one removes it. Without this the slower one would remove
-        # what the faster one has launched under the name since.
+        # If two programs find the same dead rack, one removes it. Without this the slower one would remove the rack
+        # that the faster one has launched under the name since.
         if not removal.take() or not segment.has_its_name:
             return False
         semaphores.unlink_all(rack)
@@ -53,7 +53,7 @@ def _remove(segment: Segment) -> bool:
 
 
 def remove_own(rack: str | None = None) -> None:
-    """Remove the racks that this very process has launched, or one of them; whatever state they are in."""
+    """Remove the racks that this process has launched, or one of them, in any state."""
     for name in racks() if rack is None else [rack]:
         with suppress(SegmentError):
             segment = Segment.open(name)
@@ -64,7 +64,7 @@ def remove_own(rack: str | None = None) -> None:
 
 
 def clean() -> tuple[list[str], list[str], list[str]]:
-    """Remove every rack that nobody runs; return the names removed, those in use, and a line for what is no rack."""
+    """Remove every rack that is not running; return names removed, names in use, and a line for each foreign entry."""
     removed, in_use, strange = [], [], []
     for rack in racks():
         try:

@@ -1,6 +1,6 @@
-"""Signs of life, as the host sees them: a task that has finished nothing for much longer than it may hangs.
+"""The Rack's check for hanging processes: one that has made no progress for much longer than its period.
 
-In real time the clock's watchdog looks after the tasks; here it is the clock alone. In lockstep, all of them.
+In real time it watches the clock alone, since the clock's watchdog watches the tasks. In lockstep it watches all.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
 HEARTBEATS_MISSED = 4
-"""Cycles without a sign of life: three gave a false trip in 24,000 at 400 Hz."""
+"""Cycles without progress: three gave one false trip in 24,000 at 400 Hz."""
 LEAST_S = 2.0
-"""The launcher itself is an ordinary process on a machine full of real-time ones: it looks no closer than this."""
+"""Least bound: the launcher is an ordinary process on a machine full of real-time ones, and may itself be late."""
 LOCKSTEP_S = 60.0
-"""In lockstep a plan takes as long as it takes; time stands still meanwhile."""
+"""Bound in lockstep, where time stands still while a plan is made."""
 
 
 class Heartbeat:
-    """Watches the control blocks of all tasks, and the clock: without it nothing is ever due."""
+    """Watches the clock, and in lockstep the control blocks of all tasks."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
@@ -34,12 +34,12 @@ class Heartbeat:
         self._waited_at = -1
 
     def hanging(self) -> list[str]:
-        """Return the tasks that have come to hang since the last call; "clock" is the system clock."""
+        """Return the tasks found hanging since the last call; "clock" is the system clock."""
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
         for name, block in self._blocks.items():
-            # A task that has nothing to do is alive: its newest release is finished. One that is lost is known to be.
+            # An idle task is alive: its newest release is finished. A lost one is known already.
             idle = block[Block.DONE] == block[Block.RELEASED] or block[Block.LOST]
             if block[Block.DONE] != self._seen[name][0] or idle:
                 self._seen[name] = block[Block.DONE], now
@@ -53,7 +53,7 @@ class Heartbeat:
         return found
 
     def _clock_is_stuck(self) -> bool:
-        """Say whether a silent clock has stopped, is dead, or waits; one that could run is only starved."""
+        """Say whether a silent clock is stopped, dead, or waiting; one that could run is only starved."""
         state, tick = state_of(self._words[System.CLOCK_PID]), self._seen[CLOCK][0]
         # Seen twice: after a pause of the whole machine it is about to be woken.
         waits = state in WAITING

@@ -1,7 +1,7 @@
-"""Other racks that run on this machine: whose real-time boards hold which cores.
+"""Other racks on this machine, and the cores that their real-time boards hold.
 
-Two boards of real-time priority on one core starve each other, and each rack sees only its own lateness. Racks in
-lockstep, and tasks of ordinary scheduling, hold nothing: they wait.
+Two real-time boards on one core starve each other, and each rack sees only its own lateness. Racks in lockstep and
+tasks of ordinary scheduling hold no core: they wait.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from rack.boards.config.schema import RackConfig
 
 @dataclass(frozen=True)
 class Holder:
-    """A rack that holds a core, and with which of its tasks."""
+    """A rack that holds a core, and its tasks there."""
 
     rack: str
     launcher: int
     tasks: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return it as words."""
+        """Return the holder in words."""
         return f"rack '{self.rack}' (process {self.launcher}) runs {', '.join(self.tasks)} there at real-time priority"
 
 
 def holders(own: str) -> dict[int, Holder]:
-    """Return who holds which core, the rack called `own` left out."""
+    """Return the holder of each core, except the rack called `own`."""
     found: dict[int, Holder] = {}
     for name in racks():
         if name == own:
@@ -56,16 +56,16 @@ def _held(segment: Segment) -> dict[int, list[str]]:
     for task in segment.layout.tasks:
         if segment.block(task.name)[Block.PRIORITY]:
             held.setdefault(task.core, []).append(task.name)
-    # Any program may have made the segment: its config is a stranger's.
+    # Another version of this program may have made the segment: its config is not validated here.
     clock = tomllib.loads(segment.config).get("clock", {})
-    # Where a board was refused its priority the clock was, too.
+    # If a board was refused its priority, so was the clock.
     if held and clock.get("priority"):
         held.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
     return held
 
 
 def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
-    """Return the config with boards moved off held cores where it names none for them, and what was moved, as words."""
+    """Return the config with boards moved off held cores, unless it names their core; and a note on each move."""
     free = [core for core in sorted(os.sched_getaffinity(0)) if core not in held]
     if not free or config.clock.mode == "lockstep":
         return config, []
@@ -80,7 +80,7 @@ def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, 
 
 
 def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
-    """Return a line for every core that another rack holds and real-time tasks of a config ask for."""
+    """Return a line for every core that another rack holds and a real-time task of this config asks for."""
     wanted: dict[int, list[str]] = {}
     for task, core in _wanted(config):
         wanted.setdefault(obtained_core(core), []).append(task)
@@ -89,7 +89,7 @@ def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
 
 
 def _wanted(config: RackConfig) -> Iterator[tuple[str, int]]:
-    """Yield the tasks of real-time priority, each with its core."""
+    """Yield the real-time tasks, each with its core."""
     if config.clock.priority:
         yield CLOCK, config.clock.core
     for name, board in config.board.items():

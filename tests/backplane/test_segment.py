@@ -67,20 +67,20 @@ def test_tasks_begin_without_a_release_and_boards_hold_sysfail(make_bus: MakeBus
 def test_a_name_in_use_is_refused_and_the_first_segment_stays(make_bus: MakeBus) -> None:
     first = make_bus()
     first.words[System.TICK] = 5
-    assert f"rack '{first.rack}' has a segment already" in refusal(lambda: Segment.create(first.layout, ""))
+    assert f"rack '{first.rack}' already has a segment" in refusal(lambda: Segment.create(first.layout, ""))
     assert Segment.attach(first.rack).words[System.TICK] == 5
 
 
 def test_attaching_to_nothing_names_what_there_is(make_bus: MakeBus) -> None:
     there = make_bus().rack
     told = refusal(lambda: Segment.attach("nobody-s"))
-    assert "rack 'nobody-s' is not there" in told
+    assert "rack 'nobody-s' does not exist" in told
     assert there in told
 
 
 @pytest.mark.parametrize("name", ["a/b", "x" * 300])
 def test_a_name_that_none_can_have_is_not_there(name: str) -> None:
-    assert "is not there" in refusal(lambda: Segment.attach(name))
+    assert "does not exist" in refusal(lambda: Segment.attach(name))
 
 
 def test_another_layout_version_is_refused(make_bus: MakeBus) -> None:

@@ -60,7 +60,7 @@ def test_nothing_there_is_nothing_removed(rack_name: str) -> None:
 
 def test_a_live_rack_is_refused_with_its_launcher(spec: Layout) -> None:
     segment = Segment.create(spec, "")
-    with pytest.raises(SegmentError, match=f"rack '{spec.rack}' runs already, launched by process {os.getpid()}"):
+    with pytest.raises(SegmentError, match=f"rack '{spec.rack}' is already running, launched by process {os.getpid()}"):
         remove_dead(spec.rack)
     assert segment.has_its_name
     segment.close()
@@ -69,7 +69,7 @@ def test_a_live_rack_is_refused_with_its_launcher(spec: Layout) -> None:
 def test_a_live_rack_of_another_version_is_refused_too(spec: Layout) -> None:
     segment = Segment.create(spec, "")
     segment.words[Head.VERSION] = VERSION + 1
-    with pytest.raises(SegmentError, match="runs already"):
+    with pytest.raises(SegmentError, match="is already running"):
         remove_dead(spec.rack)
     segment.words[Head.LAUNCHER_START] += 1
     assert remove_dead(spec.rack)

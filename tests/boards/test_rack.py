@@ -113,7 +113,7 @@ def test_a_stop_from_outside_is_told_as_one(config: MakeConfig, mode: str) -> No
 def test_a_running_racks_name_is_refused_and_the_rack_goes_on(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as first:
         first.start(0.25)
-        with pytest.raises(SegmentError, match=f"rack '{first.config.name}' runs already, launched by process"):
+        with pytest.raises(SegmentError, match=f"rack '{first.config.name}' is already running, launched by process"):
             Rack(config()).launch()
         while first.watch(0.5):
             pass
