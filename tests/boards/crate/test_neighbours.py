@@ -17,7 +17,7 @@ from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
 from tests.machine import needs_fifo, needs_two_cores
 from tests.processes import RACK
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
 FIFO = ("clock.mode=realtime", "board.wave.priority=5")
 ELSEWHERE = f"""{CLOCK}

@@ -16,7 +16,7 @@ from rack.boards.crate.line import CrateLine, Preload, received
 from rack.boards.errors import LaunchError
 from tests.processes import descriptors, runs, wait_until
 
-PATH = (*sys.path, str(Path(__file__).parent))
+PATH = (*sys.path, str(Path(__file__).parents[1]))
 
 
 @pytest.fixture
