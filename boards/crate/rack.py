@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from multiprocessing.connection import wait
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -224,9 +224,9 @@ class Rack:
 
     def _listen(self, timeout_s: float) -> None:
         """Wait for the crate or an alarm, at most that long."""
-        line, attention = self._line.line.fileno(), self._line.attention
-        for fd in _wait([line, attention], timeout_s):
-            if fd == attention:
+        line, attention = self._line.line, self._line.attention
+        for ready in wait([line, attention], timeout_s):
+            if ready == attention:
                 os.eventfd_read(attention)
             else:
                 self._receive()
@@ -258,8 +258,7 @@ class Rack:
             self._recovery.end_hanging(CLOCK)
 
     def _expect(self, kind: type) -> None:
-        there = _wait([self._line.line.fileno()], LAUNCH_S)
-        if not there or not isinstance(self._line.receive(), kind):
+        if not self._line.line.poll(LAUNCH_S) or not isinstance(self._line.receive(), kind):
             late = f"the crate did not open the segment in {LAUNCH_S:g} s"
             raise LaunchError("\n".join(self._line.printed()) or late)
 
@@ -332,13 +331,6 @@ class Rack:
     def _line(self) -> CrateLine:
         assert self._crate is not None, "the rack is launched"
         return self._crate
-
-
-def _wait(fds: list[int], timeout_s: float) -> list[int]:
-    poll = select.poll()
-    for fd in fds:
-        poll.register(fd, select.POLLIN)
-    return [fd for fd, _ in poll.poll(max(0, int(timeout_s * 1000)))]
 
 
 def _status(status: int) -> str:
