@@ -30,27 +30,9 @@ if TYPE_CHECKING:
     from rack.backplane.watch.alarms import Alarm
     from rack.backplane.words import Demand
 
-__all__ = [
-    "Alarm",
-    "BackplaneError",
-    "Demand",
-    "Field",
-    "Layout",
-    "MailboxSpec",
-    "Message",
-    "MessageType",
-    "Reading",
-    "Segment",
-    "State",
-    "SystemClock",
-    "TaskSpec",
-    "Verdict",
-    "command",
-    "open_observer",
-    "open_reader",
-    "open_writer",
-    "status",
-]
+__all__ = ["Alarm", "BackplaneError", "Demand", "Field", "Layout", "MailboxSpec", "Message", "MessageType"]
+__all__ += ["Reading", "Segment", "State", "SystemClock", "TaskSpec", "Verdict", "command", "open_observer"]
+__all__ += ["open_reader", "open_writer", "status"]
 _PLACES = {
     "rack.backplane.clock.system_clock": ("SystemClock",),
     "rack.backplane.errors": ("BackplaneError",),

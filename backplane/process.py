@@ -7,7 +7,6 @@ import gc
 import os
 import select
 import signal
-from dataclasses import dataclass
 from pathlib import Path
 from time import process_time_ns
 
@@ -80,24 +79,18 @@ _PR_SET_NAME, _PR_SET_PDEATHSIG = 15, 1
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-@dataclass(frozen=True)
-class Processor:
-    """Resources obtained: core, SCHED_FIFO priority (0: ordinary scheduling), and whether memory is locked."""
+def take_processor(spec: TaskSpec) -> int:
+    """Pin the calling process, take its priority if allowed, lock its memory, stop the garbage collector.
 
-    core: int
-    priority: int
-    locked: bool
-
-
-def take_processor(spec: TaskSpec) -> Processor:
-    """Pin the calling process, take its priority if allowed, lock its memory, stop the garbage collector."""
+    Return the SCHED_FIFO priority obtained; 0: ordinary scheduling.
+    """
     pin(spec.core)
     priority = spec.priority if set_priority(spec.priority) else 0
     # On fault: locking every page at once would copy all memory that the boards share since their fork.
-    locked = _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) == 0
+    _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
     gc.freeze()
     gc.disable()
-    return Processor(spec.core, priority, locked)
+    return priority
 
 
 def set_priority(priority: int) -> bool:

@@ -26,19 +26,8 @@ if TYPE_CHECKING:
     from rack.boards.errors import BoardError, ConfigError, LaunchError, Mistake
     from rack.boards.events import Cause, Event, EventKind, Outcome
 
-__all__ = [
-    "BoardError",
-    "Cause",
-    "ConfigError",
-    "Event",
-    "EventKind",
-    "LaunchError",
-    "Mistake",
-    "Outcome",
-    "Rack",
-    "RackConfig",
-    "load",
-]
+__all__ = ["BoardError", "Cause", "ConfigError", "Event", "EventKind", "LaunchError", "Mistake", "Outcome", "Rack"]
+__all__ += ["RackConfig", "load"]
 _PLACES = {
     "rack.boards.config": ("load",),
     "rack.boards.config.schema": ("RackConfig",),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from rack.backplane import semaphores
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
-from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import LockReader
 from rack.backplane.segment import SHM_FOLDER, Segment, unlink
 from rack.backplane.trace import FIELDS, Flag, TraceWriter
@@ -122,7 +122,7 @@ class Link:
 
     def written(self) -> list[tuple[int, int, int]]:
         """Return release tick, serial and first visible tick of every message in a slot, oldest first."""
-        rows = mailbox_ring(self.segment, NAME).drain().rows
+        rows = MailboxRing(self.segment, NAME).drain().rows
         return [(int(row["tick"]), int(row["serial"]), int(row["visible_at"])) for row in rows]
 
     def alarms(self, task: str = "reader") -> list[tuple[int, Alarm]]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.lines import UtilityLines
-from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
@@ -106,7 +106,7 @@ class Holds:
 
     def _standing(self, level: str, status: Message) -> tuple[int, str]:
         """Return since which tick the standing command stands, and what it says."""
-        rows = mailbox_ring(self._segment, f"{level}.operator").drain().rows
+        rows = MailboxRing(self._segment, f"{level}.operator").drain().rows
         # A newer command that was refused has left it standing.
         mine = [
             row for row in rows if row["message"]["what"] == status.standing and row["message"]["id"] <= status.order

@@ -52,11 +52,6 @@ class MailboxRing(Ring):
         return Drained(rows if good.all() else rows[good], lost)
 
 
-def mailbox_ring(segment: Segment, name: str) -> Ring:
-    """Return the ring of a mailbox's messages. Raises `KeyError`."""
-    return MailboxRing(segment, name)
-
-
 def row_dtype(spec: MailboxSpec) -> np.dtype:
     """Return the type of one row of a mailbox's ring, padding included."""
     return np.dtype(

@@ -150,10 +150,6 @@ class Slots:
         """Say whether that serial's slot holds its message, not an older or a newer one."""
         return self._slot_words[serial & self.mask][_SERIAL] == serial
 
-    def head_words(self, serial: int) -> memoryview:
-        """Return the head of that serial's slot: see `words.Slot`."""
-        return self._slot_words[serial & self.mask]
-
     def keeps(self, serial: int) -> bool:
         """Say whether that serial's slot was not reused until now: a copy made before is of that message."""
         return serial >= oldest_kept(self.box[0], self.depth)

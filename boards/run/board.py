@@ -66,8 +66,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         if wiring.fails_self_test:
             raise LevelError("self-test failed: a fault in the config asks for it")
         UtilityLines(segment).release_sysfail(spec.slot)
-        processor = take_processor(spec)
-        block[Block.CORE], block[Block.PRIORITY] = processor.core, processor.priority
+        block[Block.PRIORITY] = take_processor(spec)
+        block[Block.CORE] = spec.core
         task = _task(segment, wiring, level, attention)
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)

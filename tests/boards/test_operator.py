@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
@@ -40,7 +40,7 @@ def run(config: RackConfig, seconds: float = SECONDS) -> tuple[Outcome, list[Eve
     with Rack(config) as rack:
         boxes = [box.name for box in rack.segment.layout.mailboxes]
         outcome = rack.run(seconds)
-        return outcome, rack.events, {name: mailbox_ring(rack.segment, name).drain().rows for name in boxes}
+        return outcome, rack.events, {name: MailboxRing(rack.segment, name).drain().rows for name in boxes}
 
 
 def first(rows: np.ndarray, serial: int) -> int:
@@ -128,7 +128,7 @@ def test_what_stood_before_a_refusal_stands_on_a_board_that_comes_back(
         message.what, message.goal = What.GOTO, Goal.HOME
         OperatorTable(rack.segment).add(Request(hold[RequestWord.MAILBOX], bytes(message.raw), 60))
         assert rack.run(1.0).worked
-        last = mailbox_ring(rack.segment, f"{board}.status").drain().rows["message"][-1]
+        last = MailboxRing(rack.segment, f"{board}.status").drain().rows["message"][-1]
     assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
     assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, What.HOLD, 1)
 
@@ -181,7 +181,7 @@ def test_a_command_is_given_only_while_its_client_lives(told: Callable[..., Rack
             if is_killed:
                 kill(pid)
             assert rack.run(1.0).worked
-        assert mailbox_ring(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
+        assert MailboxRing(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
 
 
 def test_what_a_program_says_must_fit_the_rack(told: Callable[..., RackConfig]) -> None:

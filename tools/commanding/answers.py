@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.mailbox.history import mailbox_ring
+from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.levels.operator import Answer
 from rack.tools.commanding.told import Told
@@ -23,7 +23,7 @@ class Answers:
     """Keeps what a level's statuses say to a command, from the first that knows it."""
 
     def __init__(self, segment: Segment, status: MailboxSpec, told: Told) -> None:
-        self._ring = mailbox_ring(segment, status.name)
+        self._ring = MailboxRing(segment, status.name)
         self.told = told
 
     def look(self) -> Told:

@@ -14,7 +14,7 @@ from rack.tools.viewer.timelines import Ints, Timelines
 class Block:
     """Rows of one ring, oldest first, with their times.
 
-    A mailbox's rows have the fields of `rack.backplane.ring.mailbox_ring`, those of a trace the fields of
+    A mailbox's rows have the fields of `rack.backplane.mailbox.history.MailboxRing`, those of a trace the fields of
     `rack.backplane.trace.RECORD`.
     """
 
