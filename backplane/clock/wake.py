@@ -93,7 +93,7 @@ class NextCycle:
         return is_alive(*self._launcher)
 
     def _patience_s(self) -> float:
-        """Return how long to wait for the next release, s, before the clock is looked at."""
+        """Return how long to wait for the next release, s, before the clock is checked."""
         if self._last < 0:
             return CHECK_S
         every = self._spec.every

@@ -151,7 +151,7 @@ class Reader:
         self.spec = segment.layout.mailbox(name)
         self.slots = self._fetched = Slots(segment, self.spec)
         self._box = self._fetched.box
-        # The last good message has a buffer of its own: a corrupt copy never reaches it.
+        # The last good message has its own buffer: a corrupt copy never reaches it.
         self._good = Slots(segment, self.spec)
         self.message = self._good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}

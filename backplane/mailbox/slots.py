@@ -184,7 +184,7 @@ class Slots:
 
     @property
     def signature(self) -> int:
-        """Who wrote that message: see `claim`."""
+        """Signature of its writer: see `claim`."""
         return self._words[_EPOCH]
 
     @property

@@ -1,25 +1,8 @@
 """A level in execution: `procedure level()` of the paper (section 2).
 
-    procedure level()
-    cobegin
-        repeat "executor section, runs at a higher priority"
-            waituntil(next-cycle); update(next-cycle);
-            lock; read_command; unlock;
-            lock; read_status; unlock;
-            read plan;
-            process;
-            lock; write_command; unlock;
-            lock; write_status; unlock;
-        until forever;
-        repeat "planner"
-            plan;
-            lock; write_plan; unlock;
-        until forever;
-    coend
-
-`VirtualControlLoop` is the executor section and `PlannerLoop` the planner. `cobegin` is two processes: on one core, by
-priority (tightly coupled), or on two (loosely coupled). `lock` and `unlock` are the business of each mailbox: only its
-protocol `lock` needs them. Stamps, trace and counts are the stopwatch's; faults come in between cycles.
+`VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin` is two processes: on
+one core, by priority (tightly coupled), or on two (loosely coupled). `lock` and `unlock` are left to the mailboxes:
+only protocol `lock` needs them. Stamps, trace and counts are kept by the stopwatch; faults take effect between cycles.
 """
 
 from __future__ import annotations
@@ -39,7 +22,7 @@ _DEMAND, _DEMANDS = int(System.DEMAND), tuple(Demand)
 
 
 class VirtualControlLoop(Task):
-    """The executor section: one virtual control loop.
+    """The executor section of `procedure level()`: one virtual control loop, at the higher priority.
 
         repeat
             waituntil(next-cycle); update(next-cycle)
@@ -102,7 +85,7 @@ class VirtualControlLoop(Task):
 
 
 class PlannerLoop(Task):
-    """The planner: plans in the background, each plan within its cycles.
+    """The planner of `procedure level()`: plans in the background, each plan within its cycles.
 
         repeat
             plan

@@ -1,7 +1,7 @@
 """The stopwatch of a task: times each cycle, traces it, and keeps the counts of the task's control block.
 
-Everything that the paper's procedure does not show stands here: time stamps (R, X, W, C of eqs. 3.5 and 3.9), the trace
-record, missed deadlines, skipped releases, trouble on the bus, and the word that tells the clock what is done.
+Everything around the paper's procedure is here: time stamps (R, X, W, C of eqs. 3.5 and 3.9), the trace record, missed
+deadlines, skipped releases, failed accesses, and the report to the clock that a release is done.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Stopwatch:
         self.notify_clock()
 
     def notify_clock(self) -> None:
-        """In lockstep, make the clock look at this task again."""
+        """In lockstep, let the clock check this task again."""
         if self._lockstep_clock is not None:
             self._lockstep_clock.release()
 

@@ -41,7 +41,7 @@ class SystemController:
         self._demand = Demand(self._words[System.DEMAND])
 
     def begin(self, tick: int) -> None:
-        """Do what is due before the tasks of `tick` are released."""
+        """Do the work due before the tasks of `tick` are released."""
         if not self._faults.is_quiet:
             self._faults.advance(tick)
         if not self._desk.is_quiet:
@@ -51,7 +51,7 @@ class SystemController:
             self._handle_losses(tick)
 
     def released(self, tick: int) -> None:
-        """Do what is due after they were released."""
+        """Do the work due after the release."""
         self._faults.within(tick)
 
     def _handle_losses(self, tick: int) -> None:
