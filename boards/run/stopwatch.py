@@ -73,12 +73,17 @@ class Stopwatch:
         """
         block, record, skipped = self._block, self._record, self._skipped
         tick, missed = record[_TICK], not in_time
-        if self._lockstep_clock is not None:
+        lockstep_clock = self._lockstep_clock
+        if lockstep_clock is not None:
             record[_RELEASE] = record[_START]
         else:
             record[_RELEASE] = release = self._clock.time_of(tick)
             missed = missed or record[_END] > release + (deadline - tick) * self._clock.period_ns
-        record[_FLAGS] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT | self._trouble()
+        troubles = self._inputs.bad_reads + self._outputs.bus_errors
+        if troubles != self._troubles:
+            self._troubles = troubles
+            flags |= self._count_troubles()
+        record[_FLAGS] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT
         state = self._status.state if self._status is not None else 0
         if state != block[_LEVEL_STATE]:
             block[_LEVEL_SINCE] = tick
@@ -90,7 +95,8 @@ class Stopwatch:
         block[_MISSED] += missed
         block[_SKIPPED] += skipped
         block[_DONE] = done
-        self.notify_clock()
+        if lockstep_clock is not None:
+            lockstep_clock.release()
         if not block[_CYCLES] % BUS_COUNT_CYCLES:
             self.count_bus()
 
@@ -107,12 +113,8 @@ class Stopwatch:
         if self._lockstep_clock is not None:
             self._lockstep_clock.release()
 
-    def _trouble(self) -> int:
+    def _count_troubles(self) -> int:
         """Count the failed accesses since the last cycle; return them as trace flags."""
-        troubles = self._inputs.bad_reads + self._outputs.bus_errors
-        if troubles == self._troubles:
-            return 0
-        self._troubles = troubles
         bus_errors, corrupt = self._inputs.bus_errors + self._outputs.bus_errors, self._inputs.corrupt
         new_errors, new_corrupt = bus_errors - self._bus_errors, corrupt - self._corrupt
         self._bus_errors, self._corrupt = bus_errors, corrupt
