@@ -1,4 +1,4 @@
-"""The operator table: requests are filled whole, wait in order, may be taken back, and make room once given."""
+"""The operator table: requests are filled whole, wait in order, may be withdrawn, and make room once issued."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_request_that_was_given_stays_given(segment: Segment) -> None:
     assert entry.stage == RequestStage.GIVEN
 
 
-def test_nobody_takes_back_what_another_has_put_into_the_same_entry(segment: Segment) -> None:
+def test_a_request_in_a_reused_entry_is_not_withdrawn_by_an_earlier_client(segment: Segment) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b"", 9))
     ticket = entry[RequestWord.TICKET]

@@ -1,4 +1,4 @@
-"""Who is alive: told by pid and start time."""
+"""Processes are identified by pid and start time."""
 
 from __future__ import annotations
 

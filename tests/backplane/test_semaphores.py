@@ -41,7 +41,7 @@ def test_locks_begin_free_and_wake_ups_unsent(bus: Segment) -> None:
     assert semaphores.clock_semaphore(bus.rack).value == 0
 
 
-def test_what_a_killed_rack_left_is_replaced(bus: Segment) -> None:
+def test_semaphores_of_a_killed_rack_are_replaced(bus: Segment) -> None:
     semaphores.wake_semaphore(bus.rack, "writer").release()
     semaphores.create(bus.layout)
     semaphores.open_all(bus.layout)

@@ -1,4 +1,4 @@
-"""The system controller: ticks on the grid in real time, and who is woken first."""
+"""The clock in real time: ticks on the grid, and the order of releases."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Lagging:
         pass
 
 
-def test_a_late_clock_gives_out_the_last_tick_of_a_run(make_bus: MakeBus) -> None:
+def test_a_late_clock_makes_the_last_tick_of_a_run(make_bus: MakeBus) -> None:
     segment, controller = make_bus(), Lagging()
     start(segment)
     driver = RealtimeDriver(segment, lambda _: 5)

@@ -1,4 +1,4 @@
-"""The system controller in lockstep: a tick when all that is due has finished."""
+"""The clock in lockstep: a tick begins when every due task has finished."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def lockstep(
     return log, ticks
 
 
-def test_lockstep_gives_out_every_tick_once(make_bus: MakeBus) -> None:
+def test_lockstep_makes_every_tick_once(make_bus: MakeBus) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=4, slot=3))
     _, ticks = lockstep(segment, 13, False)
     assert ticks == list(range(14))

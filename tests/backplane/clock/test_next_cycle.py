@@ -1,4 +1,4 @@
-"""Waiting for the next cycle: on the grid, skipping what passed, and not for ever."""
+"""Waiting for the next cycle: on the grid, skipping passed releases, and within a bound."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_release_is_given_once(bus: Segment, poll: bool) -> None:
 
 
 @POLL
-def test_a_late_task_skips_what_passed_and_counts_it(bus: Segment, poll: bool) -> None:
+def test_a_late_task_skips_passed_releases_and_counts_them(bus: Segment, poll: bool) -> None:
     cycle = NextCycle(bus, "level", poll)
     release(bus, 0)
     cycle.wait()
@@ -113,7 +113,7 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment, poll: bool) -> None:
 
 
 @POLL
-def test_who_is_late_for_the_last_release_takes_it_all_the_same(bus: Segment, poll: bool) -> None:
+def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment, poll: bool) -> None:
     cycle = NextCycle(bus, "level", poll)
     for tick in (0, 4, 8):
         release(bus, tick)
@@ -156,7 +156,7 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_a_clock_that_stops_again_is_told_of_again(bus: Segment) -> None:
+def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
     bus.words[System.PERIOD_NS], bus.words[System.EPOCH_NS] = 2_500_000, time.monotonic_ns()
     cycle, ring = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")), alarm_ring(bus, "level")
     release(bus, 0)

@@ -35,7 +35,7 @@ def test_above_the_clocks_rate_there_is_one_neighbour(rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -50.0, float("nan")])
-def test_what_is_no_rate_is_refused(rate_hz: float) -> None:
+def test_an_impossible_rate_is_refused(rate_hz: float) -> None:
     with pytest.raises(ClockError, match="is not a rate"):
         ticks_of(rate_hz, CLOCK_NS, "level")
 

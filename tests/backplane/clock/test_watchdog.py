@@ -1,4 +1,4 @@
-"""The watchdog: a release without an answer is a miss; only proof makes it a loss."""
+"""The watchdog: a missed release is a miss; only proof makes it a loss."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Watched:
         return self._watchdog.losses
 
 
-def test_who_answers_rings_nothing(make_bus: MakeBus) -> None:
+def test_a_responding_task_rings_no_alarm(make_bus: MakeBus) -> None:
     watched = Watched(make_bus(), os.getpid())
     assert [watched.release(True) for _ in range(10)] == [[]] * 10
 

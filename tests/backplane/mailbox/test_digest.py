@@ -48,7 +48,7 @@ def test_any_difference_shows(bus: Segment, values: list[int]) -> None:
     assert found[NAME][1] != found[OTHER][1]
 
 
-def test_the_digest_tells_the_mailboxes_apart(make_bus: MakeBus, bus: Segment) -> None:
+def test_the_digest_distinguishes_mailboxes(make_bus: MakeBus, bus: Segment) -> None:
     write(bus, NAME, [1])
     write(bus, OTHER, [2])
     first = digest(bus, 100)
@@ -59,7 +59,7 @@ def test_the_digest_tells_the_mailboxes_apart(make_bus: MakeBus, bus: Segment) -
     assert digest(swapped, 100) != first
 
 
-def test_what_shows_behind_the_last_tick_does_not_count(bus: Segment) -> None:
+def test_messages_visible_after_the_last_tick_do_not_count(bus: Segment) -> None:
     write(bus, NAME, [1, 2, 3])
     assert [chains(bus, until)[NAME][0] for until in (2, 3, 4, 5, 6, 7)] == [0, 1, 1, 2, 2, 3]
     before = digest(bus, 7), digest(bus, 9)
@@ -74,7 +74,7 @@ def test_the_digest_goes_as_far_as_the_run(bus: Segment) -> None:
     assert digest(bus) == digest(bus, 4) != digest(bus, 7)
 
 
-def test_the_chain_holds_what_is_overwritten(bus: Segment) -> None:
+def test_the_chain_covers_overwritten_messages(bus: Segment) -> None:
     write(bus, NAME, list(range(500)))
     write(bus, OTHER, [-1, *range(1, 500)])
     found = chains(bus, 5000)

@@ -63,7 +63,7 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
     assert reader.read(2).is_new
 
 
-def test_what_was_never_read_is_not_there_behind_a_bus_error(bus: Segment) -> None:
+def test_a_bus_error_before_the_first_message_gives_none(bus: Segment) -> None:
     reader = open_reader(bus, NAME)
     with forked(lambda: hold(bus)):
         wait_until(lambda: bus.words[TOLD])
@@ -111,7 +111,7 @@ def cycle(segment: Segment, word: int = TOLD) -> None:
         segment.words[word] += 1
 
 
-def test_nobody_else_is_in_the_critical_section(bus: Segment) -> None:
+def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
     told = [TOLD + 1, TOLD + 2, TOLD + 3]
     workers = [fork(lambda word=word: cycle(bus, word)) for word in told]
     try:

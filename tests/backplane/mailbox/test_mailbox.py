@@ -49,7 +49,7 @@ def test_a_message_becomes_visible_at_the_end_of_its_slice(make_bus: MakeBus) ->
 
 @pytest.mark.parametrize(("every", "delay"), [(1, 1), (2, 2), (2, 6), (4, 4)])
 @pytest.mark.parametrize("ahead", [0, 3])
-def test_what_is_read_depends_on_ticks_alone(make_bus: MakeBus, every: int, delay: int, ahead: int) -> None:
+def test_reads_depend_on_ticks_alone(make_bus: MakeBus, every: int, delay: int, ahead: int) -> None:
     writer, reader = ends(make_bus(mailbox(every=every, delay=delay, depth=32)))
     released = -every
     for tick in range(40):
@@ -128,7 +128,7 @@ def test_every_bit_of_a_message_is_checked(make_bus: MakeBus) -> None:
     assert seen(reader, 1) == (1, NEW)
 
 
-def test_what_is_overwritten_before_its_reader_comes_is_a_bus_error(make_bus: MakeBus) -> None:
+def test_a_message_overwritten_before_it_is_read_is_a_bus_error(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox(depth=8))
     writer, reader = ends(segment)
     write(writer, 0)
@@ -182,7 +182,7 @@ def test_the_claim_ends_with_its_process(make_bus: MakeBus) -> None:
     open_writer(segment, NAME)
 
 
-def test_a_new_writer_goes_on_behind_the_last_message_in_a_new_epoch(make_bus: MakeBus) -> None:
+def test_a_new_writer_continues_after_the_last_message_in_a_new_epoch(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
     slots = Slots(segment, segment.layout.mailbox(NAME))
     first, reader = ends(segment)
@@ -211,7 +211,7 @@ def test_the_chain_does_not_show_where_a_writer_was_replaced(make_bus: MakeBus) 
     assert len({reader.chain for reader in chains.values()}) == 1
 
 
-def test_the_chain_tells_of_every_earlier_message(make_bus: MakeBus) -> None:
+def test_the_chain_depends_on_every_earlier_message(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox(), mailbox(name="writer.other"))
     for name, first in ((NAME, 1), ("writer.other", 2)):
         writer = open_writer(segment, name)

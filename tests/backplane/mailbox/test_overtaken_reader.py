@@ -115,7 +115,7 @@ class Overtaken:
 
 @pytest.mark.parametrize("protocol", ["time-slice", "double-buffer"])
 @pytest.mark.parametrize("kind", FAULTS)
-def test_a_reader_overtaken_at_any_instruction_tells_nothing_false(
+def test_a_reader_overtaken_at_any_instruction_reports_nothing_false(
     link: MakeLink, protocol: Protocol, kind: str
 ) -> None:
     rack = link(protocol, rates=(1, READ_EVERY), depth=DEPTH)

@@ -1,4 +1,4 @@
-"""The protocols beside each other: when a message shows, and what a dead writer leaves."""
+"""The protocols compared: when a message becomes visible, and the state a dead writer leaves."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ def test_a_message_shows_at_once(make_bus: MakeBus, protocol: Protocol) -> None:
 
 
 @pytest.mark.parametrize("protocol", AT_ONCE)
-def test_a_late_message_is_told_at_once_too(make_bus: MakeBus, protocol: Protocol) -> None:
+def test_a_late_message_is_reported_under_every_protocol(make_bus: MakeBus, protocol: Protocol) -> None:
     writer = open_writer(make_bus(mailbox(protocol, every=2, delay=4)), NAME)
     assert [writer.write(0, now) for now in (None, 3, 4, 9)] == [True, True, False, False]
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_an_observer_reads_as_its_protocol_shows_and_waits_for_nobody(make_bus: MakeBus, protocol: Protocol) -> None:
+def test_an_observer_reads_by_its_protocol_and_never_waits(make_bus: MakeBus, protocol: Protocol) -> None:
     segment = make_bus(mailbox(protocol, every=4, delay=4))
     writer, observer = open_writer(segment, NAME), open_observer(segment, NAME)
     writer.write(0)

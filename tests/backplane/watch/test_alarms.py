@@ -32,7 +32,7 @@ def test_each_task_and_the_clock_has_a_ring_of_its_own(make_bus: MakeBus) -> Non
     }
 
 
-def test_a_restarted_task_goes_on_in_its_ring(make_bus: MakeBus) -> None:
+def test_a_restarted_task_continues_its_ring(make_bus: MakeBus) -> None:
     segment = make_bus()
     ring = alarm_ring(segment, "writer")
     for tick in (1, 2):
@@ -40,7 +40,7 @@ def test_a_restarted_task_goes_on_in_its_ring(make_bus: MakeBus) -> None:
     assert ring.drain().rows["tick"].tolist() == [1, 2]
 
 
-def test_alarms_that_nobody_took_are_counted(make_bus: MakeBus) -> None:
+def test_unread_alarms_are_counted(make_bus: MakeBus) -> None:
     segment = make_bus()
     writer, ring = AlarmWriter(segment, "writer"), alarm_ring(segment, "writer")
     for tick in range(2 * ALARM_DEPTH):
@@ -50,7 +50,7 @@ def test_alarms_that_nobody_took_are_counted(make_bus: MakeBus) -> None:
     assert rows["tick"][-1] == 2 * ALARM_DEPTH - 1
 
 
-def test_an_alarm_wakes_who_watches_and_a_miss_does_not(make_bus: MakeBus) -> None:
+def test_an_alarm_wakes_the_rack_and_a_miss_does_not(make_bus: MakeBus) -> None:
     segment, attention = make_bus(), os.eventfd(0, os.EFD_NONBLOCK)
     try:
         writer = AlarmWriter(segment, "writer", attention)

@@ -1,4 +1,4 @@
-"""Watching what comes: nobody rings for a late machine, and each fault rings once an episode."""
+"""Checks on messages: no alarm for a slow machine, and one alarm an episode for each fault."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def publish(rack: Link, tick: int, visible_at: int) -> None:
     writer.publish(tick, visible_at, tick)
 
 
-def test_what_was_written_before_the_first_read_is_not_judged(link: MakeLink) -> None:
+def test_messages_before_the_first_read_are_not_judged(link: MakeLink) -> None:
     rack = link()
     rack.fault("drop", 0.5)
     rack.fault("corrupt", 0.5)
@@ -40,7 +40,7 @@ def test_what_was_written_before_the_first_read_is_not_judged(link: MakeLink) ->
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_reader_that_skips_cycles_is_told_nothing_false(link: MakeLink, protocol: Protocol) -> None:
+def test_a_reader_that_skips_cycles_reports_nothing_false(link: MakeLink, protocol: Protocol) -> None:
     rack = link(protocol)
     for pause in (1, 2, 18, 100):
         start = rack.reader.seen[-1].tick + 1 if rack.reader.seen else 0
@@ -52,7 +52,7 @@ def test_a_reader_that_skips_cycles_is_told_nothing_false(link: MakeLink, protoc
     assert not any(seen.is_lost for seen in rack.reader.seen)
 
 
-def test_a_reader_that_is_late_for_its_tick_is_told_nothing_false(link: MakeLink) -> None:
+def test_a_late_reader_reports_nothing_false(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
     # It was released at 20, and lost its core while its writer went on.
@@ -63,7 +63,7 @@ def test_a_reader_that_is_late_for_its_tick_is_told_nothing_false(link: MakeLink
     assert rack.alarms() == []
 
 
-def test_a_reader_that_finds_everything_overwritten_goes_on_with_what_there_is(link: MakeLink) -> None:
+def test_a_reader_that_finds_everything_overwritten_continues(link: MakeLink) -> None:
     rack = link(depth=8)
     rack.run(0, 20)
     for tick in range(20, 100):
@@ -101,7 +101,7 @@ def test_a_writer_that_loses_its_core_between_the_clock_and_its_slot_is_no_fault
     assert rack.alarms() == []
 
 
-def test_a_message_that_comes_behind_the_end_of_its_cycle_was_held_back(link: MakeLink) -> None:
+def test_a_message_after_the_end_of_its_cycle_was_held_back(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
     rack.writer.end(20)
@@ -111,7 +111,7 @@ def test_a_message_that_comes_behind_the_end_of_its_cycle_was_held_back(link: Ma
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_restarted_reader_is_told_nothing_false(link: MakeLink, protocol: Protocol) -> None:
+def test_a_restarted_reader_reports_nothing_false(link: MakeLink, protocol: Protocol) -> None:
     rack = link(protocol)
     rack.run(0, 50)
     for tick in range(50, 450):
@@ -153,7 +153,7 @@ def test_an_episode_rings_once_and_a_later_one_again(link: MakeLink) -> None:
 
 
 @pytest.mark.parametrize("rates", [(1, 8), (1, 24)])
-def test_a_slow_reader_finds_damage_in_what_it_does_not_take(link: MakeLink, rates: tuple[int, int]) -> None:
+def test_a_slow_reader_finds_damage_in_messages_it_skips(link: MakeLink, rates: tuple[int, int]) -> None:
     rack = link(rates=rates)
     rack.run(0, 97)
     rack.writer.cycle(97)

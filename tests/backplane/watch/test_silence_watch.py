@@ -1,4 +1,4 @@
-"""Watching what does not come: proof before an alarm, and silence alone as a reason to hold."""
+"""Checks on silence: an alarm needs proof; silence alone is a reason to hold."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_writer_that_finishes_cycles_without_a_message_is_mute(link: MakeLink)
     assert rack.alarms() == [(42, Alarm.MUTE)]
 
 
-def test_what_a_lock_cut_off_was_not_suppressed(link: MakeLink) -> None:
+def test_a_write_cut_off_by_a_lock_is_not_mute(link: MakeLink) -> None:
     rack = link("lock")
     rack.run(0, 20)
     for tick in range(20, 30):
@@ -116,7 +116,7 @@ def test_a_neighbour_finds_a_death_four_cycles_old(link: MakeLink) -> None:
     assert rack.alarms() == [(23, Alarm.STALE)]
 
 
-def test_a_loss_that_is_told_shows_from_the_tick_behind_it(link: MakeLink) -> None:
+def test_a_marked_loss_shows_from_the_next_tick(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
     rack.segment.block("writer")[Block.LOST] = 1 + 20
@@ -133,7 +133,7 @@ def test_a_lost_writer_that_never_wrote_gives_nothing_to_hold(link: MakeLink) ->
 
 
 @pytest.mark.parametrize("rates", [(1, 1), (1, 8), (8, 1)])
-def test_after_a_pause_of_the_clock_nobody_is_silent(link: MakeLink, rates: tuple[int, int]) -> None:
+def test_after_a_pause_of_the_clock_no_writer_is_silent(link: MakeLink, rates: tuple[int, int]) -> None:
     rack = link(rates=rates)
     rack.run(0, 80)
     # It left 40 ticks out: nobody was released, and every message is old.

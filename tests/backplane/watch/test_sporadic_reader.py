@@ -1,4 +1,4 @@
-"""Reading what the clock gives now and then: silence is no fault, a message that is not whole or not its own is."""
+"""Reading a mailbox of the clock: silence is not a fault; a damaged or forged message is."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def rung(segment: Segment) -> list[Alarm]:
     return [Alarm(int(row["code"])) for row in alarm_ring(segment, "reader").drain().rows]
 
 
-def test_only_what_the_clock_writes_is_read_so(segment: Segment) -> None:
+def test_only_mailboxes_of_the_clock_are_sporadic(segment: Segment) -> None:
     assert isinstance(open_reader(segment), SporadicReader)
     assert isinstance(open_reader(segment, "writer.point"), WatchedReader)
 
@@ -66,7 +66,7 @@ def test_several_messages_of_one_tick_are_no_babble(segment: Segment, writer: Wr
     assert rung(segment) == []
 
 
-def test_a_damaged_message_is_not_taken_and_is_told(segment: Segment, writer: Writer) -> None:
+def test_a_damaged_message_is_rejected_and_reported(segment: Segment, writer: Writer) -> None:
     reader = open_reader(segment)
     for number in (1, 2):
         writer.message.id = number
@@ -76,7 +76,7 @@ def test_a_damaged_message_is_not_taken_and_is_told(segment: Segment, writer: Wr
     assert rung(segment) == [Alarm.DAMAGED]
 
 
-def test_a_message_of_another_process_is_not_taken_and_is_told(segment: Segment, writer: Writer) -> None:
+def test_a_forged_message_is_rejected_and_reported(segment: Segment, writer: Writer) -> None:
     reader = open_reader(segment)
     writer.message.id = 1
     writer.write(10)

@@ -107,7 +107,7 @@ def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
         ("driven", Alarm.BRAKES_OPENED, -1, 40, "brakes released after 40 ticks (100 ms)"),
     ],
 )
-def test_an_alarm_is_told_with_names_and_units(
+def test_an_alarm_has_names_and_units(
     segment: Segment, owner: str, alarm: Alarm, subject: int, value: float, text: str
 ) -> None:
     event = heard(segment, owner, alarm, subject, value, since=360)
@@ -122,7 +122,7 @@ def test_subjects_have_names_for_programs_too(segment: Segment) -> None:
     assert heard(segment, "wave", Alarm.CLOCK_STOPPED).subject == ""
 
 
-def test_a_return_is_told_of_who_is_back(segment: Segment) -> None:
+def test_a_return_names_the_returned_task(segment: Segment) -> None:
     event = heard(segment, CLOCK, Alarm.REJOINED, 2, 200)
     assert (event.board, event.subject, event.text) == ("watch", "watch", "'watch' rejoined after 200 ticks (500 ms)")
     assert heard(segment, CLOCK, Alarm.REJOINED, -1, 4).board == CLOCK
@@ -152,12 +152,12 @@ def test_a_demand_is_a_reaction_and_its_end_a_recovery(
         (2, CLOCK, "", "kill begins"),
     ],
 )
-def test_a_fault_is_told_of_whom_it_strikes(segment: Segment, fault: int, board: str, subject: str, text: str) -> None:
+def test_a_fault_names_its_target(segment: Segment, fault: int, board: str, subject: str, text: str) -> None:
     event = heard(segment, CLOCK, Alarm.FAULT_BEGINS, fault)
     assert (event.code, event.fault, event.board, event.subject, event.text) == ("begins", fault, board, subject, text)
 
 
-def test_the_end_of_a_fault_tells_how_often_it_acted(segment: Segment) -> None:
+def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
     FaultTable(segment).entries[2].acted(400, 1)
     event = heard(segment, CLOCK, Alarm.FAULT_ENDS, 2, 1.0)
     assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; acted 1 time")

@@ -1,4 +1,4 @@
-"""Removing what killed racks left: never a rack in use, and never twice."""
+"""Removal of what killed racks left: never a rack in use, and never twice."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_live_rack_of_another_version_is_refused_too(spec: Layout) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 100, 8192])
-def test_what_is_no_segment_is_removed(rack_name: str, size: int) -> None:
+def test_a_file_too_small_for_a_segment_is_removed(rack_name: str, size: int) -> None:
     shm_path(rack_name).write_bytes(bytes(size))
     assert remove_dead(rack_name)
     assert rack_name not in racks()
@@ -104,7 +104,7 @@ def test_another_users_rack_is_left_alone(spec: Layout) -> None:
     assert spec.rack in racks()
 
 
-def test_clean_tells_what_it_removed_and_what_is_in_use(spec: Layout, rack_name: str) -> None:
+def test_clean_names_racks_removed_and_in_use(spec: Layout, rack_name: str) -> None:
     leave_dead(spec)
     live = Segment.create(layout(f"{rack_name}-live"), "")
     try:
@@ -130,7 +130,7 @@ def test_a_rack_removed_and_launched_meanwhile_is_not_removed(spec: Layout, monk
     again.close()
 
 
-def test_who_finds_another_removing_leaves_it_to_him(spec: Layout) -> None:
+def test_a_removal_under_way_is_left_alone(spec: Layout) -> None:
     leave_dead(spec)
     found = Segment.open(spec.rack)
     other = ByteLock(found, 8 * Head.MAGIC)
@@ -181,7 +181,7 @@ def test_of_several_launches_one_takes_a_dead_racks_name_and_keeps_it(spec: Layo
 
 
 @pytest.mark.parametrize("kind", ["directory", "symbolic link"])
-def test_what_has_a_racks_name_and_is_none_is_named_and_left_alone(rack_name: str, tmp_path: Path, kind: str) -> None:
+def test_a_foreign_entry_is_named_and_left_alone(rack_name: str, tmp_path: Path, kind: str) -> None:
     place, target = shm_path(rack_name), tmp_path / "target"
     target.write_bytes(bytes(8192))
     place.mkdir() if kind == "directory" else place.symlink_to(target)

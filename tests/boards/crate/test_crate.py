@@ -1,4 +1,4 @@
-"""The crate and its line: requests, answers, what boards print, and the end."""
+"""The crate and its line: requests, answers, the boards' output, and the end."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_crate_that_does_not_end_is_killed() -> None:
     assert not runs(line.pid)
 
 
-def test_what_is_printed_comes_line_by_line_and_once(line: CrateLine) -> None:
+def test_output_comes_line_by_line_and_once(line: CrateLine) -> None:
     line.send(Preload(("wave_printer",), PATH))
     found: list[str] = []
     wait_until(lambda: found.extend(line.printed()) or len(found) == 2)
@@ -60,7 +60,7 @@ def test_what_is_printed_comes_line_by_line_and_once(line: CrateLine) -> None:
     assert line.printed() == []
 
 
-def test_a_module_that_does_not_import_is_not_the_crates_affair(line: CrateLine) -> None:
+def test_the_crate_survives_a_module_that_cannot_be_imported(line: CrateLine) -> None:
     line.send(Preload(("no_such_module", "wave_printer"), PATH))
     wait_until(line.printed)
     assert runs(line.pid)
@@ -74,7 +74,7 @@ def test_a_request_to_a_crate_that_is_gone_is_a_launch_error(line: CrateLine) ->
     line.ask(Preload((), ()))
 
 
-def test_an_interrupt_from_the_terminal_is_the_racks_affair() -> None:
+def test_the_crate_ignores_an_interrupt_from_the_terminal() -> None:
     line = CrateLine()
     line.send(Preload(("wave_printer",), PATH))
     wait_until(line.printed)

@@ -1,4 +1,4 @@
-"""Signs of life: who has finished nothing for longer than its bound hangs."""
+"""Heartbeats: a task without progress for longer than its bound hangs."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def run_on(segment: Segment, clock: Clock, seconds: float, *hanging: str) -> Non
             block[Block.DONE] = tick
 
 
-def test_who_goes_on_does_not_hang(bus: Segment, clock: Clock) -> None:
+def test_a_progressing_task_does_not_hang(bus: Segment, clock: Clock) -> None:
     beat = Heartbeat(bus)
     for _ in range(100):
         run_on(bus, clock, 0.5)
@@ -85,7 +85,7 @@ def test_a_task_that_finishes_nothing_hangs_once(bus: Segment, clock: Clock) -> 
     assert told == [FAST]
 
 
-def test_a_task_that_went_on_and_hangs_again_is_told_again(bus: Segment, clock: Clock) -> None:
+def test_a_task_that_recovered_and_hangs_again_is_reported_again(bus: Segment, clock: Clock) -> None:
     beat, told = Heartbeat(bus), []
     for hanging in ((FAST,), (), (FAST,)):
         run_on(bus, clock, 2 * LOCKSTEP_S, *hanging)
@@ -107,7 +107,7 @@ def test_in_real_time_the_tasks_are_the_clocks_to_watch(bus: Segment, clock: Clo
     assert beat.hanging() == []
 
 
-def test_who_has_nothing_to_do_does_not_hang(bus: Segment, clock: Clock) -> None:
+def test_an_idle_task_does_not_hang(bus: Segment, clock: Clock) -> None:
     beat = Heartbeat(bus)
     for name in (FAST, SLOW):
         bus.block(name)[Block.RELEASED] = bus.block(name)[Block.DONE] = 8
@@ -117,7 +117,7 @@ def test_who_has_nothing_to_do_does_not_hang(bus: Segment, clock: Clock) -> None
         assert beat.hanging() == []
 
 
-def test_a_clock_that_gives_out_no_tick_hangs(bus: Segment, clock: Clock) -> None:
+def test_a_clock_that_makes_no_tick_hangs(bus: Segment, clock: Clock) -> None:
     bus.words[System.LOCKSTEP] = 0
     beat = Heartbeat(bus)
     run_on(bus, clock, 0.5)
@@ -153,7 +153,7 @@ def test_a_silent_clock_hangs_only_where_it_waits_or_was_stopped(
 
 
 @pytest.mark.parametrize("state", [Run.STARTING, Run.STOPPED])
-def test_nobody_hangs_before_and_after_the_run(bus: Segment, clock: Clock, state: Run) -> None:
+def test_no_task_hangs_before_or_after_the_run(bus: Segment, clock: Clock, state: Run) -> None:
     beat = Heartbeat(bus)
     bus.words[System.STATE] = state
     clock.now_s += 1000.0

@@ -79,7 +79,7 @@ def test_a_process_killed_before_the_start_ends_the_run_too(config: MakeConfig, 
 
 
 @pytest.mark.parametrize(("victim", "mode"), [("wave", "realtime"), ("clock", "realtime"), ("wave", "lockstep")])
-def test_a_stopped_process_is_told_as_hanging(
+def test_a_stopped_process_is_reported_as_hanging(
     config: MakeConfig, victim: str, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rack.boards.crate.heartbeat.LOCKSTEP_S", 0.5)
@@ -104,7 +104,7 @@ def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(config: MakeConfig, m
     assert not runs(crate)
 
 
-def test_a_level_that_raises_is_told_with_its_reason(config: MakeConfig) -> None:
+def test_a_level_that_raises_is_reported_with_its_reason(config: MakeConfig) -> None:
     with Rack(config("board.wave.params={ trouble = 'raise', at = 30 }", NEVER)) as rack:
         rack.start()
         outcome = end_of(rack)

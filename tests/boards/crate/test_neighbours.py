@@ -1,4 +1,4 @@
-"""Two racks on one machine: cores that one holds are not taken by the other without a word."""
+"""Two racks on one machine: a core held by one is not taken by the other without a warning."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def second(config: MakeConfig, rack: Rack, *settings: str, text: str = PLAIN) ->
 
 
 @needs_fifo
-def test_a_held_core_is_refused_with_who_holds_it(config: MakeConfig, first: Rack) -> None:
+def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack) -> None:
     with pytest.raises(ConfigError) as refused:
         Rack(second(config, first, "board.wave.core=0"), share=False).launch()
     holder = f"rack '{first.config.name}' (process {os.getpid()}) runs wave there at real-time priority"
@@ -60,7 +60,7 @@ def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
 
 @needs_fifo
 @pytest.mark.parametrize("setting", ["clock.mode=lockstep", "board.wave.priority=0"])
-def test_what_waits_takes_no_core_from_anybody(config: MakeConfig, first: Rack, setting: str) -> None:
+def test_waiting_racks_hold_no_core(config: MakeConfig, first: Rack, setting: str) -> None:
     with Rack(second(config, first, "board.wave.core=0", setting), share=False) as rack:
         assert not [event for event in rack.events if event.kind == "ready"]
 

@@ -1,4 +1,4 @@
-"""The Rack: launched, run, ended, and what it tells of it."""
+"""The Rack: launched, run and ended, and its events."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_events_tell_the_run_in_order(config: MakeConfig) -> None:
     assert [event.time_ns for event in told] == sorted(event.time_ns for event in told)
 
 
-def test_what_a_board_prints_is_told(config: MakeConfig) -> None:
+def test_output_of_a_board_becomes_an_event(config: MakeConfig) -> None:
     rack = Rack(config("board.wave.params={ trouble = 'print', at = 5 }"))
     run(rack, 0.1)
     assert [event.text for event in rack.events if event.kind == "printed"] == ["a wave 5"]
@@ -81,7 +81,7 @@ def test_boards_are_ready_before_the_clock_runs(config: MakeConfig) -> None:
     assert set(states.values()) == {TaskState.ENDED}
 
 
-def test_only_the_segment_has_a_name_once_the_boards_have_what_they_need(config: MakeConfig) -> None:
+def test_after_the_launch_only_the_segment_has_a_name(config: MakeConfig) -> None:
     with Rack(config("protocol.default=lock")) as rack:
         folder = shm_path(rack.config.name).parent
         assert [p.name for p in folder.iterdir() if rack.config.name in p.name] == [shm_path(rack.config.name).name]
@@ -100,7 +100,7 @@ def test_a_stop_ends_the_run_at_the_next_tick(config: MakeConfig) -> None:
 
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
-def test_a_stop_from_outside_is_told_as_one(config: MakeConfig, mode: str) -> None:
+def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -> None:
     with Rack(config(f"clock.mode={mode}")) as rack:
         rack.start()
         Segment.attach(rack.config.name).words[System.STOP_REQUEST] = 1
@@ -110,7 +110,7 @@ def test_a_stop_from_outside_is_told_as_one(config: MakeConfig, mode: str) -> No
     assert rack.outcome.cause == "stopped"
 
 
-def test_a_running_racks_name_is_refused_and_the_rack_goes_on(config: MakeConfig) -> None:
+def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as first:
         first.start(0.25)
         with pytest.raises(SegmentError, match=f"rack '{first.config.name}' is already running, launched by process"):
@@ -153,7 +153,7 @@ def test_a_rack_that_is_gone_gives_its_memory_back(config: MakeConfig) -> None:
     assert maps.read_text().count("(deleted)") < before, name
 
 
-def test_counters_tell_what_went_over_the_bus(config: MakeConfig) -> None:
+def test_counters_show_the_bus_traffic(config: MakeConfig) -> None:
     rack = Rack(config(text=PLAIN))
     run(rack, 0.4)
     wave, watch = (rack.segment.block(name) for name in ("wave", "watch"))

@@ -64,7 +64,7 @@ def test_a_run_with_its_faults_repeats(config: MakeConfig, coupling: tuple[str, 
     assert run(config(*coupling), 3.0)[0].digest != outcomes[0].digest
 
 
-def test_a_restarted_writer_goes_on_with_its_serials_in_a_new_epoch(config: MakeConfig) -> None:
+def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeConfig) -> None:
     with Rack(faulty(config(), {"kind": "kill", "board": "wave", "tick": 100})) as rack:
         rack.run(1.0)
         rows = Written.on(rack.segment).messages["wave.status"]
@@ -73,7 +73,7 @@ def test_a_restarted_writer_goes_on_with_its_serials_in_a_new_epoch(config: Make
     assert sorted(set((rows["epoch"] & 0xFFFFFFFF).tolist())) == [1, 2]
 
 
-def test_a_killed_clock_goes_on_with_the_tick_it_died_in(config: MakeConfig) -> None:
+def test_a_killed_clock_continues_with_the_tick_it_died_in(config: MakeConfig) -> None:
     plain, _ = run(config())
     killed, events = run(faulty(config(), {"kind": "kill", "board": "clock", "tick": 300}))
     assert of(events, "recovery", "rejoined")[0].board == "clock"
@@ -102,7 +102,7 @@ def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
 
 
 @pytest.mark.parametrize(("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0]), ("brake", [2.0, 0.0])])
-def test_the_arm_is_asked_for_what_the_config_says(config: MakeConfig, on_loss: str, demand: list[float]) -> None:
+def test_a_loss_demands_of_the_arm_as_configured(config: MakeConfig, on_loss: str, demand: list[float]) -> None:
     settled = config(f"board.wave.on_loss={on_loss}")
     _, events = run(faulty(settled, {"kind": "kill", "board": "wave", "tick": 100}))
     found = [event for event in events if event.code == "demand"]

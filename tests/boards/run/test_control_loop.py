@@ -1,4 +1,4 @@
-"""One cycle of a task: what it counts, what its trace says, and whose information it carries on."""
+"""One cycle of a task: its counts, its trace, and the age of the information it passes on."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_a_cycle_in_time_has_no_trouble(bench: MakeBench) -> None:
     assert [rack.segment.block("wave")[w] for w in (Block.CYCLES, Block.DONE, Block.MISSED)] == [3, 2, 0]
 
 
-def test_a_cycle_behind_its_deadline_is_a_miss(bench: MakeBench) -> None:
+def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
     rack = bench()
     wave = rack.task("wave")
     rack.to(1)
@@ -119,7 +119,7 @@ def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) ->
     assert rack.segment.block("watch")[Block.CORRUPT] == 1
 
 
-def test_an_access_that_is_cut_off_shows_in_the_trace_and_the_cycle_goes_on(bench: MakeBench) -> None:
+def test_a_cut_off_access_shows_in_the_trace_and_the_cycle_continues(bench: MakeBench) -> None:
     rack = bench("protocol.mailbox={ 'wave.status' = 'lock' }")
     wave, watch = rack.task("wave"), rack.task("watch")
     wave.cycle(0)
@@ -136,7 +136,7 @@ def test_an_access_that_is_cut_off_shows_in_the_trace_and_the_cycle_goes_on(benc
     assert [rack.segment.block(name)[Block.BUS_ERRORS] for name in ("wave", "watch")] == [1, 1]
 
 
-def test_a_status_carries_the_tick_of_what_it_rests_on(bench: MakeBench) -> None:
+def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -> None:
     rack = bench()
     wave, watch = rack.task("wave"), rack.task("watch")
     for tick in range(4):

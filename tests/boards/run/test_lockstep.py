@@ -37,7 +37,7 @@ def test_ten_runs_in_lockstep_have_one_digest(config: MakeConfig) -> None:
     assert len({digest(Rack(config())) for _ in range(10)}) == 1
 
 
-def test_the_digest_tells_runs_apart(config: MakeConfig) -> None:
+def test_the_digest_distinguishes_runs(config: MakeConfig) -> None:
     settings = ("board.wave.params.done_at=90", "board.wave.within_cycles=5", "board.wave.params.plan_every=3")
     digests = {digest(Rack(config(*extra))) for extra in [(), *((one,) for one in settings)]}
     assert len(digests) == 1 + len(settings)
@@ -61,7 +61,7 @@ def test_one_mailbox_may_have_a_protocol_of_its_own(config: MakeConfig) -> None:
     assert mixed.messages["wave.status"]["visible_at"][0] == 1
 
 
-def test_under_time_slice_a_level_sees_what_the_ticks_say(config: MakeConfig) -> None:
+def test_under_time_slice_a_level_reads_by_ticks_alone(config: MakeConfig) -> None:
     found = written(Rack(config(text=PLAIN)))
     seen, made = found.messages["watch.status"], found.messages["wave.status"]
     assert seen["tick"].tolist() == list(range(0, TICKS, 8))

@@ -1,4 +1,4 @@
-"""Processes in real time that lose their cores anywhere, for 5 to 45 ms: nothing of that is taken for a fault."""
+"""Processes in real time that lose their cores anywhere, for 5 to 45 ms: none of this counts as a fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a board waits for its cycle: a semaphore, or busy-waiting on a core of its own."""
+"""How a board waits for its cycle: a semaphore, or busy-waiting on its own core."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="who po
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_board_that_polls_writes_what_it_writes_when_woken(config: MakeConfig, protocol: Protocol) -> None:
+def test_a_polling_board_writes_the_same_as_a_woken_one(config: MakeConfig, protocol: Protocol) -> None:
     digests = set()
     for wake in ("board.wave.wake=signal", POLL):
         with Rack(config(wake, f"protocol.default={protocol}", text=PLAIN)) as rack:
