@@ -7,7 +7,7 @@ stay outside, in the board that runs it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
@@ -30,6 +30,7 @@ __all__ = [
     "Pace",
     "Planner",
     "Ports",
+    "Program",
     "Reading",
     "Verdict",
 ]
@@ -44,6 +45,14 @@ class Input(NamedTuple):
 
     type: MessageType
     source: str
+
+
+class Program(Table):
+    """Base of what a level may read from `[task]`: checked before the launch, with every mistake reported at once."""
+
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
+        """Yield key, value and reason of all that does not fit the arm or the scene, as in "action[0].object"."""
+        return ()
 
 
 class Ports(SimpleNamespace):
@@ -125,6 +134,8 @@ class Executor(ABC):
     """What an operator may tell the level, and how goals are given: of one that reads "own.operator"."""
     params: ClassVar[type[Table] | None] = None
     """What `[board.<name>.params]` may hold, checked before the launch; None: whatever the level reads by itself."""
+    program: ClassVar[type[Program] | None] = None
+    """What `[task]` may hold, checked before the launch; None: the level reads no program, or checks it by itself."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
@@ -156,6 +167,8 @@ class Planner(ABC):
     output: ClassVar[MessageType]
     params: ClassVar[type[Table] | None] = None
     """As the executor's: one table is for both."""
+    program: ClassVar[type[Program] | None] = None
+    """As the executor's."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

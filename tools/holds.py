@@ -15,7 +15,7 @@ from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.events import Event
-from rack.boards.operating.text import describe
+from rack.boards.operating.command import describe
 from rack.levels.operator import Answer, What
 from rack.tools.campaign.ending import arm_of
 

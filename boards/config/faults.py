@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
 from rack.backplane.layout import Layout, Role
-from rack.boards.config.classes import find_class
+from rack.boards.classes import find_class
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake
 from rack.boards.faults.condition import condition

@@ -19,7 +19,7 @@ from rack.boards.config.cell import geom_name
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
 from rack.boards.faults.text import board_of, joint_name, subject_of, what
-from rack.boards.operating.text import describe, level_of, message_of
+from rack.boards.operating.command import describe, level_of, message_of
 from rack.levels.operator import What
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]

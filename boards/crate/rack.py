@@ -23,7 +23,8 @@ from rack.backplane.operator_table import OperatorTable, RequestEntry
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
-from rack.boards.config import load
+from rack.boards.config.commands import asked, request
+from rack.boards.config.resolved import load, modules, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
 from rack.boards.crate.clean import remove_dead, remove_own
@@ -31,11 +32,10 @@ from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.line import CrateLine, Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
 from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.recovery import Recovery, Supervision
+from rack.boards.ending import Ending
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.events import Cause, Event, Journal, Outcome
 from rack.boards.faults.kinds import KINDS
-from rack.boards.launch import Launch, modules
-from rack.boards.operating.request import asked, request, requests
 
 LAUNCH_S = 60.0
 """Bound of the launch: a large model with many meshes compiles for a while in every board."""
@@ -107,7 +107,7 @@ class Rack:
         self._crate = crate = CrateLine()
         # The crate imports while the config is being wired: on two cores this saves half a second.
         crate.send(Preload(modules(self.config), tuple(sys.path)))
-        self._plan = plan = Launch.of(self.config)
+        self._plan = plan = resolve(self.config)
         remove_dead(self.config.name)
         self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
         self._set_words()
@@ -149,12 +149,13 @@ class Rack:
             if KINDS[injection.kind].where == "core":
                 self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
-        for wanted in requests(self.config, self._plan.layout):
+        for wanted in self._plan.commands:
             desk.add(wanted)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock: the run begins. It lasts `seconds` of simulated time, or until the task ends."""
         clock = self._plan.clock(seconds)
+        self._ending = Ending(self.segment, clock.ends_run, clock.silent)
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
         supervision = Supervision(self.config, self._plan.layout)
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
@@ -288,11 +289,11 @@ class Rack:
             self._journal.keep(rung.event)
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
-        state, reason = self._plan.final_state(self.segment)
+        state, reason = self._ending.final_state()
         # A stop may also come from outside, by a word in the segment.
-        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._plan.cause_of(self.segment))
+        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._ending.cause())
         if cause in ("task done", "time over"):
-            self._faults += self._plan.latched(self.segment)
+            self._faults += self._ending.latched()
         self._end_boards()
         self.outcome = Outcome(cause, stop, state, reason, digest(self.segment, stop), tuple(self._faults))
         self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")

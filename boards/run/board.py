@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
 import traceback
@@ -13,6 +12,7 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.process import die_with_parent, name_process, set_priority, take_processor
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
+from rack.boards.classes import find_class
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
 from rack.boards.run.task import Task
@@ -60,7 +60,9 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
     spec, block = segment.layout.task(wiring.task), segment.block(wiring.task)
-    level = load(wiring.target)(wiring.context)
+    kind: type[Executor] | type[Planner]
+    kind = find_class(wiring.target, Executor) if spec.role == "executor" else find_class(wiring.target, Planner)
+    level = kind(wiring.context)
     try:
         level.self_test()
         if wiring.fails_self_test:
@@ -91,10 +93,3 @@ def _task(segment: Segment, wiring: TaskWiring, level: Executor | Planner, atten
     if isinstance(level, Executor):
         return VirtualControlLoop(segment, wiring, level, attention)
     return PlannerLoop(segment, wiring, level, attention)
-
-
-def load(target: str) -> type[Executor] | type[Planner]:
-    """Return the class that "package.module:Class" names; the config has checked that it exists."""
-    module, _, name = target.partition(":")
-    found: type[Executor] | type[Planner] = getattr(importlib.import_module(module), name)
-    return found

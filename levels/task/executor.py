@@ -13,7 +13,7 @@ from rack.levels.orders import BELOW_LOST, HELD_FROM_ABOVE, Orders
 from rack.levels.params import read_params
 from rack.levels.task.detour import Detour
 from rack.levels.task.params import TaskParams
-from rack.levels.task.program import read_program
+from rack.levels.task.program import TaskConfig, read_program
 from rack.levels.task.window import ShownWindow
 
 ROUNDING_S = 1e-9
@@ -39,6 +39,7 @@ class TaskExecutor(Executor):
         What.RESUME: (),
         What.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
     }
+    program = TaskConfig
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -15,14 +15,14 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.config import load, wire
 from rack.levels.operator import Answer, Goal, What
 from rack.tools.holds import STILL_S, Holds, Standstill
-from tests.boards.told_racks import TOLD
+from tests.boards.commanded_racks import COMMANDED
 
 TICK_S = 0.0025
 
 
 @pytest.fixture
 def segment(tmp_path: Path, rack_name: str) -> Iterator[Segment]:
-    (tmp_path / "told.toml").write_text(TOLD)
+    (tmp_path / "told.toml").write_text(COMMANDED)
     config = load(tmp_path / "told.toml", [f"name={rack_name}"])
     made = Segment.create(wire(config), config.text())
     yield made

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.text import to_toml
+from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 
 EXTERNAL = "external kill"

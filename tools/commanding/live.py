@@ -12,10 +12,9 @@ from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestSt
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads
-from rack.boards.config.commands import commandable
+from rack.boards.config.commands import asked, commandable, request
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.operating.request import asked, request
-from rack.boards.operating.text import describe, message_of
+from rack.boards.operating.command import describe, message_of
 from rack.levels.operator import What, listed
 from rack.tools.answer import Failure
 from rack.tools.commanding.answers import Answers, answering

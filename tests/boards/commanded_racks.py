@@ -1,22 +1,22 @@
-"""The rack that operators' commands are tried on: two levels that count."""
+"""A rack to try an operator's commands on: two levels that count."""
 
 from __future__ import annotations
 
 from tests.boards.conftest import CLOCK
 
-TOLD = f"""{CLOCK}
+COMMANDED = f"""{CLOCK}
 [board.upper]
 slot = 2
 rate_hz = 50
 below = "lower"
-executor = "told_levels:Upper"
+executor = "commanded_levels:Upper"
 
 [board.lower]
 slot = 3
 core = 1
 rate_hz = 400
 above = "upper"
-executor = "told_levels:Lower"
+executor = "commanded_levels:Lower"
 """
 
 

@@ -1,4 +1,4 @@
-"""Levels by name: "package.module:Class" to the class."""
+"""Classes of levels by name: "package.module:Class" to the class."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 def extend_path(folders: Sequence[Path]) -> None:
-    """Let Python import from these folders too, behind all others."""
+    """Append folders to Python's import path."""
     sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
 
 
@@ -30,7 +30,6 @@ def find_class(reference: str, base: type[T]) -> type[T]:
         what = "has no class" if found is None else f"has no {base.__name__} named"
         raise LookupError(f"module '{module_name}' {what} '{name}'; it has: {', '.join(kinds) or 'none'}")
     if inspect.isabstract(found):
-        raise LookupError(
-            f"class '{name}' lacks the method '{', '.join(sorted(getattr(found, '__abstractmethods__', ())))}'"
-        )
+        missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
+        raise LookupError(f"class '{name}' lacks the method '{missing}'")
     return found

@@ -1,4 +1,4 @@
-"""Two levels without an arm that an operator can command: what they write follows from when they are told."""
+"""Two levels without an arm that an operator can command; their output depends on when a command arrives."""
 
 from __future__ import annotations
 

@@ -9,9 +9,10 @@ import pytest
 
 from rack.backplane.layout import depth_for
 from rack.backplane.mailbox.slots import message_dtype
-from rack.boards.config import context, load, shared_out, task_ports, wire
-from rack.boards.config.cores import obtained_core
-from rack.boards.config.fields import field_specs
+from rack.boards.config import load, resolve, shared_out, wire
+from rack.boards.config import resolved as resolved
+from rack.boards.config.layout import field_specs, obtained_core
+from rack.boards.config.mistakes import disagreements
 from rack.levels.messages import TASK_COMMAND, TASK_PLAN
 
 SIZES = {"joints": 6, "bodies": 3, "state": 120}
@@ -65,8 +66,10 @@ def test_a_loose_planner_has_a_board_of_its_own(small: Path) -> None:
 
 
 def test_a_port_can_be_wired_to_another_mailbox(small: Path) -> None:
-    config = load(small, ["board.lower.reads={ command = 'upper.command' }", "board.lower.above=upper"])
-    assert task_ports(config, "lower", "executor").reads == {"command": "upper.command", "plan": "lower.plan"}
+    tasks = {
+        task.task: task for task in resolve(load(small, ["board.lower.reads={ command = 'upper.command' }"])).tasks
+    }
+    assert tasks["lower"].inputs == {"command": "upper.command", "plan": "lower.plan"}
 
 
 @pytest.mark.parametrize("kind", [TASK_COMMAND, TASK_PLAN], ids=lambda kind: kind.name)
@@ -80,7 +83,7 @@ def test_field_specs_describe_the_very_bytes_of_a_message(kind) -> None:
     assert described["moves"].base.fields["position"][1] == dtype["moves"].base.fields["position"][1]
 
 
-def test_cores_that_the_machine_lacks_are_shared_out_and_told(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cores_that_the_machine_lacks_are_shared_out_and_reported(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
     assert [obtained_core(core) for core in range(6)] == [2, 3, 2, 3, 2, 3]
     assert shared_out(load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])) == [
@@ -88,9 +91,26 @@ def test_cores_that_the_machine_lacks_are_shared_out_and_told(small: Path, monke
     ]
 
 
-def test_context_tells_a_level_its_rack_in_ticks(small: Path) -> None:
-    told = context(load(small, ["board.lower.params.gain=2", "seed=5"]), "lower")
-    assert (told.board, told.every, told.within_cycles, told.clock_ns, told.seed) == ("lower", 1, 4, 2_500_000, 5)
-    assert told.below is None
-    assert context(load(small), "upper").below == (1, 4)
-    assert told.params == {"gain": 2}
+def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
+    upper, lower, _ = (task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks)
+    assert (lower.board, lower.every, lower.within_cycles, lower.clock_ns, lower.seed) == ("lower", 1, 4, 2_500_000, 5)
+    assert lower.below is None
+    assert upper.below == (1, 4)
+    assert lower.params == {"gain": 2}
+
+
+def test_all_that_a_launch_needs_is_resolved_and_checked_once(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = []
+    monkeypatch.setattr(resolved, "disagreements", lambda *of: checked.append(of) or disagreements(*of))
+    settings = ["fault=[{ kind = 'self-test', board = 'upper' }]", "board.lower.transfer.read_ms=0.5"]
+    found = resolve(load(small, settings))
+    assert len(checked) == 1
+    assert [(task.task, task.fails_self_test, task.guards_clock) for task in found.tasks] == [
+        ("upper", True, False),
+        ("lower", False, True),
+        ("lower.planner", False, False),
+    ]
+    assert (len(found.faults), found.commands, found.ends_run) == (1, (), "upper.status")
+    assert found.tasks[1].transfer.read_ns == 500_000
+    clock = found.clock(10.0)
+    assert (clock.stop_tick, clock.linger, clock.silent, clock.history) == (4000, 200, 12_000, 400)
