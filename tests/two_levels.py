@@ -9,8 +9,7 @@ import pydantic
 
 from rack.backplane.message import Field, Message, MessageType, command, status
 from rack.levels.level import Executor, Input, Planner, Ports, Program
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import RobotConfig, SceneConfig
 
 COUNT_COMMAND = command("count_command", 1, Field("goal", "i8", "1", "count to reach"))
 COUNT_STATUS = status("count_status", 1, Field("count", "i8", "1", "count reached"))

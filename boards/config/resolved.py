@@ -35,7 +35,7 @@ from rack.boards.faults.kinds import KINDS
 from rack.boards.operating.command import CommandConfig
 from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
 from rack.levels.level import LevelContext, Pace
-from rack.levels.robot import RobotConfig, Table
+from rack.levels.tables import RobotConfig, Table
 
 LINGER_S = 0.5
 """Simulated time that a run continues after the task's end, to see the arm at rest."""

@@ -19,8 +19,7 @@ from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.operating.command import CommandConfig
-from rack.levels.robot import Positive, RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""

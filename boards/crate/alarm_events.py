@@ -20,7 +20,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
 from rack.boards.faults.text import board_of, joint_name, subject_of, what
 from rack.boards.operating.command import describe, level_of, message_of
-from rack.levels.operator import What
+from rack.levels.operator import Operation
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]
 EMERGENCY_STOP = "emergency stop"
@@ -130,7 +130,7 @@ class AlarmEvents:
                 "command",
                 -1,
             )
-            subject, code = board, What(message.what).name.lower()
+            subject, code = board, Operation(message.what).name.lower()
             text = f"{describe(message)} (command {value:.0f})"
         elif alarm == Alarm.DEMAND:
             subject, demand = self._task(number, EMERGENCY_STOP), Demand(int(value))

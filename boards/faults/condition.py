@@ -10,10 +10,10 @@ import numpy as np
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.backplane.message import State
 from rack.levels.messages import Error, SegmentKind, Verb
-from rack.levels.operator import Answer, What
+from rack.levels.operator import Answer, Operation
 
 FORM = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
-ENUMS: dict[str, type[IntEnum]] = {kind.__name__: kind for kind in (State, Verb, SegmentKind, Error, What, Answer)}
+ENUMS: dict[str, type[IntEnum]] = {kind.__name__: kind for kind in (State, Verb, SegmentKind, Error, Operation, Answer)}
 """What the unit of a field may name instead of a unit."""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from rack.levels.robot import LAST_TICK, Finite, Table
+from rack.levels.tables import LAST_TICK, Finite, Table
 
 DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s)\s*")
 

@@ -11,8 +11,8 @@ from rack.backplane.layout import Layout
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry, RequestWord
-from rack.levels.operator import Goal, What
-from rack.levels.robot import LAST_TICK, Finite, Table
+from rack.levels.operator import Goal, Operation
+from rack.levels.tables import LAST_TICK, Finite, Table
 
 Vector = tuple[Finite, Finite, Finite]
 
@@ -41,9 +41,9 @@ class CommandConfig(Table):
     home: bool = Field(False, description="goal: the arm's start position")
 
     @property
-    def said(self) -> What:
+    def said(self) -> Operation:
         """The command's verb."""
-        return What[self.what.upper()]
+        return Operation[self.what.upper()]
 
     @property
     def goals(self) -> list[Goal]:
@@ -69,7 +69,7 @@ def message_of(entry: RequestEntry, layout: Layout) -> Message:
 
 def describe(message: Message) -> str:
     """Return a command as one line: its verb and its goal."""
-    what, goal = What(message.what).name.lower(), message.goal
+    what, goal = Operation(message.what).name.lower(), message.goal
     if goal == Goal.JOINTS:
         return f"{what} joints {_numbers(message.joints[: message.count])}"
     if goal == Goal.POSE:

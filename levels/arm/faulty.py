@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.arm.arm import Arm, Sensed
-from rack.levels.cell import Cell
-from rack.levels.dynamics import FRICTION_SPEED
 from rack.levels.level import Fault, Finding
-from rack.levels.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import FRICTION_SPEED
+from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class FaultyLink:
         # Friction that helped may now resist: it hides twice its value.
         self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
         # What carried may now press.
-        self._pressed = 2.0 * PRESSING * limits
+        self._pressed = 2.0 * MAX_CONTACT_PART * limits
         self._sensors: list[_Active] = []
         self._motors: list[_Active] = []
         self._commands: list[_Active] = []
@@ -149,7 +149,7 @@ class FaultyLink:
         if self._arm.leans:
             return self._pressed
         turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNS_FROM)
-        return RESTING * self._limits if self._arm.holds and turning < TURNING_JOINTS else 0.0
+        return MAX_RESTING_CONTACT_PART * self._limits if self._arm.holds and turning < MIN_TURNING_JOINTS else 0.0
 
     def _corrupt(self, torque: Array) -> Array:
         corrupt = self._torque

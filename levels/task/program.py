@@ -9,8 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from rack.levels.errors import ProgramError
 from rack.levels.level import Program
-from rack.levels.robot import Finite, Positive, RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
 
 Vector = tuple[Finite, Finite, Finite]
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from rack.backplane.message import Field, Message, State, command, status
 from rack.levels.level import Executor, Input, Ports
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, What
-from rack.levels.orders import Orders
+from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, Operation, Orders
 
 STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: do not go on"))
 COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that were not held"))
@@ -16,13 +15,13 @@ class Upper(Executor):
 
     inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "status": Input(COUNTED, "below.status")}
     outputs = {"command": STEP, "status": COUNTED}
-    commands = {What.HOLD: (), What.RESUME: (), What.GOTO: (Goal.HOME,)}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.HOME,)}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take up what is said, and hand it down."""
         orders = self.orders
         orders.take(read.operator, self._judge)
-        write.command.hold = orders.standing is What.HOLD
+        write.command.hold = orders.standing is Operation.HOLD
         write.command.operator = orders.rests_on(0)
         if read.status.value.operator >= orders.basis:
             orders.done()
@@ -30,7 +29,7 @@ class Upper(Executor):
         write.status.state = State.EXECUTING
 
     def _judge(self, command: Message) -> None:
-        if self.orders.standing is What.GOTO:
+        if self.orders.standing is Operation.GOTO:
             self.orders.refuse("the way home is closed")
 
     def self_test(self) -> None:
@@ -43,12 +42,12 @@ class Lower(Executor):
 
     inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "command": Input(STEP, "above.command")}
     outputs = {"status": COUNTED}
-    commands = {What.HOLD: (), What.RESUME: ()}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take up what is said; count."""
         self.orders.take(read.operator)
-        held = bool(read.command.value.hold) or self.orders.standing is What.HOLD
+        held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
         write.status.count += not held
         self.orders.done()
         self.orders.report(write.status, read.command.value.operator)

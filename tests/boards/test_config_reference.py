@@ -12,7 +12,7 @@ from rack.boards.config import FAULTS, load, names
 from rack.boards.config.files import read, with_faults
 from rack.boards.config.reference import Key, find_tables, key_tables
 from rack.boards.errors import ConfigError
-from rack.levels.servo.params import ServoParams
+from rack.levels.servo.control import ServoParams
 
 DIMENSIONLESS = {
     *("speed", "small_share", "phase", "damping", "braking", "quaternion", "direction"),  # ratios and directions

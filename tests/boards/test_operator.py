@@ -20,7 +20,7 @@ from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.operating.command import message_of
-from rack.levels.operator import Answer, Goal, What
+from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
 from tests.processes import FORKS, forked, kill, wait_until
@@ -99,7 +99,7 @@ def test_serials_rise_over_all_levels_in_the_order_of_giving(commanded: Callable
 def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., RackConfig]) -> None:
     _, _, boxes = run(commanded(commands("level='upper', what='goto', home=true, tick=50")))
     last = boxes["upper.status"]["message"][-1]
-    assert (last["order"], last["answer"], last["standing"]) == (1, Answer.REFUSED, What.NONE)
+    assert (last["order"], last["answer"], last["standing"]) == (1, Answer.REFUSED, Operation.NONE)
     assert last["objection"] == b"the way home is closed"
     assert not boxes["lower.status"]["message"]["operator"].any()
 
@@ -112,7 +112,7 @@ def test_a_restarted_board_continues_with_its_last_command(commanded: Callable[.
     assert outcome.worked
     assert [event.board for event in events if event.code == "rejoined"] == [board]
     last = boxes[f"{board}.status"]["message"][-1]
-    assert (last["order"], last["standing"]) == (1, What.HOLD)
+    assert (last["order"], last["standing"]) == (1, Operation.HOLD)
 
 
 @pytest.mark.parametrize("board", ["upper", "lower"])
@@ -125,12 +125,12 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     with Rack(config) as rack:
         hold = OperatorTable(rack.segment).entries[0]
         message = message_of(hold, rack.segment.layout)
-        message.what, message.goal = What.GOTO, Goal.HOME
+        message.what, message.goal = Operation.GOTO, Goal.HOME
         OperatorTable(rack.segment).add(Request(hold[RequestWord.MAILBOX], bytes(message.raw), 60))
         assert rack.run(1.0).worked
         last = MailboxRing(rack.segment, f"{board}.status").drain().rows["message"][-1]
     assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
-    assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, What.HOLD, 1)
+    assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, Operation.HOLD, 1)
 
 
 def test_a_command_overtaken_by_one_that_is_refused_stands(commanded: Callable[..., RackConfig]) -> None:
@@ -138,7 +138,7 @@ def test_a_command_overtaken_by_one_that_is_refused_stands(commanded: Callable[.
     setting = commands("level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52")
     _, _, boxes = run(commanded(setting))
     last = boxes["upper.status"]["message"][-1]
-    assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, What.HOLD)
+    assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, Operation.HOLD)
 
 
 def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackConfig]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import load
-from rack.levels.arm.limit_monitor import LimitMonitor
+from rack.levels.arm.monitors import LimitMonitor
 from rack.tools.answer import Failure
 from rack.tools.campaign.instruments import examine
 

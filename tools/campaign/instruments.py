@@ -8,8 +8,8 @@ from numpy import isfinite
 from rack.backplane.message import Message
 from rack.boards.config.schema import RackConfig
 from rack.levels.arm import SimulatedArm
-from rack.levels.cell import STATE, build_cell, sizes
 from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import STATE, build_cell, sizes
 from rack.tools.answer import Failure
 
 FACTOR = 2.0

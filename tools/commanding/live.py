@@ -15,7 +15,7 @@ from rack.boards.config import loads
 from rack.boards.config.commands import asked, commandable, request
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operating.command import describe, message_of
-from rack.levels.operator import What, listed
+from rack.levels.operator import Operation, listed
 from rack.tools.answer import Failure
 from rack.tools.commanding.answers import Answers, answering
 from rack.tools.commanding.patience import SILENT_S, Patience
@@ -111,4 +111,4 @@ class LiveDesk:
         seen = open_observer(self._segment, box.name).peek() if box is not None else None
         if seen is None or not seen.is_there or not seen.value.standing:
             return ""
-        return What(seen.value.standing).name.lower()
+        return Operation(seen.value.standing).name.lower()
