@@ -119,7 +119,7 @@ class Fault(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A fault that a level has found; its board raises the alarm. See `rack.backplane.alarms.Alarm`."""
+    """A fault that a level has found; its board raises the alarm. See `rack.backplane.watch.alarms.Alarm`."""
 
     alarm: Alarm
     subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular
