@@ -12,7 +12,7 @@ from rack.backplane.layout import Layout
 from rack.boards.events import Event
 from rack.tools.campaign.ending import Strike
 from rack.tools.campaign.judge import Circumstances, Judgement, judge
-from rack.tools.recording import Recording
+from rack.tools.runs.recording import Recording
 
 Report = dict[str, Any]
 
