@@ -1,7 +1,7 @@
-"""The memory map: where on the bus every board's window, task block and mailbox lies.
+"""The memory map: the bus address of every board's window, task block and mailbox.
 
-Addresses are byte offsets in the segment. A board's window starts on a page and holds its tasks'
-control blocks, trace and alarm rings, then the mailboxes it writes. The map follows from the layout alone.
+Addresses are byte offsets in the segment. A board's window starts on a page and holds the control blocks, trace rings
+and alarm rings of its tasks, then the mailboxes that it writes. The map follows from the layout alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BLOCK_SIZE = BLOCK_WORDS * 8
 TRACE_RECORD_SIZE = 80
 ALARM_RECORD_SIZE = 64
 ALARM_DEPTH = 256
-"""Records in an alarm ring: whoever watches looks many times a second, and an alarm rings once an episode."""
+"""Records in an alarm ring: it is read many times a second, and an alarm rings once an episode."""
 FAULT_ENTRY_SIZE = 256
 FAULT_ENTRIES = 64
 OPERATOR_HEAD_SIZE = LINE
@@ -108,8 +108,8 @@ def mailbox_size(mailbox: MailboxSpec) -> int:
 def oldest_kept(head: int, depth: int) -> int:
     """Return the number of the oldest record in a ring that its writer cannot have begun to overwrite.
 
-    The rule for whoever reads beside the writer, who is at most one record beyond its `head`: copy first, then ask this
-    with the head as it is by then. What was copied of an older record may be half another one, and proves nothing.
+    The writer is at most one record beyond its `head`. A concurrent reader copies first, then compares with the head as
+    it is by then: a copy of an older record may be half another one, and proves nothing.
     """
     return head + 2 - depth
 

@@ -1,7 +1,7 @@
-"""An exclusive lock of the kernel's on one byte of a segment: taken at once or not at all.
+"""An exclusive kernel lock on one byte of a segment, taken at once or not at all.
 
-It belongs to a file description of its own, so that two holders in one process exclude each other too,
-and it ends with its process, however that ends.
+Each lock has its own file description, so two holders in one process exclude each other too. It ends with its process,
+however that ends.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ByteLock:
         self._give_back = _FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, address, 1, 0)
 
     def take(self) -> bool:
-        """Take the lock; False when another has it."""
+        """Take the lock; False when another holder has it."""
         try:
             fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._take)
         except (BlockingIOError, PermissionError):
@@ -34,7 +34,7 @@ class ByteLock:
 
     @staticmethod
     def is_taken(segment: Segment, address: int) -> bool:
-        """Say whether somebody has the lock on the byte at a bus address, without taking it."""
+        """Say whether the byte at a bus address is locked, without taking the lock."""
         asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
         kind: int = _FLOCK.unpack(fcntl.fcntl(segment.fd, fcntl.F_OFD_GETLK, asked))[0]
         return kind != fcntl.F_UNLCK
@@ -44,7 +44,7 @@ class ByteLock:
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._give_back)
 
     def close(self) -> None:
-        """Release the lock for good; once is enough."""
+        """Release the lock and its descriptor; may be called again."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

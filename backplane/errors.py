@@ -1,13 +1,13 @@
-"""The exception tree of the bus, and where each one shows.
+"""The exception tree of the bus, with the cause of each error.
 
 `BackplaneError` is the root: catch it and every refusal of this package is caught.
 
 - `SegmentError`: a rack name that is in use, a segment of another layout or owner, a full /dev/shm.
 - `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
-- `ClockError`: a rate off the grid, a period that is no period.
+- `ClockError`: a rate that does not divide the clock, or is not a rate.
 - `FaultTableError`: more faults than one run can have.
-- `OperatorTableError`: more commands than can wait for their ticks at once.
-- `EmergencyStopError`: a reset of the emergency stop while an input is not good.
+- `OperatorTableError`: more commands waiting for their ticks than the table holds.
+- `EmergencyStopError`: a reset of the emergency stop while an input is bad.
 """
 
 from __future__ import annotations

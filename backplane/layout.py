@@ -1,7 +1,7 @@
-"""What a rack puts on its backplane: mailboxes and tasks, as plain data.
+"""The layout of a backplane: its mailboxes and tasks, as plain data.
 
-The Rack computes a layout from its config; the segment is laid out from it and carries it as text,
-so that a tool which attaches by name knows every mailbox and every task without the config's classes.
+The Rack computes a layout from its config. The segment is laid out from it and carries it as text, so a tool that
+attaches by name knows every mailbox and every task without importing the config's classes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Role = Literal["executor", "planner"]
 class FieldSpec:
     """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit, meaning.
 
-    `fields` is not empty for a group of fields (a nested message).
+    `fields` holds the fields of a group (a nested message).
     """
 
     name: str
@@ -33,7 +33,7 @@ class FieldSpec:
 
 @dataclass(frozen=True)
 class MailboxSpec:
-    """One mailbox: who writes it, what it carries, how it is shared.
+    """One mailbox: its writer and readers, its message, its protocol.
 
     `every` is the writer's period and `delay` the ticks from release to visibility, both in ticks;
     `depth` is the number of slots, a power of two.

@@ -16,11 +16,11 @@ class UtilityLines:
         self._blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
 
     def release_sysfail(self, slot: int) -> None:
-        """Say that the board in `slot` has passed its self-test."""
+        """Release SYSFAIL for `slot`: its board has passed its self-test."""
         self._words[System.SYSFAIL + slot] = 0
 
     def assert_sysfail(self, slot: int) -> None:
-        """Say that the board in `slot` has failed."""
+        """Hold SYSFAIL for `slot`: its board has failed."""
         self._words[System.SYSFAIL + slot] = 1
 
     @property
@@ -45,7 +45,7 @@ class UtilityLines:
 
     @property
     def bad_inputs(self) -> list[str]:
-        """What forbids a reset of the latch, as text: utility lines that are asserted, boards that are lost."""
+        """Reasons against a reset of the latch, as text: asserted utility lines, lost boards."""
         found = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
         found += ["ACFAIL"] if self.acfail else []
         return found + [f"board '{name}' is lost" for name, block in self._blocks.items() if block[Block.LOST]]
@@ -55,7 +55,7 @@ class UtilityLines:
         self._words[System.EMERGENCY_STOP] = 1
 
     def reset_emergency_stop(self) -> None:
-        """Clear the latch. Raises `EmergencyStopError` with every input that is not good; it stays set then."""
+        """Clear the latch. Raises `EmergencyStopError` with every bad input; the latch then stays set."""
         if bad := self.bad_inputs:
             raise EmergencyStopError(f"the emergency stop stays latched: {', '.join(bad)}")
         self._words[System.EMERGENCY_STOP] = 0

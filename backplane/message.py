@@ -1,7 +1,7 @@
 """Message types: fixed numpy structured layouts, documented field by field.
 
-A message type is declared once, with symbolic sizes ("joints"); a rack resolves the sizes
-from its config. The bytes of a resolved type are what travels through a mailbox.
+A message type is declared once, with symbolic sizes ("joints"), which a rack resolves from its config. The bytes of a
+resolved type travel through a mailbox.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class State(IntEnum):
     EXECUTING = 1
     DONE = 2
     ERROR = 3
-    HOLDING = 4  # has work and is kept from it; `reason` says by whom or what, and what ends it
+    HOLDING = 4  # has work but must wait; `reason` says for what, and what ends the wait
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Field:
 class MessageType:
     """A named, versioned layout. `fields` stand in the order of their bytes.
 
-    Raises `MailboxError` for a field that no `Message` could show.
+    Raises `MailboxError` for a field name that a `Message` cannot have.
     """
 
     name: str
@@ -84,17 +84,17 @@ class MessageType:
 
 def command(name: str, version: int, *fields: Field) -> MessageType:
     """Return a command type: `fields` after the command's serial."""
-    serial = Field("id", "u4", "1", "serial of the command; 0: nothing is commanded")
+    serial = Field("id", "u4", "1", "serial of the command; 0: no command")
     return MessageType(name, version, (serial, *fields))
 
 
 def status(name: str, version: int, *fields: Field) -> MessageType:
-    """Return a status type: `fields` behind echo, state, error code and reason."""
+    """Return a status type: `fields` after echo, state, error code and reason."""
     head = (
         Field("echo", "u4", "1", "serial of the command that this status answers"),
         Field("state", "u1", "State", "idle, executing, done, error or holding"),
         Field("error", "u2", "1", "error code of the level; 0: none"),
-        Field("reason", f"S{REASON_BYTES}", "ASCII", "why it is in error or holding, readable; empty: neither"),
+        Field("reason", f"S{REASON_BYTES}", "ASCII", "reason for the error or the hold, readable; empty: neither"),
     )
     return MessageType(name, version, (*head, *fields))
 
@@ -107,7 +107,7 @@ class Message:
     byte strings as `str`. `record` is the structured array, shape (), `raw` its bytes.
     """
 
-    # Slots all the way down: a misspelt field is an error, not an attribute that travels nowhere.
+    # Slots: a misspelt field is an error, not a new attribute that is never sent.
     __slots__ = ("raw", "record")
     raw: memoryview
     record: np.ndarray
@@ -126,11 +126,11 @@ class Message:
         self.raw[:] = bytes(len(self.raw))
 
     def copy_from(self, other: Message) -> None:
-        """Take over the bytes of a message of the same type."""
+        """Copy the bytes of a message of the same type."""
         self.raw[:] = other.raw
 
     if TYPE_CHECKING:
-        # Field names are the layout's; a type checker cannot know them.
+        # Field names come from the layout: a type checker cannot know them.
         def __setattr__(self, name: str, value: Any) -> None: ...
 
     def __getattr__(self, name: str) -> Any:

@@ -1,11 +1,11 @@
-"""The operator table: commands that come from outside, in shared memory, in the system controller's window.
+"""The operator table: commands from outside, in shared memory, in the system controller's window.
 
-Whoever commands adds a request, at any time. The clock alone gives it, at the beginning of a tick: it publishes the
-message in the level's mailbox, whose only writer it is, so that every task of the tick sees the same and a run in
-lockstep repeats with its commands. What a command means is known above: here are the bytes of a message.
+Any process may add a request, at any time. Only the clock issues it, at the beginning of a tick: it publishes the
+message in the level's mailbox, whose only writer it is. So all tasks of a tick see the same, and a run in lockstep
+repeats with its commands. The meaning of a command is defined above this level: here it is the bytes of a message.
 
-A request belongs to the run, or to a client that waits for it: then it is withdrawn when the client's process ends,
-however that ends. The client holds a lock of the kernel's meanwhile, so that the clock can tell in a microsecond.
+A request belongs to the run, or to a client that waits for it; then it is withdrawn when the client's process ends,
+however that ends. The client holds a kernel lock meanwhile, which the clock can check in a microsecond.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 
 _CLAIMS = 1 << 40
-"""Address of the byte that the client of ticket 0 locks: beyond any segment, for a lock needs no byte there."""
+"""Address of the byte locked by the client of ticket 0: beyond any segment, since a lock needs no memory."""
 
 
 class RequestStage(IntEnum):
@@ -30,24 +30,24 @@ class RequestStage(IntEnum):
 
     FREE = 0
     WAITING = 1  # for its tick
-    GIVEN = 2  # and its entry may be filled again
+    GIVEN = 2  # issued; the entry may be filled again
 
 
 class RequestWord(IntEnum):
-    """Words of an entry. The host writes them while it is free, the clock STAGE, SERIAL and GIVEN_TICK thereafter."""
+    """Words of an entry. The host writes them while it is free, then the clock writes STAGE, SERIAL and GIVEN_TICK."""
 
     STAGE = 0
-    TICKET = 1  # number of the request: an entry that was filled again has another
+    TICKET = 1  # number of the request: it changes when the entry is filled again
     MAILBOX = 2  # index among the layout's mailboxes
-    TICK = 3  # tick at which it is to be given; -1: at once
-    SERIAL = 4  # of the command, rising over all levels in the order in which they are given; 0: not yet
+    TICK = 3  # tick at which to issue it; -1: at once
+    SERIAL = 4  # of the command, rising over all levels in the order of issue; 0: not yet
     GIVEN_TICK = 5  # -1: not yet
-    HAS_CLIENT = 6  # 1: it is given only as long as its client lives
+    HAS_CLIENT = 6  # 1: issued only while its client lives
 
 
 @dataclass(frozen=True)
 class Request:
-    """A command to be given: the index of its mailbox, its message, and its tick; -1: as soon as possible."""
+    """A command to issue: the index of its mailbox, its message, and its tick (-1: as soon as possible)."""
 
     mailbox: int
     message: bytes
@@ -70,7 +70,7 @@ class RequestEntry:
 
     @property
     def stage(self) -> RequestStage:
-        """Where the request stands."""
+        """Stage of the request."""
         return RequestStage(self.words[RequestWord.STAGE])
 
 
@@ -81,15 +81,10 @@ class OperatorTable:
         self._segment, self._words = segment, segment.words
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
-    @property
-    def requested(self) -> int:
-        """Requests added so far: whoever has seen this number need not look again."""
-        return self._words[System.REQUESTED]
-
     def add(self, request: Request) -> RequestEntry:
-        """Fill an entry, a free one or that of the command given longest ago; the clock gives it when it is due.
+        """Fill a free entry, or that of the command issued longest ago; the clock issues it when it is due.
 
-        Raises `OperatorTableError` when all of them wait for their ticks.
+        Raises `OperatorTableError` when all entries wait for their ticks.
         """
         entry, claim = self._add(request)
         claim.close()
@@ -97,7 +92,7 @@ class OperatorTable:
 
     @contextmanager
     def claim(self, request: Request) -> Iterator[RequestEntry]:
-        """Add a request for a block, as its client; what was not given by its end, or that of the process, never is.
+        """Add a request, as its client, for the length of a `with` block; if not issued by its end, it never is.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
@@ -112,12 +107,12 @@ class OperatorTable:
     def _add(self, request: Request, has_client: bool = False) -> tuple[RequestEntry, ByteLock]:
         lock = ByteLock(self._segment, self._segment.map.operator)
         try:
-            # The bound of this wait is the time in which another process fills an entry.
+            # This wait lasts while another process fills an entry.
             while not lock.take():
                 continue
             settled = [entry for entry in self.entries if not self.is_waiting(entry)]
             if not settled:
-                why = f"{len(self.entries)} commands wait for their ticks, as many as it holds"
+                why = f"{len(self.entries)} commands wait for their ticks"
                 raise OperatorTableError(f"the operator table is full: {why}; permitted: once one of them is given")
             entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
             ticket = self._words[System.REQUESTED] + 1
@@ -130,16 +125,16 @@ class OperatorTable:
         return entry, claim
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
-        """Take a request back that still waits; False when it was given."""
+        """Withdraw a request that still waits; False when it was issued."""
         words = entry.words
         if words[RequestWord.TICKET] != ticket or words[RequestWord.STAGE] != RequestStage.WAITING:
             return False
         words[RequestWord.STAGE] = RequestStage.FREE
-        # The clock first says that it gives it, then looks whether it is still wanted.
+        # The clock first marks the request as issued, then checks whether it is still wanted.
         return words[RequestWord.GIVEN_TICK] < 0
 
     def is_waiting(self, entry: RequestEntry) -> bool:
-        """Say whether a request waits, and nobody who wanted it has ended."""
+        """Say whether a request waits, and its client, if any, still lives."""
         words = entry.words
         if words[RequestWord.STAGE] != RequestStage.WAITING:
             return False
@@ -148,7 +143,7 @@ class OperatorTable:
         )
 
     def waiting(self) -> list[RequestEntry]:
-        """Return the requests that wait, in the order in which they were added."""
+        """Return the waiting requests in the order in which they were added."""
         found = [entry for entry in self.entries if self.is_waiting(entry)]
         return sorted(found, key=lambda entry: entry.words[RequestWord.TICKET])
 
@@ -161,6 +156,6 @@ class OperatorTable:
         words[RequestWord.TICK] = request.tick
         words[RequestWord.SERIAL], words[RequestWord.GIVEN_TICK] = 0, -1
         entry.message[: len(request.message)] = request.message
-        # From here the clock may give it.
+        # From here the clock may issue it.
         words[RequestWord.STAGE] = RequestStage.WAITING
         self._words[System.REQUESTED] += 1

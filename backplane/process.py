@@ -1,34 +1,39 @@
-"""Who is alive: processes told apart by pid and start time, for a pid comes back."""
+"""Processes: alive or not, on which core, at which priority."""
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 import select
+import signal
 from pathlib import Path
 from time import process_time_ns
+
+from rack.backplane.layout import TaskSpec
 
 GONE = "ZX"
 """States of a process that has ended."""
 WAITING = "SD"
-"""States of a process that waits for something."""
+"""States of a process that waits."""
 _TICKS_A_SECOND = os.sysconf("SC_CLK_TCK")
 STOPPED = "Tt"
-"""States of a process that a signal, or a debugger, has stopped."""
+"""States of a process stopped by a signal or a debugger."""
 
 
 def start_time(pid: int) -> int:
-    """Return when a process started, in kernel clock ticks since boot; 0 when there is none or it is a zombie."""
+    """Return the start time of a process, in kernel clock ticks since boot; 0 when there is none or it is a zombie."""
     fields = _stat(pid)
     return int(fields[19]) if fields and fields[0] not in GONE else 0
 
 
 def state_of(pid: int) -> str:
-    """Return the kernel's letter for what a process does: R, S, D, T (stopped), Z (dead, not reaped); X: no process."""
+    """Return the kernel's letter for a process's state: R, S, D, T (stopped), Z (dead, not reaped); X: no process."""
     return (_stat(pid) or "X")[0]
 
 
 def processor_ns(pid: int) -> int:
-    """Return the processor time that a process has used so far, in ns, to about 10 ms; 0 when there is none."""
+    """Return the processor time used by a process so far, in ns, to about 10 ms; 0 when there is none."""
     fields = _stat(pid)
     return (int(fields[11]) + int(fields[12])) * (1_000_000_000 // _TICKS_A_SECOND) if fields else 0
 
@@ -43,15 +48,15 @@ def _stat(pid: int) -> list[str]:
 
 
 def is_alive(pid: int, started: int = 0) -> bool:
-    """Say whether the process runs; with `started`, whether it is still that same process."""
+    """Say whether a process is alive; with `started`, whether it is still the same process: a pid is reused."""
     found = start_time(pid) if pid > 0 else 0
     return found > 0 and started in (0, found)
 
 
 def readable(fd: int, timeout_s: float) -> bool:
-    """Wait until a descriptor can be read, a pidfd until its process has ended; False when the time is over.
+    """Wait until a descriptor can be read, or the process of a pidfd has ended; False when the time is over.
 
-    Whatever its number: `select` takes none above 1023.
+    Unlike `select` this takes descriptors above 1023.
     """
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
@@ -59,10 +64,7 @@ def readable(fd: int, timeout_s: float) -> bool:
 
 
 def compute_until(processor_time_ns: int) -> None:
-    """Compute until the calling process has used that much processor time, as `process_time_ns` counts it.
-
-    Time in which it is preempted does not count.
-    """
+    """Compute until the calling process has used that much processor time (`process_time_ns`: without preemption)."""
     while process_time_ns() < processor_time_ns:
         pass
 
@@ -70,3 +72,45 @@ def compute_until(processor_time_ns: int) -> None:
 def pin(core: int) -> None:
     """Pin the calling process to one core. Raises `OSError` when the machine lacks it."""
     os.sched_setaffinity(0, {core})
+
+
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_PR_SET_NAME, _PR_SET_PDEATHSIG = 15, 1
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def take_processor(spec: TaskSpec) -> int:
+    """Pin the calling process, take its priority if allowed, lock its memory, stop the garbage collector.
+
+    Return the SCHED_FIFO priority obtained; 0: ordinary scheduling.
+    """
+    pin(spec.core)
+    priority = spec.priority if set_priority(spec.priority) else 0
+    # On fault: locking every page at once would copy all memory that the boards share since their fork.
+    _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    gc.freeze()
+    gc.disable()
+    return priority
+
+
+def set_priority(priority: int) -> bool:
+    """Take a SCHED_FIFO priority, 0 for ordinary scheduling; False when the system refuses it."""
+    policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
+    try:
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    except PermissionError:
+        return False
+    return True
+
+
+def name_process(name: str) -> None:
+    """Set the name of the calling process in `top` and `ps`, 15 characters."""
+    _libc.prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
+
+
+def die_with_parent(parent: int) -> None:
+    """Let the kernel kill the calling process when its parent ends, however that ends."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    # The parent may have ended between fork and prctl.
+    if os.getppid() != parent:
+        os._exit(1)

@@ -1,8 +1,8 @@
 """The backplane's memory: one POSIX shared-memory segment a rack.
 
-The Rack makes and unlinks it; everyone else attaches by the rack's name and finds the layout and
-the resolved config in the segment itself. It gets its name when it is complete: a launcher killed before
-that leaves nothing, and nobody ever finds half a segment.
+The Rack makes and unlinks it. All others attach by the rack's name and find the layout and the resolved config in the
+segment itself. It gets its name when it is complete: a launcher killed before that leaves nothing behind, and no
+process ever finds half a segment.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 3
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
-"""Where the C library keeps what `shm_open` names."""
+"""Folder in which `shm_open` of the C library keeps its names."""
 
 
 class Segment:
@@ -47,7 +47,7 @@ class Segment:
     def create(cls, layout: Layout, config: str) -> Self:
         """Make the segment of a rack, mode 0600, all of it allocated.
 
-        Raises `SegmentError` when the name is in use or the memory does not suffice.
+        Raises `SegmentError` when the name is in use or memory is short.
         """
         texts = [json.dumps(asdict(layout)).encode(), config.encode()]
         places = AddressMap(layout)
@@ -57,7 +57,7 @@ class Segment:
         except OSError as error:
             raise SegmentError(f"rack '{layout.rack}': {SHM_FOLDER}: {error.strerror}") from None
         try:
-            # A full /dev/shm would otherwise show as SIGBUS at the first touch of a page.
+            # Otherwise a full /dev/shm would raise SIGBUS at the first access to a page.
             os.posix_fallocate(fd, 0, size)
             segment = cls(layout.rack, fd, size)
             segment.layout, segment.config, segment.map = layout, config, places
@@ -73,7 +73,7 @@ class Segment:
     def _take_name(self) -> None:
         folder = os.open(SHM_FOLDER, os.O_PATH)
         try:
-            # With a folder's descriptor the link is made to what the path leads to, not to the path.
+            # With a folder's descriptor the link leads to the path's target, not to the path.
             os.link(f"/proc/self/fd/{self.fd}", shm_path(self.rack).name, src_dir_fd=folder, dst_dir_fd=folder)
         finally:
             os.close(folder)
@@ -93,14 +93,14 @@ class Segment:
         self.words[Head.LAUNCHER_PID] = os.getpid()
         self.words[Head.LAUNCHER_START] = start_time(os.getpid())
         self.words[Head.CREATED_NS] = time.time_ns()
-        # Last, so that nobody attaches to half a segment.
+        # Last, so that no process attaches to half a segment.
         self.words[Head.MAGIC] = MAGIC
 
     @classmethod
     def attach(cls, rack: str) -> Self:
         """Attach to a rack's segment.
 
-        Raises `SegmentError` when there is none, or its owner, size or version is not what it must be.
+        Raises `SegmentError` when there is none, or its owner, size or version is wrong.
         """
         segment = cls.open(rack)
         try:
@@ -112,16 +112,16 @@ class Segment:
 
     @classmethod
     def open(cls, rack: str) -> Self:
-        """Open a rack's segment, of whatever version: its head tells who launched it, its layout is not read.
+        """Open a rack's segment of any version: the launcher is read from its head, the layout is not read.
 
-        Raises `SegmentError` when there is none, or it is another user's or no segment.
+        Raises `SegmentError` when there is none, or it is another user's, or not a segment.
         """
         if (kind := stranger(rack)) is not None:
             raise SegmentError(f"rack '{rack}': {shm_path(rack)} is a {kind}, not a segment")
         try:
             shm = posix_ipc.SharedMemory(_shm_name(rack))
         except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
-            why = "belongs to another user" if isinstance(error, posix_ipc.PermissionsError) else "is not there"
+            why = "belongs to another user" if isinstance(error, posix_ipc.PermissionsError) else "does not exist"
             raise SegmentError(f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}") from None
         found = os.fstat(shm.fd)
         if os.getuid() not in (found.st_uid, 0) or found.st_size < HEAD_SIZE:
@@ -161,13 +161,13 @@ class Segment:
 
     @property
     def launcher_is_alive(self) -> bool:
-        """Whether the process that made the segment, of whatever version, still runs."""
+        """Whether the process that made the segment, of any version, still runs."""
         words = self.words
         return words[Head.MAGIC] == MAGIC and is_alive(words[Head.LAUNCHER_PID], words[Head.LAUNCHER_START])
 
     @property
     def has_its_name(self) -> bool:
-        """Whether the rack's name still means this segment: it may be removed, and made again by another launch."""
+        """Whether the rack's name still leads to this segment: another launch may have replaced it."""
         try:
             named = shm_path(self.rack).stat()
         except FileNotFoundError:
@@ -175,7 +175,7 @@ class Segment:
         return os.path.samestat(named, os.fstat(self.fd))
 
     def close(self) -> None:
-        """Give the file descriptor back; the mapping goes with the last view on it."""
+        """Close the file descriptor; the mapping lasts as long as views of it."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
@@ -187,17 +187,17 @@ def racks() -> list[str]:
 
 
 def stranger(rack: str) -> str | None:
-    """Return what stands under a rack's name that no rack has made, as in "directory"; None for a file, or nothing."""
+    """Return the kind of a foreign entry under a rack's name, as in "directory"; None for a file, or no entry."""
     try:
         mode = shm_path(rack).lstat().st_mode
-    except OSError:  # no such file, or a name that none can have
+    except OSError:  # no such file, or an impossible name
         return None
     kinds = {stat.S_IFDIR: "directory", stat.S_IFLNK: "symbolic link"}
     return None if stat.S_ISREG(mode) else kinds.get(stat.S_IFMT(mode), "special file")
 
 
 def unlink(rack: str) -> None:
-    """Remove a rack's segment by name; no error when it is gone already.
+    """Remove a rack's segment by name; no error if it does not exist.
 
     Raises `SegmentError` when it is another user's.
     """
@@ -206,11 +206,11 @@ def unlink(rack: str) -> None:
     except posix_ipc.ExistentialError:
         return
     except posix_ipc.PermissionsError:
-        raise SegmentError(f"rack '{rack}' belongs to another user, who alone may remove it") from None
+        raise SegmentError(f"rack '{rack}' belongs to another user: only that user may remove it") from None
 
 
 def shm_path(rack: str) -> Path:
-    """Return where the file system shows a rack's segment."""
+    """Return the path of a rack's segment."""
     return SHM_FOLDER / f"{PREFIX}{rack}"
 
 
@@ -219,7 +219,7 @@ def _shm_name(rack: str) -> str:
 
 
 def _in_use(rack: str) -> str:
-    return f"rack '{rack}' has a segment already: it runs, or was killed; see 'rack list', 'rack clean'"
+    return f"rack '{rack}' already has a segment: it is running, or was killed; see 'rack list', 'rack clean'"
 
 
 def _field(entry: dict[str, Any]) -> FieldSpec:
@@ -228,7 +228,7 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
 
 
 def layout_of(entry: dict[str, Any]) -> Layout:
-    """Return the layout that `dataclasses.asdict` has made plain data of."""
+    """Return a layout from the plain data that `dataclasses.asdict` makes of it."""
     boxes = [
         MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": tuple(_field(f) for f in m["fields"])})
         for m in entry["mailboxes"]

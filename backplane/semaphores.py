@@ -1,11 +1,11 @@
 """The named semaphores of a rack: one wake-up a task, one for the clock, one a locked mailbox.
 
-The Rack makes them, the crate opens them before it forks the boards, and the names are removed at
-once: the boards keep the open semaphores, and nothing is left behind however they end.
+The Rack makes them, the crate opens them before it forks the boards, and the names are then removed: the boards keep
+the open semaphores, and nothing is left behind however they end.
 
-`posix_ipc` waits by the wall clock: set back by an hour, a bound of 2 ms would end an hour later. The C library has a
-wait by CLOCK_MONOTONIC too (glibc 2.30). Alternatives considered: a futex by hand, and an eventfd with `poll`, are
-slower to wake up.
+`posix_ipc` waits by the wall clock: if that is set back by an hour, a wait of 2 ms takes an hour. The C library can
+wait by CLOCK_MONOTONIC (since glibc 2.30). Alternatives considered: a futex through ctypes, and an eventfd with `poll`;
+both wake up more slowly.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 
 
 class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no types
-    """An open semaphore whose waits no step of the wall clock makes longer or shorter.
+    """An open semaphore whose waits do not depend on the wall clock.
 
-    `wait()` waits until what `bind` has set, and returns 0 when it has obtained the semaphore: it is the C library's
-    own function, for whoever must be awake at once. A signal may end it early.
+    `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. It is the C library's
+    own function, for the fastest wake-up. A signal may end it early.
     """
 
     def __init__(self, name: str) -> None:
         """Open the semaphore of that name. Raises `posix_ipc.ExistentialError`."""
         super().__init__(name)
-        # The same one: the C library opens a name once in a process.
+        # The same semaphore: the C library opens a name once in a process.
         address = _sem_open(name.encode(), 0)
-        # A struct timespec, which the C library reads where it is.
+        # A struct timespec, read by the C library in place.
         self._deadline = (ctypes.c_int64 * 2)()
         self.wait = partial(_sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline))
 
     def bind(self, timeout_s: float) -> int:
-        """Have waits end in `timeout_s` from now; return when that is, CLOCK_MONOTONIC, ns."""
+        """Let waits end in `timeout_s` from now; return that time, CLOCK_MONOTONIC, ns."""
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
         return deadline_ns
 
     def acquire(self, timeout_s: float) -> bool:
-        """Wait for that long at most; False when it was in vain."""
+        """Wait at most that long; False when the time is over."""
         try:
             super().acquire(0)
         except posix_ipc.BusyError:
@@ -71,7 +71,7 @@ def names(layout: Layout) -> list[str]:
 
 
 def create(layout: Layout) -> None:
-    """Make every semaphore of a rack, replacing what a killed rack of that name left."""
+    """Make every semaphore of a rack, replacing those left by a killed rack of that name."""
     for name in names(layout):
         _unlink(name)
         initial = 1 if name.startswith(_lock(layout.rack, "")) else 0
@@ -85,14 +85,14 @@ def open_all(layout: Layout) -> None:
 
 
 def unlink(layout: Layout) -> None:
-    """Remove the names; whoever has a semaphore open keeps it."""
+    """Remove the names; processes keep the semaphores that they have open."""
     for name in names(layout):
         _unlink(name)
 
 
 def unlink_all(rack: str) -> None:
     """Remove every semaphore name of a rack whose layout is not known."""
-    # The C library keeps semaphores beside the segments, with a prefix of its own. No rack's name holds a dot.
+    # The C library keeps semaphores in the segments' folder, with its own prefix. A rack's name has no dot.
     for path in SHM_FOLDER.glob(f"sem.{PREFIX}{rack}.*"):
         _unlink(f"/{path.name.removeprefix('sem.')}")
 

@@ -1,8 +1,12 @@
-"""Trace rings: one fixed record a cycle of a task, written without ever waiting.
+"""Trace rings: one fixed record for each cycle of a task, written without ever waiting.
 
 One record gives lateness (start - release), t_comm (read and write parts), t_exec (the process part) and t_residual
-(deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 (plan - start), and the processor time that a cycle really
-took, whoever preempted it. A reader that falls behind knows how many it lost.
+(deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 (plan - start), and the processor time of the cycle, without
+preemption. A reader that falls behind knows how many records it lost.
+
+A task traces a cycle after its last write. So the trace also proves things about messages (`CycleRecord`): one that is
+not there by then was not written, and one that comes later was held back. Age alone proves nothing, since the machine
+may have taken the core away.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ from enum import IntFlag
 
 import numpy as np
 
-from rack.backplane.address_map import TRACE_RECORD_SIZE
+from rack.backplane.address_map import TRACE_RECORD_SIZE, oldest_kept
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
@@ -21,29 +25,33 @@ RECORD = np.dtype(
         ("tick", "i8"),  # release, in ticks
         ("release_ns", "i8"),  # the grid point of that tick, CLOCK_MONOTONIC
         ("start_ns", "i8"),
-        ("plan_ns", "i8"),  # an executor has read its plan; where there is none to read: start_ns
-        ("read_ns", "i8"),  # commands, statuses read
+        ("plan_ns", "i8"),  # an executor has its plan over the bus (C of fig. 4); without one to read: start_ns
+        ("read_ns", "i8"),  # command, status and plan read
         ("process_ns", "i8"),  # process done
-        ("end_ns", "i8"),  # commands, statuses written
+        ("end_ns", "i8"),  # command and status written
         ("flags", "i8"),  # Flag in the low 16 bits; above them the releases skipped just before this one
         ("state", "i8"),  # state of the level
         ("processor_ns", "i8"),  # processor time since the last record: this cycle, and waking up for it
     ]
 )
 FIELDS = tuple(RECORD.names or ())
-
-
 SKIPPED_SHIFT = 16
 
 
 class Flag(IntFlag):
-    """What a cycle's record says besides its times."""
+    """Flags of a cycle's record."""
 
-    MISSED = 1  # missed its deadline, or a message came too late
-    SKIPPED = 2  # releases were skipped just before this one
+    MISSED = 1  # missed its deadline, or wrote a message too late
+    SKIPPED = 2  # releases were skipped just before it
     BUS_ERROR = 4  # an access was cut off by its bound
     CORRUPT = 8  # a message failed its CRC
     PLANNED = 16  # the record of a planner's cycle that made a plan
+
+
+# Plain integers for the hot path.
+_TICK, _END, _FLAGS = (FIELDS.index(name) for name in ("tick", "end_ns", "flags"))
+_RECORD = TRACE_RECORD_SIZE // 8
+_TRACE_HEAD, _BUS_ERROR = int(Block.TRACE_HEAD), int(Flag.BUS_ERROR)
 
 
 class TraceWriter:
@@ -63,7 +71,7 @@ class TraceWriter:
         """Append the record."""
         self._count += 1
         self._slots[self._count & self._mask][:] = self.record
-        self._block[16] = self._count  # Block.TRACE_HEAD
+        self._block[_TRACE_HEAD] = self._count
 
 
 def trace_ring(segment: Segment, task: str) -> Ring:
@@ -71,3 +79,39 @@ def trace_ring(segment: Segment, task: str) -> Ring:
     spec = segment.layout.task(task)
     head = segment.block(task)[Block.TRACE_HEAD : Block.TRACE_HEAD + 1]
     return Ring(segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE), RECORD, head)
+
+
+class CycleRecord:
+    """The trace of one task, as read by the readers of its mailboxes."""
+
+    def __init__(self, segment: Segment, task: str) -> None:
+        self._block = segment.block(task)
+        self._words = segment.words
+        self._first = segment.map.traces[task] // 8
+        self._depth = segment.layout.task(task).depth
+
+    @property
+    def finished(self) -> int:
+        """Newest release whose cycle has ended with every access done; -1: none, or not known."""
+        count = self._block[_TRACE_HEAD]
+        at = self._at(count)
+        flags, tick = self._words[at + _FLAGS], self._words[at + _TICK]
+        return tick if count and not flags & _BUS_ERROR and self._keeps(count) else -1
+
+    def ended_ns(self, tick: int) -> int | None:
+        """Return the end of the cycle released at `tick`, CLOCK_MONOTONIC; None without a record of it."""
+        count = self._block[_TRACE_HEAD]
+        for number in range(count, max(0, count - self._depth), -1):
+            at = self._at(number)
+            found, ended_ns = self._words[at + _TICK], self._words[at + _END]
+            if not self._keeps(number) or found < tick:
+                return None
+            if found == tick:
+                return ended_ns
+        return None
+
+    def _keeps(self, number: int) -> bool:
+        return number >= oldest_kept(self._block[_TRACE_HEAD], self._depth)
+
+    def _at(self, number: int) -> int:
+        return self._first + number % self._depth * _RECORD

@@ -1,7 +1,7 @@
-"""The shared words: every number on the backplane that is not in a message, by name.
+"""The shared words: every number on the backplane outside messages, by name.
 
-Each is an aligned 64-bit integer with one writer, stored and loaded at once through a memoryview
-cast to 'q' ('struct' packs byte by byte, so a reader could see half a number).
+Each is an aligned 64-bit integer with one writer, stored and loaded whole through a memoryview cast to 'q'. (`struct`
+packs byte by byte: a reader could see half a number.)
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Head(IntEnum):
 
 
 class System(IntEnum):
-    """Words of the system clock and the utility lines, behind the head's."""
+    """Words of the system clock and the utility lines, after those of the head."""
 
     STATE = 32  # Run
     TICK = 33
@@ -34,20 +34,20 @@ class System(IntEnum):
     LOCKSTEP = 36
     STOP_REQUEST = 37  # written by the host
     STOP_TICK = 38  # first tick that does not happen; 0: not known
-    CLOCK_SKIPPED = 39  # ticks that the clock itself left out
+    CLOCK_SKIPPED = 39  # ticks skipped by the clock itself
     FOLLOWER_PID = 40  # a recorder for which lockstep waits; 0: none
     FOLLOWER_TICK = 41  # everything up to here is recorded
-    TICK_NS = 42  # CLOCK_MONOTONIC at which the clock gave out the newest tick
-    FAULTS = 43  # rises with every change in the fault table that tasks must see; the clock's
+    TICK_NS = 42  # CLOCK_MONOTONIC of the newest tick
+    FAULTS = 43  # rises with every change in the fault table that concerns tasks; the clock's
     DEMAND = 44  # Demand of the utility lines on the arm; the clock's
     CLOCK_PID = 45
     INJECTED = 46  # faults put into the fault table so far
-    LOSSES = 47  # rises when a board was found dead; the crate's
+    LOSSES = 47  # rises when a board is found dead; the crate's
     SYSRESET = 48
     ACFAIL = 49
     EMERGENCY_STOP = 50
     REQUESTED = 51  # commands put into the operator table so far
-    COMMANDED = 52  # serial of the newest command that was given; the clock's
+    COMMANDED = 52  # serial of the newest command issued; the clock's
     SYSFAIL = 64  # one word a slot, 22 of them: 1 until the board's self-test has passed
 
 
@@ -60,7 +60,7 @@ class Run(IntEnum):
 
 
 class Demand(IntEnum):
-    """Values of `System.DEMAND`: what the safety of the rack asks of the arm, the stronger the greater."""
+    """Values of `System.DEMAND`: the demand of the rack's safety on the arm; a greater one is stronger."""
 
     NONE = 0
     STOP = 1  # controlled stop: ramp to rest, then brake
@@ -68,7 +68,7 @@ class Demand(IntEnum):
 
 
 class Block(IntEnum):
-    """Words of a task's control block. RELEASED is the clock's, LOST of whoever finds it, all others the task's."""
+    """Words of a task's control block. The clock writes RELEASED, the finder LOST, the task all others."""
 
     RELEASED = 0  # newest release, as a tick; -1: none yet
     DEADLINE = 1  # tick before which that cycle, or plan, must be finished
@@ -85,12 +85,12 @@ class Block(IntEnum):
     WRITES = 12
     WRITE_BYTES = 13
     CORRUPT = 14  # messages that failed their CRC
-    BUS_ERRORS = 15  # accesses that their bound cut off
+    BUS_ERRORS = 15  # accesses cut off by their bound
     TRACE_HEAD = 16  # trace records written
     LEVEL_STATE = 17  # state of the level, as in its status
     PLANS = 18  # plans made
-    LOST = 19  # 1 + tick at which the task was found dead or hanging; 0: it is not. The clock clears it
-    LEVEL_SINCE = 20  # tick of the cycle in which the level came into that state
+    LOST = 19  # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
+    LEVEL_SINCE = 20  # tick of the cycle in which the level entered that state
 
 
 class TaskState(IntEnum):
@@ -111,14 +111,17 @@ class Box(IntEnum):
     HEAD = 0  # serial of the newest whole message; 0: none
     EPOCH = 1  # counts the writers that have claimed the mailbox
     WRITER_PID = 2
-    CLAIM = 3  # no number: the writer holds the kernel's lock on this address
-    OWNER = 4  # likewise whoever is in the critical section, protocol lock; the number is its process, 0: nobody
+    CLAIM = 3  # not a number: the writer holds the kernel's lock on this address
+    OWNER = 4  # likewise for the critical section, protocol lock; the number is its owner's process, 0: none
     CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
 
 
 class Slot(IntEnum):
-    """Words in front of every message in its slot. The chain covers SERIAL to the end of the message,
-    the CRC also BASIS and EPOCH; the time stamp is in neither, so that equal runs have equal chains."""
+    """Words in front of every message in its slot.
+
+    The chain covers SERIAL to the end of the message, the CRC also BASIS and EPOCH. The time stamp is in neither, so
+    that equal runs have equal chains.
+    """
 
     STAMP_NS = 0
     CRC = 1

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import State
-from rack.backplane.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.outcome import Cause
+from rack.boards.events import Cause
 
 
 class Ending:

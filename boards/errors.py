@@ -1,9 +1,9 @@
-"""The exception tree of the boards, and where each one shows.
+"""The exception tree of the boards, with the cause of each error.
 
 `BoardError` is the root: catch it and every refusal of this package is caught.
 
 - `ConfigError`: a config with mistakes, all of them at once, before any process starts.
-- `LaunchError`: a board that does not start: its self-test failed, or it is not ready in time.
+- `LaunchError`: a board that does not start: its self-test failed, or it was not ready in time.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class BoardError(Exception):
 
 
 class LaunchError(BoardError):
-    """A rack that cannot be launched, though its config is right."""
+    """A rack that cannot be launched although its config is correct."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake of a config: where it stands, what stands there (None: nothing), why not and what is permitted."""
+    """One mistake of a config: its place, the value there (None: none), and why it is wrong or what is permitted."""
 
     place: str
     value: Any
@@ -48,16 +48,16 @@ class ConfigError(BoardError):
 
 
 def shown(value: Any) -> str:
-    """Return a config value as TOML would have it, cut to one short line."""
+    """Return a config value as in TOML, cut to one short line."""
     value = list(value) if isinstance(value, tuple) else value
     try:
         text = str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
-    except ValueError:  # Python writes no integer of thousands of digits
+    except ValueError:  # Python does not print integers of thousands of digits
         text = f"an integer of {value.bit_length()} bits"
     return one_line(text, LONGEST_VALUE)
 
 
 def one_line(text: str, longest: int) -> str:
-    """Return text as one line of at most that many characters, without what a terminal would obey."""
+    """Return text as one line of at most that many characters, without control characters."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text[: 2 * longest].split()))
     return text if len(text) <= longest else f"{text[: longest - 3]}..."

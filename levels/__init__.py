@@ -13,8 +13,8 @@ every processor), `rack.levels.robot` (cell, limits, dynamics), `rack.levels.arm
 levels: `servo`, `primitive`, `elemental_move`, `task`, `world`, `figures`.
 """
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import Field, Message, MessageType, State, command, status
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.errors import LevelError, ProgramError, Refused, RobotError
 from rack.levels.level import (
     Demand,

@@ -55,9 +55,9 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
-from rack.backplane.alarms import Alarm
-from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
+from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.operator import Commands
 from rack.levels.tables import RobotConfig, SceneConfig, Table
@@ -119,7 +119,7 @@ class Fault(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A fault that a level has found; its board raises the alarm. See `rack.backplane.alarms.Alarm`."""
+    """A fault that a level has found; its board raises the alarm. See `rack.backplane.watch.alarms.Alarm`."""
 
     alarm: Alarm
     subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular

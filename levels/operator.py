@@ -14,7 +14,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.mailbox import Reading
+from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import REASON_BYTES, Field, Message, command
 
 MAX_JOINTS = 16

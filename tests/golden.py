@@ -16,9 +16,9 @@ import tomllib
 from importlib.metadata import version
 from pathlib import Path
 
+from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.crate_line import environment
-from rack.boards.rack import Rack
+from rack.boards.crate.line import environment
 
 FILE = Path(__file__).with_suffix(".toml")
 RUNS = (

@@ -8,16 +8,16 @@ from time import monotonic_ns
 from typing import NamedTuple
 
 from rack.backplane import semaphores
-from rack.backplane.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
-from rack.backplane.lock import LockReader
-from rack.backplane.ring import mailbox_ring
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import LockReader
 from rack.backplane.segment import SHM_FOLDER, Segment, unlink
 from rack.backplane.trace import FIELDS, Flag, TraceWriter
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block
 from rack.boards.faults.kinds import KINDS, NUMBERS
-from rack.boards.ports import InputPorts, OutputPorts
+from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
 
@@ -122,7 +122,7 @@ class Link:
 
     def written(self) -> list[tuple[int, int, int]]:
         """Return release tick, serial and first visible tick of every message in a slot, oldest first."""
-        rows = mailbox_ring(self.segment, NAME).drain().rows
+        rows = MailboxRing(self.segment, NAME).drain().rows
         return [(int(row["tick"]), int(row["serial"]), int(row["visible_at"])) for row in rows]
 
     def alarms(self, task: str = "reader") -> list[tuple[int, Alarm]]:

@@ -41,7 +41,7 @@ def first(file: str, header: str, statement: str) -> tuple[str, str, str]:
     return file, f"    {header}\n", f"    {header}\n        {statement}\n"
 
 
-SLOTS, ARM = "backplane/slots.py", "levels/arm/simulated.py"
+SLOTS, ARM = "backplane/mailbox/slots.py", "levels/arm/simulated.py"
 MUTANTS = (
     Mutant(
         "sensor monitor",
@@ -58,26 +58,33 @@ MUTANTS = (
         "corrupt",
         (
             (SLOTS, "self._words[_CRC] == crc32(self._crc_part)", "True"),
-            ("backplane/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
+            ("backplane/watch/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
+            ("backplane/watch/message_watch.py", "self._episodes.find(Alarm.DAMAGED, found.accesses, tick)", "pass"),
         ),
     ),
     Mutant(
         "claim",
         "masquerade",
         (
-            ("backplane/mailbox.py", "fetched.is_lawful(self._signature)", "True"),
-            ("boards/ports.py", "if writer.intruder:", "if False:"),
+            ("backplane/mailbox/mailbox.py", "fetched.is_lawful(self._signature)", "True"),
+            ("boards/run/ports.py", "if writer.intruder:", "if False:"),
         ),
     ),
     Mutant(
         "silence",
         "mute",
-        (first("backplane/silence_watch.py", "def _tell(self, code: Alarm, tick: int, age: int) -> None:", "return"),),
+        (
+            first(
+                "backplane/watch/silence_watch.py",
+                "def _report(self, code: Alarm, tick: int, age: int) -> None:",
+                "return",
+            ),
+        ),
     ),
     Mutant(
         "watchdog",
         "hang",
-        (first("backplane/watchdog.py", "def _hangs(self, task: ReleasedTask) -> bool:", "return False"),),
+        (first("backplane/clock/released_task.py", "def _hangs(self, task: ReleasedTask) -> bool:", "return False"),),
     ),
     Mutant(
         "limit gate",
@@ -85,7 +92,7 @@ MUTANTS = (
         (first("levels/arm/arm.py", "def refused(self, torque: Array) -> Finding | None:", "return None"),),
     ),
     Mutant("brake", "sensor-nan", (first(ARM, "def brake(self) -> None:", "return"),)),
-    Mutant("restart", "kill", (("boards/supervision.py", "if len(recent) >= most:", "if True:"),)),
+    Mutant("restart", "kill", (("boards/crate/recovery.py", "if len(recent) >= most:", "if True:"),)),
     Mutant(
         "violation counter",
         "violation counter",

@@ -9,9 +9,9 @@ import sys
 import numpy as np
 import pytest
 
+from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.crate_line import TUNABLES
-from rack.boards.rack import Rack
+from rack.boards.crate.line import TUNABLES
 
 SECONDS = 9.0
 """Of `nasrem`: the plans, the way to the first object, the grasp, the way up with it."""

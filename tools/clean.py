@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rack.boards.clean import clean as remove_leftovers
+from rack.boards.crate.clean import clean as remove_leftovers
 from rack.tools.console.answer import Json, print_json
 
 

@@ -10,9 +10,9 @@ from pydantic import ValidationError
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.layout import Layout
+from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import Request
-from rack.backplane.slots import message_dtype
 from rack.boards.classes import find_class
 from rack.boards.config.cell import joint_ranges
 from rack.boards.config.mistakes import mistakes_of

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, StringConstraints
 
-from rack.backplane.clock import ticks_of
+from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Protocol, Role
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml

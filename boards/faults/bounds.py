@@ -13,7 +13,7 @@ from math import ceil
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.lock import WAIT_S
+from rack.backplane.mailbox.protocols import LOCK_WAIT_S
 from rack.boards.faults.kinds import Kind
 
 RACK_NS = 5_000_000
@@ -86,7 +86,7 @@ BOUNDS: Mapping[str, Callable[[_Case], int]] = {
     "corrupt": lambda case: case.seen,
     "babble": lambda case: case.seen,
     "masquerade": lambda case: case.seen,
-    "lock-held": lambda case: ceil(WAIT_S * 1e9 / case.layout.clock_ns) + case.read,
+    "lock-held": lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns) + case.read,
     "clock-stop": lambda case: 3,
     # It is seen at the first tick that is not left out.
     "clock-skip": lambda case: int(case.parameter),

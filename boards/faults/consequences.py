@@ -10,8 +10,8 @@ from math import ceil
 from typing import NamedTuple
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.alarms import Alarm
 from rack.backplane.layout import Layout
+from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.bounds import cycle_ticks
 
 SENSOR_ALARMS = (Alarm.SENSOR_RANGE, Alarm.SENSOR_STUCK, Alarm.SENSOR_SILENT, Alarm.SENSOR_MODEL)

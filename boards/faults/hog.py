@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 
-from rack.backplane.clock import SystemClock
+from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Stage
-from rack.backplane.process import pin
+from rack.backplane.process import pin, set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.boards.processor import set_priority
 
 LEAST_S = 0.001
 """Least time between two such looks."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
 """Who does it: `process`, `clock`, `bus`: the clock's board, at the beginning of a tick; `load`, `writer`, `lock`: the

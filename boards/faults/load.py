@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from time import monotonic_ns
 
-from rack.backplane.clock import SystemClock
+from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import Entry, FaultEntry
 from rack.backplane.layout import TaskSpec
 

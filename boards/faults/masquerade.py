@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
+from rack.backplane.mailbox.slots import Slots, claim
 from rack.backplane.segment import Segment
-from rack.backplane.slots import Slots, claim
 from rack.backplane.words import Box
 
 

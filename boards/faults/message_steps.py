@@ -14,8 +14,8 @@ from time import monotonic_ns
 from typing import NamedTuple
 
 from rack.backplane.fault_table import Entry, FaultEntry
-from rack.backplane.lock import LockWriter
-from rack.backplane.mailbox import Writer
+from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.protocols import LockWriter
 
 
 class Outgoing(NamedTuple):

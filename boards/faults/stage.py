@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 
-from rack.backplane.alarms import Alarm, AlarmWriter
-from rack.backplane.clock import SystemClock
+from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
-from rack.backplane.mailbox import Reader
-from rack.backplane.protocols import open_observer
+from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import System
 from rack.boards.faults.kinds import KINDS
 from rack.boards.faults.strikes import Strikes

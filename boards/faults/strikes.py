@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from rack.backplane.clock import SystemClock
-from rack.backplane.clock_driver import ClockDriver
+from rack.backplane.clock.driver import ClockDriver
+from rack.backplane.clock.released_task import ReleasedTask
+from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import Entry, FaultEntry
-from rack.backplane.released_task import ReleasedTask
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.boards.faults.kinds import KINDS
@@ -122,7 +122,7 @@ class Strikes:
 
     def _skip(self, entry: FaultEntry, tick: int) -> None:
         self._acts(entry, tick)
-        self._driver.leave_out = int(entry.parameters[0])
+        self._driver.skip = int(entry.parameters[0])
 
     def _delay(self, entry: FaultEntry, tick: int) -> None:
         self._acts(entry, tick)

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from time import monotonic_ns
+from typing import Protocol
 
-from rack.backplane.clock import SystemClock
+from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
 from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
 from rack.boards.faults.kinds import KINDS
 from rack.boards.faults.load import Load
-from rack.boards.ports import OutputPorts
 from rack.levels.level import Executor, Fault, Planner
+
+
+class Outputs(Protocol):
+    """The outputs of a task, as far as faults concern them."""
+
+    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
+        """Write with these faults, by kind, from now on."""
 
 
 class TaskFaults:
     """Keeps a task's active faults in force; `loads` are those of its computing time."""
 
-    def __init__(self, segment: Segment, spec: TaskSpec, outputs: OutputPorts, level: Executor | Planner) -> None:
+    def __init__(self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner) -> None:
         self._table = FaultTable(segment)
         self._spec, self._outputs, self._level = spec, outputs, level
         self._clock = SystemClock(segment)

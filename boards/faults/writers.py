@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rack.backplane.fault_table import FaultEntry
-from rack.backplane.mailbox import Writer
+from rack.backplane.mailbox.mailbox import Writer
 from rack.boards.faults.message_steps import STEPS, Held, Outgoing, Step
 
 

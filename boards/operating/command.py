@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from rack.backplane.layout import Layout
+from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry, RequestWord
-from rack.backplane.slots import message_dtype
 from rack.levels.operator import Goal, Operation
 from rack.levels.tables import LAST_TICK, Finite, Table
 

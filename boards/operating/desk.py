@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.alarms import Alarm, AlarmWriter
-from rack.backplane.clock import SystemClock
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
-from rack.backplane.protocols import open_writer
 from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import System
 
 # Plain integers for the hot path.

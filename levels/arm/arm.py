@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig

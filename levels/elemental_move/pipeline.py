@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rack.backplane.mailbox import Reading
+from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import SEGMENTS, WINDOW, Error, SegmentKind, Verb

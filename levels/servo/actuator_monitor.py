@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import each, mat_vec
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell

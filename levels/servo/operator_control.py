@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.mailbox import Reading
+from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.operator import Commands, Operation, Orders, joints_of
 from rack.levels.servo.curves import Motion

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Sensed
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell

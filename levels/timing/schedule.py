@@ -1,8 +1,8 @@
 """Gantt charts as data, and the schedule of tasks under fixed priorities, computed instead of run.
 
-The schedule follows the rack's own rules (backplane/wake.py, boards/planner_task.py): a late task takes up the newest
-release and skips the others; a planner's release lasts as long as the time slice of its plan, and the next release
-comes after that slice.
+The schedule follows the rack's own rules (backplane/clock/wake.py, boards/run/control_loop.py): a late task takes up
+the newest release and skips the others; a planner's release lasts as long as the time slice of its plan, and the next
+release comes after that slice.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A small bus for tests: a writer's and a reader's task, and the mailboxes that a test asks for."""
+"""A small bus for tests: a writer's and a reader's task, and the mailboxes of a test."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
     assert all(address + size <= following for (address, size), (following, _) in pairwise(areas))
 
 
-def test_what_a_board_writes_lies_in_its_window(full: Layout) -> None:
+def test_a_boards_mailboxes_lie_in_its_window(full: Layout) -> None:
     places = AddressMap(full)
     window = next(window for window in places.windows if window.board == "writer")
     boxes = [places.mailboxes[mailbox.name] for mailbox in full.mailboxes if mailbox.writer == "writer"]
@@ -63,7 +63,7 @@ def test_what_a_board_writes_lies_in_its_window(full: Layout) -> None:
         assert window.address <= address < window.address + window.size
 
 
-def test_what_an_operator_says_lies_in_the_window_of_the_clock_who_gives_it(full: Layout) -> None:
+def test_operators_mailboxes_lie_in_the_window_of_the_clock(full: Layout) -> None:
     places = AddressMap(full)
     clock = places.windows[0]
     for address in (places.operator, places.mailboxes["reader.operator"]):

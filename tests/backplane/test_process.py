@@ -1,4 +1,4 @@
-"""Who is alive: told by pid and start time."""
+"""Processes are identified by pid and start time."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.process import is_alive, pin, start_time
-from rack.boards.processor import name_process
+from rack.backplane.process import is_alive, name_process, pin, start_time
 from tests.processes import FORKS, exit_status, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)

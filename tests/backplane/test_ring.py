@@ -7,11 +7,12 @@ import os
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox import Writer
-from rack.backplane.protocols import open_writer
-from rack.backplane.ring import Ring, mailbox_ring
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.mailbox.slots import claim
+from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
-from rack.backplane.slots import claim
 from rack.boards.faults.masquerade import masquerade
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
@@ -42,7 +43,7 @@ def serials(ring: Ring) -> tuple[list[int], int]:
 
 
 def test_rows_come_in_order_and_once(bus: Segment) -> None:
-    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     assert serials(ring) == ([], 0)
     for first in range(1, 100, 11):
         write(writer, 11)
@@ -53,7 +54,7 @@ def test_rows_come_in_order_and_once(bus: Segment) -> None:
 
 
 def test_a_row_carries_its_messages_head(bus: Segment) -> None:
-    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     writer.write(7, basis=3)
     row = ring.drain().rows[0]
     assert [row[word] for word in ("serial", "tick", "visible_at", "basis")] == [1, 7, 8, 3]
@@ -62,7 +63,7 @@ def test_a_row_carries_its_messages_head(bus: Segment) -> None:
 
 @pytest.mark.parametrize("written", [DEPTH - 1, DEPTH, DEPTH + 1, 3 * DEPTH + 5])
 def test_lost_rows_are_counted_exactly(bus: Segment, written: int) -> None:
-    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     write(writer, 3)
     ring.drain()
     write(writer, written)
@@ -74,7 +75,7 @@ def test_lost_rows_are_counted_exactly(bus: Segment, written: int) -> None:
 
 
 def test_rows_taken_are_copies(bus: Segment) -> None:
-    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     write(writer, 1)
     rows = ring.drain().rows
     write(writer, 3 * DEPTH)
@@ -82,7 +83,7 @@ def test_rows_taken_are_copies(bus: Segment) -> None:
 
 
 def test_only_messages_that_a_reader_takes_are_rows(bus: Segment) -> None:
-    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     write(writer, 2)
     writer.publish(30, 31, 30, damage=(5, 70))
     writer.lose()
@@ -92,7 +93,7 @@ def test_only_messages_that_a_reader_takes_are_rows(bus: Segment) -> None:
 
 @pytest.mark.filterwarnings(FORKS)
 def test_a_forged_message_is_no_row_and_the_true_one_in_its_place_is(bus: Segment) -> None:
-    writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
+    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     write(writer, 2)
     assert serials(ring) == ([1, 2], 0)
     assert exit_status(fork(lambda: masquerade(bus, NAME, 20))) == 0
@@ -102,7 +103,7 @@ def test_a_forged_message_is_no_row_and_the_true_one_in_its_place_is(bus: Segmen
 
 
 def test_a_second_reader_loses_nothing_by_the_first(bus: Segment) -> None:
-    writer, first, second = open_writer(bus, NAME), mailbox_ring(bus, NAME), mailbox_ring(bus, NAME)
+    writer, first, second = open_writer(bus, NAME), MailboxRing(bus, NAME), MailboxRing(bus, NAME)
     write(writer, 5)
     assert serials(first) == serials(second) == ([1, 2, 3, 4, 5], 0)
 
@@ -113,8 +114,8 @@ def hammer(segment: Segment) -> None:
         write(writer, 1)
 
 
-def test_every_row_is_whole_or_counted_beside_a_hammering_writer(bus: Segment) -> None:
-    ring, taken, lost = mailbox_ring(bus, NAME), 0, 0
+def test_every_row_is_whole_or_counted_while_a_writer_hammers(bus: Segment) -> None:
+    ring, taken, lost = MailboxRing(bus, NAME), 0, 0
     writer = fork(lambda: hammer(bus))
     try:
         while taken < 20_000:
@@ -127,4 +128,4 @@ def test_every_row_is_whole_or_counted_beside_a_hammering_writer(bus: Segment) -
     finally:
         kill(writer)
     rows, missing = ring.drain()
-    assert taken + len(rows) + lost + missing == mailbox_ring(bus, NAME).waiting
+    assert taken + len(rows) + lost + missing == MailboxRing(bus, NAME).waiting

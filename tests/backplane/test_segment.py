@@ -1,4 +1,4 @@
-"""The segment: who may attach, what it carries, and that nothing half made has a name."""
+"""The segment: attaching, its contents, and no name before it is complete."""
 
 from __future__ import annotations
 
@@ -67,20 +67,20 @@ def test_tasks_begin_without_a_release_and_boards_hold_sysfail(make_bus: MakeBus
 def test_a_name_in_use_is_refused_and_the_first_segment_stays(make_bus: MakeBus) -> None:
     first = make_bus()
     first.words[System.TICK] = 5
-    assert f"rack '{first.rack}' has a segment already" in refusal(lambda: Segment.create(first.layout, ""))
+    assert f"rack '{first.rack}' already has a segment" in refusal(lambda: Segment.create(first.layout, ""))
     assert Segment.attach(first.rack).words[System.TICK] == 5
 
 
-def test_attaching_to_nothing_names_what_there_is(make_bus: MakeBus) -> None:
+def test_attaching_to_an_unknown_rack_names_the_racks(make_bus: MakeBus) -> None:
     there = make_bus().rack
     told = refusal(lambda: Segment.attach("nobody-s"))
-    assert "rack 'nobody-s' is not there" in told
+    assert "rack 'nobody-s' does not exist" in told
     assert there in told
 
 
 @pytest.mark.parametrize("name", ["a/b", "x" * 300])
 def test_a_name_that_none_can_have_is_not_there(name: str) -> None:
-    assert "is not there" in refusal(lambda: Segment.attach(name))
+    assert "does not exist" in refusal(lambda: Segment.attach(name))
 
 
 def test_another_layout_version_is_refused(make_bus: MakeBus) -> None:
@@ -150,14 +150,14 @@ def too_large(rack: str) -> Layout:
     return layout(rack, [mailbox(depth=1 << 40)])
 
 
-def test_shared_memory_that_does_not_suffice_is_told_at_creation(rack_name: str) -> None:
+def test_a_lack_of_shared_memory_is_reported_at_creation(rack_name: str) -> None:
     told = refusal(lambda: Segment.create(too_large(rack_name), ""))
     assert f"rack '{rack_name}'" in told
     assert "bytes of shared memory" in told
     assert rack_name not in racks()
 
 
-def test_a_limit_on_file_size_is_told_at_creation(rack_name: str) -> None:
+def test_a_limit_on_file_size_is_reported_at_creation(rack_name: str) -> None:
     def create() -> bool:
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
         return "File too large" in refusal(lambda: Segment.create(layout(rack_name, [mailbox()]), ""))
@@ -188,7 +188,7 @@ def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str
     assert complete
 
 
-def test_a_launcher_is_told_from_a_later_process_of_its_number(make_bus: MakeBus) -> None:
+def test_a_launcher_is_distinguished_from_a_later_process_with_its_pid(make_bus: MakeBus) -> None:
     segment = make_bus()
     segment.words[Head.LAUNCHER_START] += 1
     assert not segment.launcher_is_alive
@@ -203,12 +203,12 @@ def test_a_segment_knows_when_its_name_means_another(make_bus: MakeBus) -> None:
     assert (first.has_its_name, second.has_its_name) == (False, True)
 
 
-def test_unlinking_what_is_gone_is_no_error(rack_name: str) -> None:
+def test_unlinking_twice_is_not_an_error(rack_name: str) -> None:
     unlink(rack_name)
     assert rack_name not in racks()
 
 
-def test_a_segment_outlives_its_name_for_those_who_have_it(make_bus: MakeBus) -> None:
+def test_a_segment_outlives_its_name_where_it_is_attached(make_bus: MakeBus) -> None:
     segment = make_bus()
     with forked(lambda: time.sleep(60)):
         unlink(segment.rack)

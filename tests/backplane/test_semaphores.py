@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from rack.backplane import semaphores
-from rack.backplane.lock import MailboxLock
-from rack.backplane.lockstep_driver import LockstepDriver
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.wake import NextCycle
+from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.segment import SHM_FOLDER, Segment
-from rack.backplane.wake import NextCycle
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
@@ -41,7 +41,7 @@ def test_locks_begin_free_and_wake_ups_unsent(bus: Segment) -> None:
     assert semaphores.clock_semaphore(bus.rack).value == 0
 
 
-def test_what_a_killed_rack_left_is_replaced(bus: Segment) -> None:
+def test_semaphores_of_a_killed_rack_are_replaced(bus: Segment) -> None:
     semaphores.wake_semaphore(bus.rack, "writer").release()
     semaphores.create(bus.layout)
     semaphores.open_all(bus.layout)

@@ -25,7 +25,7 @@ def test_records_are_read_as_they_were_written(make_bus: MakeBus) -> None:
     assert [row.tolist() for row in rows] == [tuple(100 * t + at for at in range(len(FIELDS))) for t in range(1, 6)]
 
 
-def test_a_task_that_nobody_reads_goes_on_and_its_reader_knows_what_it_lost(make_bus: MakeBus) -> None:
+def test_a_trace_without_a_reader_continues_and_lost_records_are_counted(make_bus: MakeBus) -> None:
     segment = make_bus(task("writer", depth=DEPTH))
     writer, ring = TraceWriter(segment, "writer"), trace_ring(segment, "writer")
     trace(writer, range(100))
@@ -34,7 +34,7 @@ def test_a_task_that_nobody_reads_goes_on_and_its_reader_knows_what_it_lost(make
     assert len(rows) + lost == 100
 
 
-def test_a_restarted_task_goes_on_in_its_ring(make_bus: MakeBus) -> None:
+def test_a_restarted_task_continues_its_ring(make_bus: MakeBus) -> None:
     segment = make_bus(task("writer", depth=DEPTH))
     ring = trace_ring(segment, "writer")
     trace(TraceWriter(segment, "writer"), range(3))

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 
-from rack.boards.rack import Rack
+from rack.boards import Rack
 
 
 def main(config: str, *settings: str) -> None:

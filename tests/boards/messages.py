@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rack.backplane.ring import mailbox_ring
+from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, trace_ring
 
@@ -25,7 +25,7 @@ class Written:
         """Take what is on a segment."""
         messages, cycles = {}, {}
         for mailbox in segment.layout.mailboxes:
-            messages[mailbox.name], lost = mailbox_ring(segment, mailbox.name).drain()
+            messages[mailbox.name], lost = MailboxRing(segment, mailbox.name).drain()
             assert not lost
         for task in segment.layout.tasks:
             cycles[task.name], lost = trace_ring(segment, task.name).drain()

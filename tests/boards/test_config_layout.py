@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.layout import depth_for
-from rack.backplane.slots import message_dtype
+from rack.backplane.mailbox.slots import message_dtype
 from rack.boards.config import load, resolve, shared_out, wire
 from rack.boards.config import resolved as resolved
 from rack.boards.config.layout import field_specs, obtained_core

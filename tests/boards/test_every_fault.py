@@ -13,13 +13,13 @@ from rack.backplane.fault_table import Entry, FaultTable, Stage
 from rack.backplane.message import State
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block
+from rack.boards import Rack
 from rack.boards.errors import LaunchError
 from rack.boards.faults.bounds import bound_ticks, cycle_ticks
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.consequences import recovery_ticks
 from rack.boards.faults.kinds import KINDS, Kind
 from rack.boards.faults.request import injections
-from rack.boards.rack import Rack
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import FOLLOWED, LOCKED, PATIENCE_TICKS, TARGETS
 from tests.processes import BOUND_S

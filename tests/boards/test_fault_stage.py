@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 import time
 
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.wake import NextCycle
 from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
-from rack.backplane.lockstep_driver import LockstepDriver
 from rack.backplane.semaphores import clock_semaphore
-from rack.backplane.wake import NextCycle
 from rack.backplane.words import Block, System
 from rack.boards.faults.kinds import NUMBERS
 from rack.boards.faults.stage import FaultStage

@@ -10,9 +10,9 @@ import pytest
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import racks
 from rack.backplane.words import Block, TaskState
+from rack.boards import Rack
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event
-from rack.boards.rack import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import children_of, descriptors, wait_until
 
@@ -49,7 +49,7 @@ def test_a_board_that_leaves_without_a_word_is_no_ready_board(config: MakeConfig
 
 
 def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rack.boards.rack.LAUNCH_S", 2.0)
+    monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
     settings = ("board.watch.executor=wave_levels:Endless",)
     assert refusal(Rack(config(*settings))) == "boards watch: not ready within 2 s"
 

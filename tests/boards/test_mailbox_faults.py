@@ -8,12 +8,11 @@ import pytest
 
 from rack.backplane.layout import PROTOCOLS
 from rack.backplane.words import Block
+from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.events import Event
+from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kinds import KINDS, NUMBERS
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
 from tests.boards.conftest import LOOSE, MakeConfig
 
 KINDS_OF_WRITERS = ("mute", "drop", "delay", "reorder", "corrupt", "babble", "masquerade")

@@ -8,19 +8,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox import Reading
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.mailbox import Reading
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
-from rack.backplane.protocols import open_observer
-from rack.backplane.ring import mailbox_ring
 from rack.backplane.words import Run, System
+from rack.boards import Rack
 from rack.boards.config import load, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
-from rack.boards.events import Event
+from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.operating.command import message_of
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
 from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
@@ -41,7 +40,7 @@ def run(config: RackConfig, seconds: float = SECONDS) -> tuple[Outcome, list[Eve
     with Rack(config) as rack:
         boxes = [box.name for box in rack.segment.layout.mailboxes]
         outcome = rack.run(seconds)
-        return outcome, rack.events, {name: mailbox_ring(rack.segment, name).drain().rows for name in boxes}
+        return outcome, rack.events, {name: MailboxRing(rack.segment, name).drain().rows for name in boxes}
 
 
 def first(rows: np.ndarray, serial: int) -> int:
@@ -129,7 +128,7 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
         message.what, message.goal = Operation.GOTO, Goal.HOME
         OperatorTable(rack.segment).add(Request(hold[RequestWord.MAILBOX], bytes(message.raw), 60))
         assert rack.run(1.0).worked
-        last = mailbox_ring(rack.segment, f"{board}.status").drain().rows["message"][-1]
+        last = MailboxRing(rack.segment, f"{board}.status").drain().rows["message"][-1]
     assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
     assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, Operation.HOLD, 1)
 
@@ -182,7 +181,7 @@ def test_a_command_is_given_only_while_its_client_lives(commanded: Callable[...,
             if is_killed:
                 kill(pid)
             assert rack.run(1.0).worked
-        assert mailbox_ring(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
+        assert MailboxRing(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
 
 
 def test_commands_of_a_program_must_fit_the_rack(commanded: Callable[..., RackConfig]) -> None:

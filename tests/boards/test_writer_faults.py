@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.fault_table import Entry, FaultTable, Injection
 from rack.backplane.layout import PROTOCOLS, Protocol
-from rack.backplane.mailbox import Verdict
+from rack.backplane.mailbox.mailbox import Verdict
 from rack.backplane.process import state_of
+from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.bounds import bound_ticks
 from rack.boards.faults.kinds import KINDS, NUMBERS
 from rack.boards.faults.masquerade import masquerade

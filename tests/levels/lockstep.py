@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
 from rack.levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation

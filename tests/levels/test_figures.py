@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State
 from rack.levels.errors import LevelError
 from rack.levels.figures import FIGURE_PLAN, FIGURE_STATUS, FigureExecutor, FigurePlanner

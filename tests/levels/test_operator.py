@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State, status
 from rack.levels.messages import Verb
 from rack.levels.operator import ANSWER, OPERATOR_COMMAND, Answer, Goal, Operation, Orders, joints_of

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
+from rack.backplane.process import name_process
 from rack.backplane.segment import SHM_FOLDER
-from rack.boards.processor import name_process
 from rack.tools.campaign.leftovers import children, left_behind
 from rack.tools.campaign.load import load
 from tests.processes import FORKS, RACK, forked, runs, wait_until

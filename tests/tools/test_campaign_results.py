@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.events import Event
-from rack.boards.outcome import Cause, Outcome
+from rack.boards.events import Cause, Event, Outcome
 from rack.tools.campaign.ending import Arm, Strike
 from rack.tools.campaign.plan import Plan
 from rack.tools.campaign.results import Faultless, Judged, Results, keep, kept, misses_of

@@ -14,10 +14,10 @@ from rack.backplane.fault_table import Entry, FaultTable, Stage
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, System
+from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.errors import ConfigError
 from rack.boards.faults.kinds import KINDS
-from rack.boards.rack import Rack
 from rack.tools.console.answer import Failure
 from rack.tools.injecting import live
 from rack.tools.injecting.live import LiveRack

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.rack import Rack
 from rack.tools.analysis.report import write_report
 from rack.tools.console.answer import Failure
 from rack.tools.replay import replay

@@ -12,8 +12,8 @@ import numpy as np
 
 from rack.backplane import semaphores
 from rack.backplane.layout import PROTOCOLS, Layout, MailboxSpec, Protocol, TaskSpec
+from rack.backplane.mailbox.protocols import open_reader, open_writer
 from rack.backplane.message import Field, command
-from rack.backplane.protocols import open_reader, open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config.layout import field_specs
 

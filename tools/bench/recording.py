@@ -16,8 +16,8 @@ import numpy as np
 from rack.backplane.process import processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, trace_ring
+from rack.boards import Rack
 from rack.boards.config import RackConfig, load
-from rack.boards.rack import Rack
 from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import table

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rack.boards import Rack
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.operating.command import CommandConfig
-from rack.boards.rack import Rack
 from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress

@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import posix_ipc
 
-from rack.backplane.process import pin
-from rack.boards.processor import die_with_parent, set_priority
+from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.levels.timing.trace_times import Distribution, distribution
 from rack.tools.console.answer import Failure
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.boards.events import Event
 from rack.boards.faults.consequences import consequence
 from rack.boards.faults.kinds import KINDS, NUMBERS, Where

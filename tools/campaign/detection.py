@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.boards.events import Event
 from rack.boards.faults.consequences import consequence
 from rack.boards.faults.kinds import KINDS, NUMBERS

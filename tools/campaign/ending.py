@@ -10,8 +10,8 @@ import numpy as np
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
 from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
-from rack.backplane.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.boards.faults.kinds import KINDS
 from rack.levels.messages import Error

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rack.boards.processor import die_with_parent, name_process
+from rack.backplane.process import die_with_parent, name_process
 
 DISKS = "disks"
 

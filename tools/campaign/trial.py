@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from rack.backplane.errors import BackplaneError
 from rack.backplane.layout import Layout
 from rack.backplane.words import System
+from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import BoardError, ConfigError
-from rack.boards.events import Event
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
+from rack.boards.events import Event, Outcome
 from rack.tools.campaign.ending import Arm, Strike, arm_of, is_late, levels_of, strikes
 from rack.tools.campaign.external import Killer
 from rack.tools.campaign.interrupt import Interrupt

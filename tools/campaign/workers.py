@@ -15,8 +15,8 @@ from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
 from typing import Any
 
+from rack.backplane.process import die_with_parent
 from rack.boards.config.schema import RackConfig
-from rack.boards.processor import die_with_parent
 from rack.tools.campaign.interrupt import Interrupt
 from rack.tools.campaign.plan import Plan
 from rack.tools.campaign.results import Judged, keep

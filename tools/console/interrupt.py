@@ -163,6 +163,6 @@ def _descendants(pid: int, session: int) -> Iterator[int]:
 
 def _remove_racks() -> None:
     # Looked up, not imported: in a handler a module may be half imported. Not loaded, it has made no racks.
-    remove_own = getattr(sys.modules.get("rack.boards.clean"), "remove_own", None)
+    remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own", None)
     if remove_own is not None:
         remove_own()

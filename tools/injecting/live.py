@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
 from rack.boards.config import loads
@@ -21,7 +22,6 @@ from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.hog import run_hog
 from rack.boards.faults.request import injection
 from rack.boards.faults.text import describe, document
-from rack.boards.processor import set_priority
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import table
 

@@ -11,8 +11,8 @@ from typing import Protocol, Self
 
 import numpy as np
 
+from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.process import is_alive
-from rack.backplane.ring import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Run, System
@@ -91,7 +91,7 @@ class Recorder:
         self._files = RunFiles(folder, layout)
         self._spool.resume(self._files.add)
         traces = {task.name: trace_ring(segment, task.name) for task in layout.tasks}
-        mailboxes = {mailbox.name: mailbox_ring(segment, mailbox.name) for mailbox in layout.mailboxes}
+        mailboxes = {mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in layout.mailboxes}
         self._rings = traces | mailboxes
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)

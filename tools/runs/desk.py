@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
-from rack.backplane.protocols import open_observer
-from rack.backplane.ring import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
 from rack.boards.config import loads
@@ -178,7 +178,7 @@ class Replies:
     """Follows a level's statuses, message by message, for their reply to one command."""
 
     def __init__(self, segment: Segment, status: MailboxSpec, reply: Reply) -> None:
-        self._ring = mailbox_ring(segment, status.name)
+        self._ring = MailboxRing(segment, status.name)
         self.reply = reply  # as of the last look
 
     def look(self) -> Reply:

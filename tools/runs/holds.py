@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
-from rack.backplane.protocols import open_observer
-from rack.backplane.ring import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.events import Event
@@ -106,7 +106,7 @@ class Holds:
 
     def _standing(self, level: str, status: Message) -> tuple[int, str]:
         """Return the tick of the command in force, and its text."""
-        rows = mailbox_ring(self._segment, f"{level}.operator").drain().rows
+        rows = MailboxRing(self._segment, f"{level}.operator").drain().rows
         # A newer command that was refused has left it in force.
         mine = [
             row for row in rows if row["message"]["what"] == status.standing and row["message"]["id"] <= status.order

@@ -11,10 +11,9 @@ from typing import Any
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
+from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.events import Event
-from rack.boards.outcome import Outcome
-from rack.boards.rack import Rack
+from rack.boards.events import Event, Outcome
 from rack.tools.campaign.ending import Strike, strikes
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT

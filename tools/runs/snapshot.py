@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import State
-from rack.backplane.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState

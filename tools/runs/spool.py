@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 
 from rack.backplane.layout import Layout
-from rack.backplane.ring import row_dtype
+from rack.backplane.mailbox.history import row_dtype
 from rack.backplane.segment import layout_of
 from rack.backplane.trace import RECORD
 from rack.tools.console.answer import Failure

@@ -77,7 +77,7 @@ class Timelines:
 class RowBlock:
     """Rows of one ring, oldest first, with their times.
 
-    Rows of a mailbox have the fields of `rack.backplane.ring.mailbox_ring`, those of a trace the fields of
+    Rows of a mailbox have the fields of `rack.backplane.mailbox.history.MailboxRing`, those of a trace the fields of
     `rack.backplane.trace.RECORD`.
     """
 

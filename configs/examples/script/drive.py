@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from rack.backplane.protocols import open_observer
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.words import System
 from rack.boards import Rack
 

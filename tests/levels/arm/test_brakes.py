@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, sizes

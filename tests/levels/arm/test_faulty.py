@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import FaultyLink, SimulatedArm
 from rack.levels.level import Fault
 from rack.levels.robot.cell import Cell

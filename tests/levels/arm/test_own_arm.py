@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.boards.config import load, wire
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import solve

@@ -8,8 +8,8 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Fault, Finding
 from rack.levels.messages import JOINT_SET_POINT
 from rack.levels.servo import ServoExecutor, ServoPlanner

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import MAX_CONTACT_PART

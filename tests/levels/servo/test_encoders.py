@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import State
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import SimulatedArm
 from rack.levels.errors import RobotError
 from rack.levels.messages import Error

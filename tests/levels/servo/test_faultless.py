@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import State
+from rack.backplane.watch.alarms import Alarm
 from rack.boards.config import load
 from rack.levels.level import Finding
 from tests.levels.whole_rack import WholeRack

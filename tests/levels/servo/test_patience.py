@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
 from rack.backplane.message import State
+from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.level import Fault
 from rack.levels.messages import Error

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rack.backplane.alarms import Alarm
+from rack.backplane.watch.alarms import Alarm
 from tests.levels.arms import config
 from tests.levels.servo.rig import Course, ServoRig
 

@@ -14,8 +14,8 @@ import pytest
 
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
+from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.rack import Rack
 from rack.tools.command import LiveDesk, goal_of
 from rack.tools.console.answer import Failure
 from rack.tools.runs import desk

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import State
-from rack.backplane.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Run, System
 from rack.boards.config import load, wire

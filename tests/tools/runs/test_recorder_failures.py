@@ -13,9 +13,9 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
+from rack.boards import Rack
 from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
-from rack.boards.rack import Rack
 from rack.tools.analysis.report import write_report
 from rack.tools.console.answer import Failure
 from rack.tools.recorder.recorder import Recorder, SafeSink

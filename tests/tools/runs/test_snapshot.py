@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.fault_table import Entry, FaultTable, Stage
-from rack.backplane.protocols import open_writer
+from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Demand, System
 from rack.boards.config import load, wire

@@ -1,0 +1,158 @@
+"""The system controller's side of the clock: makes the ticks and releases the tasks that are due."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Protocol
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.clock.released_task import ReleasedTask, Watchdog, by_priority
+from rack.backplane.clock.wake import CHECK_S
+from rack.backplane.process import is_alive
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import AlarmWriter
+from rack.backplane.words import Head, Run, System
+
+Ended = Callable[[int], int | None]
+"""Called at every tick; returns the tick at which the run stops, once that is known."""
+
+
+class Controller(Protocol):
+    """The system controller's work at every tick besides releasing tasks."""
+
+    def begin(self, tick: int) -> None:
+        """Do the work due before the tasks of `tick` are released."""
+
+    def released(self, tick: int) -> None:
+        """Do the work due after the release."""
+
+
+class ClockDriver(ABC):
+    """The part common to both modes: the tick, the releases, the end of the run.
+
+    `controller` is set by the clock's board, if it has one. The next `skip` ticks are skipped.
+    """
+
+    def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
+        self.words = segment.words
+        self.tasks = [ReleasedTask(segment, task) for task in by_priority(segment.layout)]
+        self.controller: Controller | None = None
+        self.skip = 0
+        self.alarms = alarms or AlarmWriter(segment, CLOCK)
+        self.watchdog = Watchdog(self.alarms, self.words[System.PERIOD_NS])
+        self._ended = ended
+        self._launcher = self.words[Head.LAUNCHER_PID], self.words[Head.LAUNCHER_START]
+
+    def task(self, name: str) -> ReleasedTask:
+        """Return the task of that name. Raises `KeyError`."""
+        return {task.spec.name: task for task in self.tasks}[name]
+
+    def begin(self, tick: int) -> bool:
+        """Publish `tick` and do the work due before its releases; False when the tick is skipped."""
+        self.words[System.TICK] = tick
+        if self.controller is not None:
+            self.controller.begin(tick)
+        if not self.skip:
+            return True
+        self.skip -= 1
+        self.words[System.CLOCK_SKIPPED] += 1
+        return False
+
+    def release(self, tick: int, last: int) -> None:
+        """Wake every task with a release in (last, tick]."""
+        self.words[System.TICK_NS] = time.monotonic_ns()
+        for task in self.tasks:
+            if task.is_due(tick, last):
+                task.release(tick)
+                if task.missed:
+                    self.watchdog.check(task, tick)
+        if self.controller is not None:
+            self.controller.released(tick)
+
+    @property
+    def first_tick(self) -> int:
+        """First tick to do: 0 for a new clock; a restarted one repeats the last tick.
+
+        No task is released twice for a tick: its deadline shows that it was.
+        """
+        return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
+
+    @abstractmethod
+    def settle(self) -> None:
+        """In lockstep, wait until each task has finished what it was released for, plans too.
+
+        To be called before a change of anything that tasks read at any time rather than as of a tick.
+        """
+
+    @abstractmethod
+    def await_state(self, condition: Callable[[], bool]) -> None:
+        """In lockstep, wait until `condition` holds."""
+
+    @abstractmethod
+    def run(self) -> None:
+        """Make ticks until the run is over or the launcher is gone."""
+
+    def is_over(self, tick: int) -> bool:
+        """Say whether the run ends before `tick`."""
+        words = self.words
+        stop = words[System.STOP_TICK]
+        if words[System.STOP_REQUEST] and (not stop or stop > tick):
+            stop = words[System.STOP_TICK] = max(tick, 1)
+        if not stop and (found := self._ended(tick)) is not None:
+            stop = words[System.STOP_TICK] = max(found, 1)
+        return bool(stop) and tick >= stop
+
+    @property
+    def launcher_is_alive(self) -> bool:
+        """Whether the launcher still lives."""
+        return is_alive(*self._launcher)
+
+    def end(self) -> None:
+        """End the run, and wake every task to see it."""
+        self.words[System.STATE] = Run.STOPPED
+        for task in self.tasks:
+            task.wake()
+
+
+class RealtimeDriver(ClockDriver):
+    """The clock in real time, on an absolute grid of CLOCK_MONOTONIC. A late clock skips ticks and counts them."""
+
+    def run(self) -> None:
+        """Make ticks until the run is over or the launcher is gone."""
+        words = self.words
+        period, epoch = words[System.PERIOD_NS], words[System.EPOCH_NS]
+        beat = max(1, int(CHECK_S * 1e9) // period)
+        last = self.first_tick - 1
+        # The grid begins a little after the clock's start, so that tick 0 has its grid point too.
+        tick = self._sleep_until_next(last, epoch, period)
+        words[System.STATE] = Run.RUNNING
+        while not self.is_over(tick):
+            if self.begin(tick):
+                self.release(tick, last)
+                if tick // beat != last // beat and not self.launcher_is_alive:
+                    break
+                last = tick
+            tick = self._sleep_until_next(tick, epoch, period)
+        self.end()
+
+    def settle(self) -> None:
+        """Do not wait: in real time a change meets a task wherever it is."""
+
+    def await_state(self, condition: Callable[[], bool]) -> None:
+        """Do not wait: time does not."""
+
+    def _sleep_until_next(self, tick: int, epoch: int, period: int) -> int:
+        """Sleep to the next grid point; return the newest tick of the run that has come by then, or the one after."""
+        wait = epoch + (tick + 1) * period - time.monotonic_ns()
+        if wait > 0:
+            time.sleep(wait * 1e-9)
+        now = (time.monotonic_ns() - epoch) // period
+        if stop := self.words[System.STOP_TICK]:
+            # Even a late clock makes the run's last tick: tasks that are late for it are seen.
+            now = min(now, stop - 1)
+        # Never early: the wait may end a rounding error before its grid point.
+        next_tick = max(tick + 1, now)
+        self.words[System.CLOCK_SKIPPED] += next_tick - tick - 1
+        return next_tick

@@ -1,0 +1,87 @@
+"""The messages of a mailbox as the host side reads them: in blocks, and as the digest of a run.
+
+The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time. Each message carries
+the running hash of its mailbox, so the digest is complete even if a recorder lost rows, and a restarted writer
+continues it. Messages that become visible after the last tick do not count: whether they were finished in time is no
+part of the motion.
+"""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+from zlib import crc32
+
+import numpy as np
+
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.slots import CRC_FROM, EPOCH_MASK, Slots, epoch_of, message_dtype
+from rack.backplane.ring import Drained, Ring
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box, Slot, System
+
+
+class MailboxRing(Ring):
+    """The messages of a mailbox as a ring: fields of `words.Slot` in lower case, then `message`.
+
+    It leaves out what every reader rejects: lost and damaged messages, and those of an intruder.
+    """
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        spec = segment.layout.mailbox(name)
+        address, self._stride = segment.map.mailboxes[name], slot_stride(spec)
+        self._box = segment.words[address // 8 : address // 8 + len(Box)]
+        memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
+        super().__init__(memory, row_dtype(spec), self._box[Box.HEAD : Box.HEAD + 1])
+        self._covered = slice(CRC_FROM, SLOT_HEAD_SIZE + spec.size)
+
+    def drain(self) -> Drained:
+        """Take every good message written since the last call."""
+        rows, lost = super().drain()
+        if not len(rows):
+            return Drained(rows, lost)
+        serials = np.arange(self._taken - len(rows), self._taken) + 1
+        holder, signatures = self._box[Box.CLAIMANT], rows["epoch"]
+        lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < epoch_of(holder))
+        if not lawful[-1]:
+            # The writer does not know of this message, and will write its own in that place.
+            self._taken -= 1
+        covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
+        crcs = (crc32(part.tobytes()) for part in covered)
+        good = lawful & (np.fromiter(crcs, np.int64, len(rows)) == rows["crc"]) & (rows["serial"] == serials)
+        return Drained(rows if good.all() else rows[good], lost)
+
+
+def row_dtype(spec: MailboxSpec) -> np.dtype:
+    """Return the type of one row of a mailbox's ring, padding included."""
+    return np.dtype(
+        {
+            "names": [word.name.lower() for word in Slot] + ["message"],
+            "formats": ["i8"] * len(Slot) + [message_dtype(spec.fields, spec.size)],
+            "offsets": [8 * word for word in Slot] + [8 * len(Slot)],
+            "itemsize": slot_stride(spec),
+        }
+    )
+
+
+def chains(segment: Segment, until: int) -> dict[str, tuple[int, bytes]]:
+    """Return serial and running hash of every mailbox's newest message that was visible before tick `until`."""
+    found = {}
+    for spec in segment.layout.mailboxes:
+        slots = Slots(segment, spec)
+        serial = head = slots.box[Box.HEAD]
+        oldest = max(0, head - slots.depth)
+        # A lost, damaged or forged message has no valid hash: the one before it has.
+        while serial > oldest and not (slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)):
+            serial -= 1
+        found[spec.name] = (serial, slots.chain if serial > oldest else bytes(8))
+    return found
+
+
+def digest(segment: Segment, until: int | None = None) -> str:
+    """Return the run's digest, 32 hexadecimal digits, up to tick `until` (default: where it stopped)."""
+    stop = segment.words[System.STOP_TICK] if until is None else until
+    total = blake2b(digest_size=16)
+    for name, (serial, chain) in sorted(chains(segment, stop).items()):
+        total.update(f"{name} {serial} ".encode() + chain)
+    return total.hexdigest()

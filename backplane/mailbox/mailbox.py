@@ -1,0 +1,279 @@
+"""Mailboxes under logical execution time: one writer, many readers.
+
+The writer fills `writer.message` and calls `write(tick)`. A reader calls `read(tick)` and gets a `Reading`: message and
+verdict. `tick` is the release tick of the calling cycle. A message written in the cycle released at tick T becomes
+visible at T + delay, the end of that cycle, however early it was written. Reads therefore depend on ticks alone.
+
+Alternatives considered: a sequence lock (a writer killed inside a write leaves its readers spinning for ever), a kernel
+lock (the paper's, 3 to 4 times the cost: protocol `lock`), the newest whole message (not a function of ticks alone:
+protocol `double-buffer`). For the memory order that readers rely on see `slots`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import MailboxError
+from rack.backplane.mailbox.slots import Slots, claim, pid_of
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box
+
+NOT_YET = 1 << 62
+"""Tick of the newest message before there is one: its age is negative, so it is never too old."""
+MAX_STEP_BACK = 4
+"""Messages that a read tries before a bad one, so that its work stays bounded."""
+
+
+class Verdict(IntEnum):
+    """Result of a read."""
+
+    NONE = 0  # no message has come yet
+    OLD = 1  # the same message as in an earlier read
+    NEW = 2  # a message not read before
+    BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one
+
+
+class Reading(NamedTuple):
+    """A message, all zero before the first one, and the verdict of the read.
+
+    `is_lost`: its writer is dead, hangs, or has been silent for too long for its period. `earlier`: in a mailbox where
+    every message counts, the unread ones before this one, oldest first.
+    """
+
+    value: Message
+    verdict: Verdict
+    is_lost: bool = False
+    earlier: tuple[Message, ...] = ()
+
+    @property
+    def is_new(self) -> bool:
+        """Whether this is the first cycle that reads the message."""
+        return self.verdict is Verdict.NEW
+
+    @property
+    def is_there(self) -> bool:
+        """Whether any message has come yet."""
+        return self.verdict is not Verdict.NONE
+
+
+class Writer:
+    """The one writer of a mailbox, under protocol time-slice.
+
+    Opening claims the mailbox: a second writer is refused with `MailboxError` while the process of the first one lives.
+    A new writer continues after the last whole message, in a new epoch.
+    """
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        self.spec = spec = segment.layout.mailbox(name)
+        self._slots = Slots(segment, spec)
+        self.message = self._slots.message
+        self.bus_errors = 0
+        self.held_up = 0
+        """Accesses so far for which a dead or stopped process held the lock."""
+        self.intruder = 0
+        """Another process that has published since this writer's last message but one; 0: none."""
+        self._claim = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.CLAIM)
+        if not self._claim.take():
+            pid = self._slots.box[Box.WRITER_PID]
+            self._claim.close()
+            raise MailboxError(f"mailbox '{name}' has a writer already, process {pid}; permitted: one")
+        box = self._slots.box
+        box[Box.WRITER_PID] = os.getpid()
+        box[Box.EPOCH] += 1
+        # One store: no reader sees half a claim.
+        box[Box.CLAIMANT] = claim(box[Box.EPOCH], os.getpid())
+        self._slots.resume(box[Box.CLAIMANT])
+
+    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
+        """Publish `message`, released at `tick`; return False when it is too late.
+
+        It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes visible at the next
+        boundary of the writer's period.
+        """
+        written = self.publish(tick, self.visible_at(tick, now), tick if basis is None else basis)
+        return written and (now is None or now < tick + self.spec.delay)
+
+    def visible_at(self, tick: int, now: int | None) -> int:
+        """Return the tick from which a message released at `tick` and written now is visible."""
+        in_time = tick + self.spec.delay
+        if now is None or now < in_time:
+            return in_time
+        every = self.spec.every
+        return (now // every + 1) * every
+
+    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+        """Publish `message`, visible at that tick; return False when its bound cut it off.
+
+        `damage`: see `Slots.publish`.
+        """
+        self.intruder = self._slots.publish(tick, visible_at, basis, damage)
+        return True
+
+    def lose(self) -> None:
+        """Take a serial whose message is lost."""
+        self._slots.lose()
+
+    @property
+    def serial(self) -> int:
+        """Serial of the newest message written."""
+        return self._slots.serial
+
+    def close(self) -> None:
+        """Give the claim back."""
+        self._claim.close()
+
+
+class ReadStatistics:
+    """Counts of one reader's reads so far."""
+
+    __slots__ = ("accesses", "bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up", "transfers")
+
+    def __init__(self) -> None:
+        self.accesses = 0
+        self.transfers = 0  # messages copied
+        self.bad_reads = 0  # with any of the following: one number to compare
+        self.bus_errors = 0  # accesses that their bound cut off
+        self.corrupt = 0  # messages that failed their CRC
+        self.forged = 0  # messages of a process that does not hold the claim
+        self.forger = 0  # the last such process
+        self.held_up = 0  # accesses for which a dead or stopped process held the lock
+
+
+class Reader:
+    """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the mailbox's depth."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        self.spec = segment.layout.mailbox(name)
+        self.slots = self._fetched = Slots(segment, self.spec)
+        self._box = self._fetched.box
+        # The last good message has its own buffer: a corrupt copy never reaches it.
+        self._good = Slots(segment, self.spec)
+        self.message = self._good.message
+        self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
+        self._serial = 0
+        self._signature = 0
+        self.found = 0
+        """Serial of the newest message that the last read has found, good or not."""
+        self.newest = NOT_YET
+        """Release tick of the last good message."""
+        self.statistics = ReadStatistics()
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message visible at `tick`, with its verdict."""
+        self.statistics.accesses += 1
+        head = self._box[0]
+        self.found = serial = self._newest_visible(head, tick)
+        if serial == self._serial:
+            return self._readings[Verdict.OLD if serial else Verdict.NONE]
+        return self._take(serial, tick)
+
+    def _newest_visible(self, head: int, tick: int) -> int:
+        """Return the newest serial visible at `tick`; stop at the last one read."""
+        visible_at = self._fetched.visible_at
+        # Older messages are overwritten: a serial beyond the slots fails when it is taken.
+        oldest, serial = max(self._serial, head - self._fetched.depth), head
+        while serial > oldest and visible_at(serial) > tick:
+            serial -= 1
+        return serial
+
+    def _take(self, serial: int, tick: int) -> Reading:
+        if self._obtain(serial):
+            return self._readings[Verdict.NEW]
+        # The reader came too late: the slot is being overwritten.
+        if not self._fetched.keeps(serial):
+            return self._cut_off()
+        self.statistics.bad_reads += 1
+        self._blame(serial)
+        return self._step_back(serial, tick)
+
+    def _step_back(self, serial: int, tick: int) -> Reading:
+        """Take the newest good message before a lost, damaged or forged one, if it is unread."""
+        fetched, tries = self._fetched, MAX_STEP_BACK
+        for older in range(serial - 1, max(self._serial, serial - fetched.depth), -1):
+            if fetched.holds(older) and fetched.visible_at(older) <= tick:
+                if self._obtain(older):
+                    return self._readings[Verdict.NEW]
+                self._blame(older)
+                tries -= 1
+                if not tries:
+                    break
+        return self._readings[Verdict.OLD if self._serial else Verdict.NONE]
+
+    def _obtain(self, serial: int) -> bool:
+        """Take a message over as the last good one; False when it is not good."""
+        self.statistics.transfers += 1
+        fetched = self._fetched
+        if not fetched.fetch(serial) or not (
+            fetched.signature == self._signature or fetched.is_lawful(self._signature)
+        ):
+            return False
+        self._good.record[:] = fetched.record
+        self._serial, self._signature, self.newest = serial, fetched.signature, fetched.tick
+        return True
+
+    def _blame(self, serial: int) -> None:
+        """Count the fault of the message fetched last. Another message in its place is a loss: not counted."""
+        fetched = self._fetched
+        if not fetched.keeps(serial):
+            return
+        if not fetched.is_sound:
+            # Serial 0: an empty slot, as at the start.
+            self.statistics.corrupt += fetched.serial != 0
+        elif fetched.serial == serial:
+            self.statistics.forged += 1
+            self.statistics.forger = pid_of(fetched.signature)
+
+    def _cut_off(self) -> Reading:
+        self.statistics.bus_errors += 1
+        self.statistics.bad_reads += 1
+        return self._readings[Verdict.BUS_ERROR if self._serial else Verdict.NONE]
+
+    @property
+    def serial(self) -> int:
+        """Serial of the last good message; 0: none."""
+        return self._serial
+
+    @property
+    def basis(self) -> int:
+        """Tick of the oldest information that the last good message rests on."""
+        return self._good.basis
+
+    @property
+    def chain(self) -> bytes:
+        """Running hash up to the last good message."""
+        return self._good.chain
+
+    def peek(self) -> Reading:
+        """Return the newest whole message at once, under any protocol: for the host side."""
+        return self._newest()
+
+    def _newest(self) -> Reading:
+        self.found = head = self._box[0]
+        if head == self._serial:
+            return self._readings[Verdict.OLD if head else Verdict.NONE]
+        return self._take(head, NOT_YET)
+
+
+class DoubleBufferWriter(Writer):
+    """A writer under protocol double-buffer: its message is visible as soon as it is whole."""
+
+    def visible_at(self, tick: int, now: int | None) -> int:
+        """Return the tick at which the message is written: it is visible at once."""
+        return tick if now is None else now
+
+
+class DoubleBufferReader(Reader):
+    """A reader under protocol double-buffer (section 3.3 of the paper): gets the newest whole message.
+
+    It reacts faster than time-slice; in real time it no longer depends on ticks alone.
+    """
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest whole message, with its verdict."""
+        self.statistics.accesses += 1
+        return self._newest()

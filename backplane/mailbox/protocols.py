@@ -1,0 +1,145 @@
+"""The mailbox protocols by name, and protocol lock: the paper's `lock; read; unlock`, made safe against dead holders.
+
+A semaphore whose holder was killed stays down for ever, and does not show who held it. So processes wait on the
+semaphore, within a bound, but the critical section belongs to the one that holds the kernel's lock on the mailbox,
+which ends with its process. An access cut off by its bound is a bus error: a verdict, never a hang.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.layout import Protocol
+from rack.backplane.mailbox.mailbox import DoubleBufferReader, DoubleBufferWriter, Reader, Reading, Writer
+from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import lock_semaphore
+from rack.backplane.words import Box
+
+LOCK_WAIT_S = 0.002
+"""Bound of one wait: an access takes a microsecond or two, a preempted holder some hundred."""
+
+
+_OWNER = int(Box.OWNER)
+
+
+class MailboxLock:
+    """Mutual exclusion on one mailbox, with a bounded wait.
+
+    `held_up` counts the waits that ran out while a dead or stopped process held the lock: a fault, unlike a holder that
+    has lost its core.
+    """
+
+    def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
+        address = segment.map.mailboxes[name]
+        self._semaphore = lock_semaphore(segment.rack, name)
+        self._owner = ByteLock(segment, address + 8 * Box.OWNER)
+        self._box = segment.words[address // 8 : address // 8 + len(Box)]
+        self._pid = os.getpid()
+        self._wait_s = wait_s
+        self.held_up = 0
+
+    def acquire(self) -> bool:
+        """Take the lock within its bound; False when a living holder keeps it."""
+        if not self._semaphore.acquire(self._wait_s):
+            self._check_holder()
+        # After a wait that ran out, the kernel's lock is free if the semaphore's holder is dead; one of several waiters
+        # gets it. After a successful wait it may be taken: such a waiter came between the two steps and is the owner.
+        if not self._owner.take():
+            return False
+        self._box[_OWNER] = self._pid
+        return True
+
+    def _check_holder(self) -> None:
+        holder = self._box[_OWNER]
+        # It may have released the lock, and ended, since.
+        if holder and state_of(holder) in GONE + STOPPED and self._box[_OWNER] == holder:
+            self.held_up += 1
+
+    def release(self) -> None:
+        """Release the lock. Only its owner may."""
+        self._box[_OWNER] = 0
+        self._owner.give_back()
+        self._semaphore.release()
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        self._owner.close()
+
+
+class LockWriter(DoubleBufferWriter):
+    """A writer that publishes inside the critical section."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        super().__init__(segment, name)
+        self.lock = MailboxLock(segment, name)
+
+    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+        """Publish `message`; return False when the lock's bound cut it off."""
+        obtained = self.lock.acquire()
+        self.held_up = self.lock.held_up
+        if not obtained:
+            self.bus_errors += 1
+            return False
+        try:
+            return super().publish(tick, visible_at, basis, damage)
+        finally:
+            self.lock.release()
+
+    def close(self) -> None:
+        """Give the claim back."""
+        self.lock.close()
+        super().close()
+
+
+class LockReader(Reader):
+    """A reader that copies inside the critical section."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        super().__init__(segment, name)
+        self.lock = MailboxLock(segment, name)
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message; BUS_ERROR with the last good one when the wait ran out."""
+        statistics = self.statistics
+        statistics.accesses += 1
+        obtained = self.lock.acquire()
+        if statistics.held_up != self.lock.held_up:
+            statistics.held_up = self.lock.held_up
+            statistics.bad_reads += 1
+        if not obtained:
+            return self._cut_off()
+        try:
+            return self._newest()
+        finally:
+            self.lock.release()
+
+
+WRITERS: dict[Protocol, type[Writer]] = {
+    "time-slice": Writer,
+    "double-buffer": DoubleBufferWriter,
+    "lock": LockWriter,
+}
+READERS: dict[Protocol, type[Reader]] = {
+    "time-slice": Reader,
+    "double-buffer": DoubleBufferReader,
+    "lock": LockReader,
+}
+
+
+def open_writer(segment: Segment, name: str) -> Writer:
+    """Claim a mailbox for writing under its protocol. Raises `MailboxError` when it has a writer."""
+    return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
+
+
+def open_reader(segment: Segment, name: str) -> Reader:
+    """Open a mailbox for reading under its protocol."""
+    return READERS[segment.layout.mailbox(name).protocol](segment, name)
+
+
+def open_observer(segment: Segment, name: str) -> Reader:
+    """Open a mailbox for reading that never takes its lock: for the clock and the host side."""
+    is_locked = segment.layout.mailbox(name).protocol == "lock"
+    return DoubleBufferReader(segment, name) if is_locked else open_reader(segment, name)

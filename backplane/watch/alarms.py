@@ -1,0 +1,141 @@
+"""Alarm rings: a task or the clock reports what it has found wrong. One fixed record an alarm, never a wait.
+
+An alarm is rung once an episode: when a condition is found, not in every cycle that it lasts.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from os import eventfd_write
+from time import monotonic_ns
+
+import numpy as np
+
+from rack.backplane.address_map import ALARM_DEPTH, ALARM_RECORD_SIZE, LINE
+from rack.backplane.ring import Ring
+from rack.backplane.segment import Segment
+
+RECORD = np.dtype(
+    [
+        ("tick", "i8"),  # release, in ticks, of the cycle that found it; the clock's: its tick
+        ("time_ns", "i8"),  # CLOCK_MONOTONIC
+        ("code", "i8"),  # Alarm
+        ("subject", "i8"),  # see Alarm; -1: none
+        ("value", "f8"),  # the measured value, see Alarm
+        ("since", "i8"),  # tick since which the condition holds; `tick` if not known
+        ("spare0", "i8"),
+        ("spare1", "i8"),
+    ]
+)
+
+
+class Alarm(IntEnum):
+    """Kinds of alarms. In brackets: subject; value."""
+
+    # Rung by the clock: faults, losses and demands.
+    FAULT_BEGINS = 1  # [entry of the fault table; -]
+    FAULT_ENDS = 2  # [entry; times it acted]
+    HANG = 3  # [task; releases missed]
+    REJOINED = 4  # [task, -1: the clock itself; ticks it was away]
+    DEMAND = 5  # [task whose loss demands it, -1: the emergency stop or nobody; Demand]
+    COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was given
+    # Rung by the clock: tasks that miss their cycles.
+    LATE = 10  # [task; releases missed]  an executor has not finished before its next release
+    PLAN_LATE = 11  # [task; releases missed]  a plan has not finished within its cycles (eq. 3.8)
+    STARVED = 12  # [task; releases missed]  a task that could run does not get its core
+    # Rung by readers: mailboxes.
+    STALE = 20  # [mailbox; age, ticks]  its writer is dead or stopped
+    MUTE = 21  # [mailbox; age, ticks]  its writer is running but not writing
+    GAP = 22  # [mailbox; serials missing]
+    HELD_BACK = 23  # [mailbox; ticks]  a message came after the end of its cycle
+    DISORDER = 24  # [mailbox; ticks]  a later serial has an earlier tick
+    DAMAGED = 25  # [mailbox; -]  a message failed its CRC
+    BABBLE = 26  # [mailbox; serials a cycle]
+    MASQUERADE = 27  # [mailbox; process id that the message names]  not from the writer that holds the claim
+    LOCKED = 28  # [mailbox; -]  a dead or stopped process holds the lock
+    # Rung by tasks: the clock.
+    CLOCK_STOPPED = 30  # [process id of that clock; ticks]
+    CLOCK_SKIPPED = 31  # [-1; ticks skipped]
+    CLOCK_LATE = 32  # [-1; lateness, ns]
+    # Rung by the servo level: the arm.
+    SENSOR_RANGE = 40  # [joint; value]  NaN, or beyond the joint's range
+    SENSOR_STUCK = 41  # [joint; cycles]  no change while the arm is driven
+    SENSOR_SILENT = 42  # [-1; age, ticks]  no new sample
+    SENSOR_MODEL = 43  # [joint; residual]  the sensed position disagrees with the model's motion
+    ACTUATOR = 44  # [joint; residual]  the arm does not follow its torques
+    COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is not a number
+    COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond its limit was cut
+    BRAKES_CLOSED = 47  # [-1; ticks without torque, 0: demanded]
+    BRAKES_OPENED = 48  # [-1; ticks they were engaged]
+    RE_REFERENCED = 49  # [joint; rad]  its sensor is trusted again; distance from its estimate
+    COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
+    LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
+
+
+MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
+"""Alarms of missed cycles: counted, and no reason to act. All others are faults or reactions."""
+
+
+class AlarmWriter:
+    """The writing end of an alarm ring: a task's, or the clock's ("clock").
+
+    `attention` is an eventfd that wakes the Rack; None: nobody is woken.
+    """
+
+    def __init__(self, segment: Segment, task: str, attention: int | None = None) -> None:
+        address = segment.map.alarms[task]
+        self._head = segment.words[address // 8 : address // 8 + 1]
+        first = address + LINE
+        self._slots = np.frombuffer(segment.view(first, ALARM_DEPTH * ALARM_RECORD_SIZE), dtype=RECORD)
+        self._attention = attention
+
+    def ring(self, tick: int, code: Alarm, subject: int = -1, value: float = 0.0, since: int | None = None) -> None:
+        """Append an alarm, and wake the Rack if the alarm asks for action."""
+        count = self._head[0] + 1
+        found = tick if since is None else since
+        self._slots[count % ALARM_DEPTH] = (tick, monotonic_ns(), code, subject, value, found, 0, 0)
+        self._head[0] = count
+        if self._attention is not None and code not in MISSES:
+            # This never waits: an eventfd counts further than any run can ring.
+            eventfd_write(self._attention, 1)
+
+
+def alarm_ring(segment: Segment, task: str) -> Ring:
+    """Return the reading end of an alarm ring; its rows are of dtype `RECORD`."""
+    address = segment.map.alarms[task]
+    head = segment.words[address // 8 : address // 8 + 1]
+    return Ring(segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE), RECORD, head)
+
+
+CLEAN_READS = 20
+"""Accesses, and cycles of the writer, without a finding before the next one begins a new episode."""
+
+
+class Episodes:
+    """Alarms about one mailbox, rung once an episode, however long a fault lasts.
+
+    Keeps each finding with the access and the tick at which it was last made.
+    """
+
+    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
+        self._subject = [spec.name for spec in segment.layout.mailboxes].index(name)
+        self._clean_ticks = CLEAN_READS * segment.layout.mailbox(name).every
+        self._alarms = alarms
+        self._last: dict[Alarm, tuple[int, int]] = {}
+
+    def find(self, code: Alarm, access: int, tick: int, value: float = 0.0, since: int | None = None) -> None:
+        """Note a finding in an access, counted by the caller; ring if it begins an episode."""
+        if not self.is_open(code, access, tick):
+            self.ring(code, tick, value, since)
+        self._last[code] = access, tick
+
+    def ring(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
+        """Ring at once, when the caller knows that an episode begins."""
+        self._alarms.ring(tick, code, self._subject, value, since)
+
+    def is_open(self, code: Alarm, access: int, tick: int) -> bool:
+        """Say whether an episode still lasts."""
+        if code not in self._last:
+            return False
+        last_access, last_tick = self._last[code]
+        return access - last_access <= CLEAN_READS or tick - last_tick <= self._clean_ticks

@@ -1,0 +1,106 @@
+"""Checks on a silent mailbox: its writer is lost, mute, or only late.
+
+Executors write in every cycle, so the age of their messages has a limit; plans have none. Silence alone is a reason to
+hold (`is_lost`) but does not prove a fault. For an alarm the writer must be dead or stopped, or must have finished
+cycles for which no message came.
+"""
+
+from __future__ import annotations
+
+from rack.backplane.mailbox.mailbox import NOT_YET, Reader
+from rack.backplane.mailbox.slots import pid_of
+from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.trace import CycleRecord
+from rack.backplane.watch.alarms import Alarm, Episodes
+from rack.backplane.words import Block, Box
+
+MUTE_CYCLES = 3
+"""Age in cycles of the writer from which silence is investigated; two are normal."""
+STALE_CYCLES = 4
+LONG_AGO = -(1 << 62)
+_LOST, _CLAIMANT = int(Block.LOST), int(Box.CLAIMANT)
+
+
+class ReadingTask:
+    """The task that reads: the tick since which it has read without a pause, and which writers are dead or stopped."""
+
+    def __init__(self) -> None:
+        self.since = 0
+        self._last = LONG_AGO
+        self._step = NOT_YET
+        self._asked_at = -1
+        self._gone: dict[int, bool] = {}
+
+    def reads(self, tick: int) -> None:
+        """Note a read. After a pause of this task or of the clock, all messages are old but no writer is silent."""
+        step = tick - self._last
+        if step != self._step:
+            if step > self._step:
+                self.since = tick
+            elif self._last != LONG_AGO:
+                self._step = step
+        self._last = tick
+
+    def is_gone(self, pid: int, tick: int) -> bool:
+        """Say whether a process is dead or stopped. The kernel is asked once a cycle for each process."""
+        if tick != self._asked_at:
+            self._asked_at = tick
+            self._gone.clear()
+        if pid not in self._gone:
+            self._gone[pid] = state_of(pid) in GONE + STOPPED
+        return self._gone[pid]
+
+
+class SilenceWatch:
+    """Judges the silence of one mailbox for one reader. `quiet` is the age in ticks from which it must be asked."""
+
+    def __init__(self, segment: Segment, reader: Reader, episodes: Episodes, task: ReadingTask) -> None:
+        spec = reader.spec
+        is_periodic = segment.layout.task(spec.writer).role == "executor"
+        self.quiet = MUTE_CYCLES * spec.every if is_periodic else NOT_YET
+        self._lost_after = self.quiet + spec.delay
+        self._stale_after = STALE_CYCLES * spec.every
+        self._reader, self._episodes, self._task = reader, episodes, task
+        self._slots = reader.slots
+        self._cycles = CycleRecord(segment, spec.writer)
+        self._block = segment.block(spec.writer)
+        self._reported: dict[Alarm, int] = {}
+
+    def is_lost(self, tick: int) -> bool:
+        """Say whether the writer is lost or has been silent for too long; ring an alarm if the cause is proven."""
+        newest = self._reader.newest
+        age = tick - newest
+        if age >= self.quiet:
+            self._investigate(tick, age)
+            if tick - max(newest, self._task.since) >= self._lost_after:
+                return True
+        # From the tick after the loss: within that tick the answer would depend on which process is faster.
+        return newest != NOT_YET and 0 < self._block[_LOST] <= tick
+
+    def _investigate(self, tick: int, age: int) -> None:
+        pid = pid_of(self._slots.box[_CLAIMANT])
+        # The loss may be marked already, and a new process may exist that does not cycle yet.
+        if age >= self._stale_after and (self._block[_LOST] or self._task.is_gone(pid, tick)):
+            self._report(Alarm.STALE, tick, age)
+        elif self._is_mute(tick):
+            self._report(Alarm.MUTE, tick, age)
+
+    def _is_mute(self, tick: int) -> bool:
+        """Say whether the writer has finished a release, and the newest message is of an earlier one."""
+        accesses = self._reader.statistics.accesses
+        if any(self._episodes.is_open(code, accesses, tick) for code in (Alarm.HELD_BACK, Alarm.DISORDER)):
+            # Messages come, but late.
+            return False
+        # In this order: a writer publishes before it reports the cycle as finished.
+        finished, slots = self._cycles.finished, self._slots
+        head = slots.box[0]
+        # A serial without a message was lost on the way, not suppressed.
+        return slots.copy(head) and slots.serial == head and slots.tick < finished
+
+    def _report(self, code: Alarm, tick: int, age: int) -> None:
+        """Ring once for each last message: the next good message ends the episode."""
+        serial = self._reader.serial
+        if self._reported.get(code) != serial:
+            self._reported[code] = serial
+            self._episodes.ring(code, tick, age, tick - age + self._reader.spec.every)

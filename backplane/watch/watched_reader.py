@@ -1,0 +1,85 @@
+"""Readers that watch their mailbox: every read also checks the messages that came, and those that did not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.mailbox.protocols import open_reader
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import AlarmWriter, Episodes
+from rack.backplane.watch.message_watch import MessageWatch, ReadFindings
+from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
+from rack.backplane.words import Block
+
+_LOST = int(Block.LOST)
+
+
+def watched(segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> WatchedReader | SporadicReader:
+    """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have no period."""
+    if segment.layout.mailbox(name).writer == CLOCK:
+        return SporadicReader(segment, name, alarms)
+    return WatchedReader(segment, name, alarms, task)
+
+
+class WatchedReader:
+    """Reads a mailbox for a task and rings the task's alarms about it. A clean read costs three comparisons more."""
+
+    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> None:
+        self.reader = reader = open_reader(segment, name)
+        episodes = Episodes(segment, name, alarms)
+        self._messages = MessageWatch(segment, reader, episodes)
+        self._silence = SilenceWatch(segment, reader, episodes, task)
+        self._quiet = self._silence.quiet
+        self._writer = segment.block(reader.spec.writer)
+        self._statistics = reader.statistics
+        self._bad_reads = 0
+        self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message visible at `tick`, with its verdict, and whether its writer is lost."""
+        reader = self.reader
+        reading = reader.read(tick)
+        if reader.found > self._messages.seen or self._statistics.bad_reads != self._bad_reads:
+            self._bad_reads = self._statistics.bad_reads
+            self._messages.judge(tick)
+        if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(tick):
+            return self._lost[reading.verdict]
+        return reading
+
+
+class SporadicReader:
+    """Reads an operator's mailbox: silence there proves nothing, but messages must be whole, and the clock's.
+
+    A command may leave part of an earlier one in force, so none is left out: the newest comes with the unread ones
+    before it. The first read gives all that the slots hold, for a restarted board must know them.
+    """
+
+    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
+        self.reader = open_reader(segment, name)
+        self._slots = Slots(segment, self.reader.spec)
+        self._findings = ReadFindings(self.reader, Episodes(segment, name, alarms))
+        self._bad_reads = 0
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message visible at `tick`, with its verdict, and the unread ones before it."""
+        before = self.reader.serial
+        reading = self.reader.read(tick)
+        if self.reader.statistics.bad_reads != self._bad_reads:
+            self._bad_reads = self.reader.statistics.bad_reads
+            self._findings.report(tick)
+        if self.reader.serial > before + 1:
+            return reading._replace(earlier=tuple(self._between(before, self.reader.serial)))
+        return reading
+
+    def _between(self, before: int, newest: int) -> Iterator[Message]:
+        """Yield a copy of each good message between two serials, as far as the slots reach back."""
+        slots = self._slots
+        for serial in range(max(before + 1, newest - slots.mask), newest):
+            if slots.fetch(serial) and slots.is_lawful(0):
+                message = Message(slots.dtype)
+                message.copy_from(slots.message)
+                yield message

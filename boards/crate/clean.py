@@ -1,0 +1,75 @@
+"""Removal of what killed racks have left behind; a rack in use is never removed."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+
+from rack.backplane import semaphores
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import Segment, racks, stranger, unlink
+from rack.backplane.words import Head
+
+
+def remove_dead(rack: str) -> bool:
+    """Remove the segment of a rack that is not running; return whether there was one.
+
+    Raises `SegmentError` when its launcher lives, or it is another user's, or not a file.
+    """
+    if rack not in racks():
+        return False
+    try:
+        segment = Segment.open(rack)
+    except SegmentError:
+        if stranger(rack) is not None:
+            raise
+        # Too small for a head: no process can be running it.
+        unlink(rack)
+        return True
+    try:
+        return _remove(segment)
+    finally:
+        segment.close()
+
+
+def _remove(segment: Segment) -> bool:
+    rack = segment.rack
+    if segment.launcher_is_alive:
+        raise SegmentError(
+            f"rack '{rack}' is already running, launched by process {segment.launcher}; stop it, or choose another name"
+        )
+    removal = ByteLock(segment, 8 * Head.MAGIC)
+    try:
+        # If two programs find the same dead rack, one removes it. Without this the slower one would remove the rack
+        # that the faster one has launched under the name since.
+        if not removal.take() or not segment.has_its_name:
+            return False
+        semaphores.unlink_all(rack)
+        unlink(rack)
+        return True
+    finally:
+        removal.close()
+
+
+def remove_own(rack: str | None = None) -> None:
+    """Remove the racks that this process has launched, or one of them, in any state."""
+    for name in racks() if rack is None else [rack]:
+        with suppress(SegmentError):
+            segment = Segment.open(name)
+            if segment.launcher_is_alive and segment.launcher == os.getpid():
+                semaphores.unlink_all(name)
+                unlink(name)
+            segment.close()
+
+
+def clean() -> tuple[list[str], list[str], list[str]]:
+    """Remove every rack that is not running; return names removed, names in use, and a line for each foreign entry."""
+    removed, in_use, strange = [], [], []
+    for rack in racks():
+        try:
+            if remove_dead(rack):
+                removed.append(rack)
+        except SegmentError as error:
+            strange.append(str(error)) if stranger(rack) is not None else in_use.append(rack)
+    return removed, in_use, strange

@@ -1,0 +1,160 @@
+"""The crate: one small process that imports what the boards need, then forks every board from itself.
+
+Importing numpy, MuJoCo and the planning libraries takes a second; forked boards share it. The crate stays
+single-threaded, so that forking is safe at any time, and it is the boards' parent: it reaps them, and the
+kernel kills them if it ends. Started by the Rack as `python -m rack.boards.crate.crate LINE ATTENTION`: descriptors of
+the line and of the eventfd that boards write to.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+
+from rack.backplane import semaphores
+from rack.backplane.lines import UtilityLines
+from rack.backplane.process import set_priority
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System, TaskState
+from rack.boards.crate.line import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload, received
+from rack.boards.faults.hog import hog
+from rack.boards.run.board import enter, run_clock_board, run_task_board
+from rack.boards.wiring import ClockWiring, TaskWiring
+
+LEAVE_S = 0.5
+"""Time for boards to end by themselves when the launcher is gone."""
+
+
+class Crate:
+    """The parent of all boards. Lives until the Rack closes the line."""
+
+    def __init__(self, line: Connection, attention: int) -> None:
+        self._line = line
+        self._attention = attention
+        self._segment: Segment | None = None
+        self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
+        self._poll = select.poll()
+        self._poll.register(line, select.POLLIN)
+        # The line alone does not show that the launcher is gone: a process forked by it may hold its end open.
+        self._launcher = os.pidfd_open(os.getppid())
+        self._poll.register(self._launcher, select.POLLIN)
+
+    def run(self) -> None:
+        """Serve the Rack until it is gone, then make sure that no board is left."""
+        while True:
+            for fd, _ in self._poll.poll():
+                if fd in self._boards:
+                    self._reap(fd)
+                elif fd == self._launcher or (request := received(self._line)) is None:
+                    self._leave()
+                    return
+                else:
+                    self._serve(request)
+
+    def _serve(self, request: object) -> None:
+        match request:
+            case Preload(modules, path):
+                sys.path[:] = path
+                for name in modules:
+                    # A module that cannot be imported is a mistake in the config: the Rack reports it.
+                    with suppress(Exception):
+                        importlib.import_module(name)
+                gc.collect()
+                gc.freeze()
+            case Open(rack, priority):
+                self._segment = Segment.attach(rack)
+                semaphores.open_all(self._segment.layout)
+                set_priority(priority)
+                self._line.send(Opened())
+            case PowerOn(name, TaskWiring() as task):
+                self._fork(name, lambda segment: run_task_board(segment, task, self._attention))
+            case PowerOn(name, ClockWiring() as clock):
+                self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
+            case PowerOn(name, HogWiring(entry)):
+                self._fork(name, lambda segment: hog(segment, entry))
+            case PowerOff(name):
+                self._kill(name)
+
+    def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
+        assert self._segment is not None, "the Rack opens the segment first"
+        crate = os.getpid()
+        pid = os.fork()
+        if pid == 0:
+            self._line.close()
+            # The only way out of the child: the crate's own code must not run twice.
+            status = os.EX_SOFTWARE
+            try:
+                status = enter(crate, name, self._segment, board)
+            finally:
+                os._exit(status)
+        pidfd = os.pidfd_open(pid)
+        self._boards[pidfd] = name, pid
+        self._poll.register(pidfd, select.POLLIN)
+        self._line.send(Forked(name, pid))
+
+    def _reap(self, pidfd: int) -> None:
+        seen_ns = time.monotonic_ns()
+        name, pid = self._boards.pop(pidfd)
+        tick = self._mark_lost(name)
+        self._poll.unregister(pidfd)
+        os.close(pidfd)
+        _, status = os.waitpid(pid, 0)
+        with suppress(OSError):
+            self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
+
+    def _mark_lost(self, name: str) -> int:
+        """Mark a board as dead on the backplane, for the clock and its neighbours; return the tick."""
+        assert self._segment is not None, "boards are forked after the segment is open"
+        words = self._segment.words
+        tick = words[System.TICK]
+        if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
+            block = self._segment.block(name)
+            if block[Block.STATE] != TaskState.FAILED:
+                block[Block.STATE] = TaskState.ABSENT
+            block[Block.LOST] = block[Block.LOST] or tick + 1
+            UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
+            words[System.LOSSES] += 1
+            # In lockstep the clock waits for this.
+            semaphores.clock_semaphore(self._segment.rack).release()
+        return tick
+
+    def _kill(self, board: str | None = None) -> None:
+        for pidfd, (name, _) in self._boards.items():
+            if board in (None, name):
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+
+    def _leave(self) -> None:
+        """End after the Rack: boards see that it is gone and end; those that do not in time are killed."""
+        self._poll.unregister(self._line)
+        self._poll.unregister(self._launcher)
+        deadline = time.monotonic() + LEAVE_S
+        while self._boards and (left := deadline - time.monotonic()) > 0:
+            self._reap_ended(int(left * 1000) + 1)
+        self._kill()
+        while self._boards:
+            self._reap_ended(None)
+
+    def _reap_ended(self, timeout_ms: int | None) -> None:
+        for pidfd, _ in self._poll.poll(timeout_ms):
+            self._reap(pidfd)
+
+
+def main() -> None:
+    """Serve as the crate of the Rack at the other end of the inherited socket."""
+    # Ctrl-C reaches every process of the group; how the run ends is the Rack's decision.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    line, attention = (int(fd) for fd in sys.argv[1:])
+    Crate(Connection(line), attention).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""The Rack's check for hanging processes: one that has made no progress for much longer than its period.
+
+In real time it watches the clock alone, since the clock's watchdog watches the tasks. In lockstep it watches all.
+"""
+
+from __future__ import annotations
+
+import time
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.process import GONE, STOPPED, WAITING, state_of
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System
+
+HEARTBEATS_MISSED = 4
+"""Cycles without progress: three gave one false trip in 24,000 at 400 Hz."""
+LEAST_S = 2.0
+"""Least bound: the launcher is an ordinary process on a machine full of real-time ones, and may itself be late."""
+LOCKSTEP_S = 60.0
+"""Bound in lockstep, where time stands still while a plan is made."""
+
+
+class Heartbeat:
+    """Watches the clock, and in lockstep the control blocks of all tasks."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._words = segment.words
+        watched = segment.layout.tasks if self._words[System.LOCKSTEP] else ()
+        self._blocks = {task.name: segment.block(task.name) for task in watched}
+        bound_s = max(LEAST_S, HEARTBEATS_MISSED * self._words[System.PERIOD_NS] * 1e-9)
+        self._bounds = {**dict.fromkeys(self._blocks, LOCKSTEP_S), CLOCK: LOCKSTEP_S if watched else bound_s}
+        self._seen = {name: (-1, time.monotonic()) for name in self._bounds}
+        self._reported: set[str] = set()
+        self._waited_at = -1
+
+    def hanging(self) -> list[str]:
+        """Return the tasks found hanging since the last call; "clock" is the system clock."""
+        if self._words[System.STATE] != Run.RUNNING:
+            return []
+        now = time.monotonic()
+        for name, block in self._blocks.items():
+            # An idle task is alive: its newest release is finished. A lost one is known already.
+            idle = block[Block.DONE] == block[Block.RELEASED] or block[Block.LOST]
+            if block[Block.DONE] != self._seen[name][0] or idle:
+                self._seen[name] = block[Block.DONE], now
+                self._reported.discard(name)
+        if self._words[System.TICK] != self._seen[CLOCK][0]:
+            self._seen[CLOCK] = self._words[System.TICK], now
+            self._reported.discard(CLOCK)
+        late = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]
+        found = [name for name in late if name != CLOCK or self._clock_is_stuck()]
+        self._reported.update(found)
+        return found
+
+    def _clock_is_stuck(self) -> bool:
+        """Say whether a silent clock is stopped, dead, or waiting; one that could run is only starved."""
+        state, tick = state_of(self._words[System.CLOCK_PID]), self._seen[CLOCK][0]
+        # Seen twice: after a pause of the whole machine it is about to be woken.
+        waits = state in WAITING
+        is_stuck = state in STOPPED + GONE or (waits and self._waited_at == tick)
+        self._waited_at = tick if waits else -1
+        return is_stuck

@@ -1,0 +1,338 @@
+"""The Rack: launches the boards of a config, watches them, and ends them again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from multiprocessing.connection import wait
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rack.backplane import semaphores
+from rack.backplane.address_map import CLOCK
+from rack.backplane.errors import EmergencyStopError
+from rack.backplane.fault_table import FaultTable
+from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.history import digest
+from rack.backplane.operator_table import OperatorTable, RequestEntry
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm
+from rack.backplane.words import Block, Run, System, TaskState
+from rack.boards.config.commands import asked, request
+from rack.boards.config.resolved import load, modules, resolve
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
+from rack.boards.crate.clean import remove_dead, remove_own
+from rack.boards.crate.heartbeat import Heartbeat
+from rack.boards.crate.line import CrateLine, Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
+from rack.boards.crate.neighbours import conflicts, holders, placed
+from rack.boards.crate.recovery import Recovery, Supervision
+from rack.boards.ending import Ending
+from rack.boards.errors import ConfigError, LaunchError, Mistake
+from rack.boards.events import Cause, Event, Journal, Outcome
+from rack.boards.faults.kinds import KINDS
+
+LAUNCH_S = 60.0
+"""Bound of the launch: a large model with many meshes compiles for a while in every board."""
+UP = (TaskState.READY, TaskState.RUNNING)
+TO_SHARE = "stop that rack, choose other cores, or give --share"
+LEAVE_S = 2.0
+"""Time for the boards to end by themselves."""
+STOP_S = 0.8
+"""Time for the clock to end the run after a stop request; then the Rack ends it."""
+
+
+class Rack:
+    """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
+
+    `on_event` is called with every `Event`, in the process of the caller. Without `share`, a launch is refused if
+    another rack's real-time boards hold a core that this one asks for.
+    """
+
+    def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None, share: bool = True) -> None:
+        self.config = config
+        self._share = share
+        self.segment: Segment
+        self.outcome: Outcome | None = None
+        self._journal = Journal(on_event)
+        self._crate: CrateLine | None = None
+        self._pids: dict[str, int] = {}
+        self._faults: list[str] = []
+        self._is_armed = False
+        self._is_beyond_help = False
+        self._cause: Cause | None = None
+        self._why_stopped = ""
+        self._stop_by: float | None = None
+
+    @property
+    def events(self) -> list[Event]:
+        """The events so far."""
+        return self._journal.events
+
+    @classmethod
+    def from_file(cls, name_or_path: str | Path, overrides: Sequence[str] = ()) -> Self:
+        """Return the rack of a config, by name or path. Raises `ConfigError` with every mistake."""
+        return cls(load(str(name_or_path), overrides))
+
+    def __enter__(self) -> Self:
+        self.launch()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def launch(self) -> None:
+        """Power on every board but the clock, and wait until all have passed their self-tests.
+
+        Raises `ConfigError` for a config or cores that cannot be used, `SegmentError` when the name is in use, and
+        `LaunchError` when a board fails; in each case nothing is left behind.
+        """
+        try:
+            self._power_on()
+        except BaseException:
+            self.close()
+            raise
+
+    def _power_on(self) -> None:
+        held = holders(self.config.name)
+        self.config, moved = placed(self.config, held)
+        shared = conflicts(self.config, held)
+        if shared and not self._share:
+            raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
+        self._crate = crate = CrateLine()
+        # The crate imports while the config is being wired: on two cores this saves half a second.
+        crate.send(Preload(modules(self.config), tuple(sys.path)))
+        self._plan = plan = resolve(self.config)
+        remove_dead(self.config.name)
+        self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
+        self._set_words()
+        semaphores.create(plan.layout)
+        crate.send(Open(self.config.name, plan.crate_priority))
+        self._journal.add("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
+        self._expect(Opened)
+        # The crate has them open and every board inherits them: without names nothing can be left behind.
+        semaphores.unlink(plan.layout)
+        for wiring in plan.tasks:
+            crate.send(PowerOn(wiring.task, wiring))
+        self._await_ready()
+        plan.check_realtime(self.segment)
+        self._inject()
+        for note in (*moved, *shared, *plan.notes(self.segment)):
+            self._journal.add("ready", "", note)
+
+    def _set_words(self) -> None:
+        words, clock = self.segment.words, self.config.clock
+        # The latch starts set: until it is reset, the arm's brakes stay engaged.
+        words[System.EMERGENCY_STOP] = 1
+        words[System.LOCKSTEP] = clock.mode == "lockstep"
+        words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
+
+    def _await_ready(self) -> None:
+        deadline = time.monotonic() + LAUNCH_S
+        while absent := [t.name for t in self._plan.layout.tasks if self._state(t.name) not in UP]:
+            self._listen(deadline - time.monotonic())
+            if self._faults:
+                raise LaunchError("\n".join(self._line.printed()) or self._faults[0])
+            if time.monotonic() > deadline:
+                raise LaunchError(f"boards {', '.join(absent)}: not ready within {LAUNCH_S:g} s")
+
+    def _inject(self) -> None:
+        """Fill the tables with the config's faults and commands; start the faults that are processes."""
+        table = FaultTable(self.segment)
+        for injection in self._plan.faults:
+            entry = table.add(injection)
+            if KINDS[injection.kind].where == "core":
+                self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
+        desk = OperatorTable(self.segment)
+        for wanted in self._plan.commands:
+            desk.add(wanted)
+
+    def start(self, seconds: float | None = None) -> None:
+        """Power on the clock: the run begins. It lasts `seconds` of simulated time, or until the task ends."""
+        clock = self._plan.clock(seconds)
+        self._ending = Ending(self.segment, clock.ends_run, clock.silent)
+        wirings = {wiring.task: wiring for wiring in self._plan.tasks}
+        supervision = Supervision(self.config, self._plan.layout)
+        self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
+        self._alarms = AlarmWatch(self.segment, self.config)
+        self._heartbeat = Heartbeat(self.segment)
+        self._reset_latch()
+        self._line.ask(PowerOn(CLOCK, clock))
+        self._journal.add("start", CLOCK, self.config.clock.mode)
+
+    def _reset_latch(self) -> None:
+        """Reset the emergency stop on behalf of the caller, as soon as every input is good."""
+        with suppress(EmergencyStopError):
+            UtilityLines(self.segment).reset_emergency_stop()
+            self._is_armed = True
+
+    def run(self, seconds: float | None = None) -> Outcome:
+        """Run for `seconds` of simulated time, or until the task ends; return how it ended."""
+        self.start(seconds)
+        while self.watch(0.5):
+            continue
+        assert self.outcome is not None
+        return self.outcome
+
+    def watch(self, timeout_s: float) -> bool:
+        """Watch the boards for that long or until the run is over; False when it is over."""
+        deadline = time.monotonic() + timeout_s
+        while self.outcome is None:
+            self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
+            self._record_stop()
+            for line in self._line.printed():
+                self._journal.add("printed", "", line)
+            for rung in self._alarms.drain():
+                self._act_on(rung)
+            for board in self._heartbeat.hanging():
+                self._journal.add("detection", "rack", f"'{board}' is not responding", "hang", subject=board)
+                self._recovery.end_hanging(board)
+            self._recovery.advance()
+            if not self._is_armed:
+                self._reset_latch()
+            is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
+            if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help or is_late:
+                self._end()
+            if time.monotonic() >= deadline:
+                break
+        return self.outcome is None
+
+    def stop(self, why: str) -> None:
+        """End the run at the next tick. May be called at any moment, even by a signal handler."""
+        self._why_stopped = self._why_stopped or why
+        self._cause = self._cause or "stopped"
+        self.segment.words[System.STOP_REQUEST] = 1
+        os.eventfd_write(self._line.attention, 1)
+
+    def _record_stop(self) -> None:
+        if self._why_stopped and self._stop_by is None:
+            self._stop_by = time.monotonic() + STOP_S
+            self._journal.add("stop", "", self._why_stopped)
+
+    def command(self, level: str, what: str, tick: int | None = None, **goal: object) -> RequestEntry:
+        """Issue an operator's command to a level, at `tick` or at once; return its entry in the operator table.
+
+        `what` and `goal` are as in a `[[command]]` table: `rack.command("servo", "setpoint", joints=(...))`. Raises
+        `ConfigError` with every mistake, `OperatorTableError` when too many wait.
+        """
+        wanted = asked({"level": level, "what": what, "tick": tick, **goal})
+        return OperatorTable(self.segment).add(request(wanted, self.config, self._plan.layout))
+
+    def _listen(self, timeout_s: float) -> None:
+        """Wait for the crate or an alarm, at most that long."""
+        line, attention = self._line.line, self._line.attention
+        for ready in wait([line, attention], timeout_s):
+            if ready == attention:
+                os.eventfd_read(attention)
+            else:
+                self._receive()
+
+    def _receive(self) -> None:
+        message = self._line.receive()
+        match message:
+            case Forked(name, pid):
+                self._pids[name] = pid
+            case Ended(name, _, status) as end:
+                self._pids.pop(name, None)
+                is_board = name == CLOCK or name in self.segment.map.blocks
+                over = self.outcome is not None or self.segment.words[System.STATE] == Run.STOPPED
+                if is_board and not (over and status == 0):
+                    self._lose(end)
+            case None:
+                self._is_beyond_help = True
+                text = "the crate ended, and all boards with it"
+                self._journal.add("died", "crate", text, "died")
+                self._give_up("crate", text)
+
+    def _act_on(self, rung: RungAlarm) -> None:
+        """Record the event of an alarm, and act where the Rack must."""
+        self._journal.keep(rung.event)
+        if rung.alarm == Alarm.HANG:
+            self._recovery.end_hanging(self._plan.layout.tasks[rung.subject].name)
+        elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self._pids.get(CLOCK):
+            # Only the clock that was meant: by now another one may have begun.
+            self._recovery.end_hanging(CLOCK)
+
+    def _expect(self, kind: type) -> None:
+        if not self._line.line.poll(LAUNCH_S) or not isinstance(self._line.receive(), kind):
+            late = f"the crate did not open the segment in {LAUNCH_S:g} s"
+            raise LaunchError("\n".join(self._line.printed()) or late)
+
+    def _lose(self, end: Ended) -> None:
+        """Record the end of a board, and restart it or give it up."""
+        text = f"board '{end.name}' ended: {_status(end.status)}"
+        self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
+        if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
+            self._give_up(end.name, text)
+            return
+        restart = self._recovery.lose(end.name, end.tick)
+        if restart is None:
+            self._is_beyond_help = end.name == CLOCK
+            self._give_up(end.name, f"{text}; its restarts are used up")
+        else:
+            nth = f"restart {restart.number} of at most {restart.most} in {restart.within_s:g} s"
+            self._journal.add("reaction", end.name, nth, "restart")
+
+    def _give_up(self, board: str, text: str) -> None:
+        self._faults.append(text)
+        self._cause = "board lost"
+        self._journal.add("reaction", board, f"'{board}' is given up", "given_up")
+
+    def _end(self) -> None:
+        """Record the end of the run: cause, ticks and digest; then let the boards end."""
+        for rung in self._alarms.drain():
+            self._journal.keep(rung.event)
+        words = self.segment.words
+        stop = words[System.STOP_TICK] or words[System.TICK] + 1
+        state, reason = self._ending.final_state()
+        # A stop may also come from outside, by a word in the segment.
+        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._ending.cause())
+        if cause in ("task done", "time over"):
+            self._faults += self._ending.latched()
+        self._end_boards()
+        self.outcome = Outcome(cause, stop, state, reason, digest(self.segment, stop), tuple(self._faults))
+        self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
+
+    def close(self) -> None:
+        """End everything: afterwards no process and no segment of this rack is left."""
+        if self._crate is None:
+            return
+        crate, self._crate = self._crate, None
+        try:
+            if hasattr(self, "segment"):
+                self._end_boards()
+            if self._cause == "board lost" or self._has_lost():
+                crate.ask(PowerOff())
+            # A crate that has no boards yet may still be importing for them.
+            crate.close(LEAVE_S if self._pids else 0)
+        finally:
+            # By name: the launch may have been interrupted before the segment was known here.
+            remove_own(self.config.name)
+            if hasattr(self, "segment"):
+                self.segment.close()
+
+    def _has_lost(self) -> bool:
+        """Say whether a board is lost: it may not end by itself."""
+        return hasattr(self, "segment") and any(self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks)
+
+    def _end_boards(self) -> None:
+        """Declare the run over, to the clock and the boards."""
+        self.segment.words[System.STOP_REQUEST] = 1
+        self.segment.words[System.STATE] = Run.STOPPED
+
+    def _state(self, task: str) -> int:
+        return self.segment.block(task)[Block.STATE]
+
+    @property
+    def _line(self) -> CrateLine:
+        assert self._crate is not None, "the rack is launched"
+        return self._crate
+
+
+def _status(status: int) -> str:
+    return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"

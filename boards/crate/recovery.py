@@ -1,0 +1,120 @@
+"""Recovery of lost boards: how often each may be restarted, in which order, and their way back."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, TaskState
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.line import CrateLine, PowerOff, PowerOn
+from rack.boards.wiring import ClockWiring, TaskWiring
+
+
+class Restart(NamedTuple):
+    """A restart that the policy permits: the `number`-th of at most `most` within `within_s`, s."""
+
+    number: int
+    most: int
+    within_s: float
+
+
+class Supervision:
+    """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have the same end."""
+
+    def __init__(self, config: RackConfig, layout: Layout) -> None:
+        self._config, self._layout = config, layout
+        self._restarts: dict[str, list[int]] = defaultdict(list)
+        self._rank = {task.name: _rank(config, task.board, task.role == "planner") for task in layout.tasks}
+        self._rank[CLOCK] = (0, False)
+
+    def admit(self, task: str, tick: int) -> Restart | None:
+        """Count one more restart of a task, lost at `tick`; None when its policy permits no more."""
+        most, within_s = self._policy(task)
+        since = tick - within_s * 1e9 / self._layout.clock_ns
+        recent = [at for at in self._restarts[task] if at > since]
+        if len(recent) >= most:
+            return None
+        self._restarts[task] = [*recent, tick]
+        return Restart(len(recent) + 1, most, within_s)
+
+    def in_order(self, tasks: list[str]) -> list[str]:
+        """Return the tasks in the order of restart: the clock, lower levels before higher, planners last."""
+        return sorted(tasks, key=lambda task: self._rank[task])
+
+    def must_wait(self, task: str, absent: list[str]) -> bool:
+        """Say whether a task that this one depends on is still absent: any below it, and a planner's executor."""
+        return any(self._rank[other] < self._rank[task] for other in absent)
+
+    def _policy(self, task: str) -> tuple[int, float]:
+        common = self._config.supervision
+        if task == CLOCK:
+            return common.restarts, common.within_s
+        board = self._config.board[self._layout.task(task).board]
+        most = common.restarts if board.restarts is None else board.restarts
+        return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
+
+
+def _rank(config: RackConfig, board: str, is_planner: bool) -> tuple[int, bool]:
+    """Return how many levels lie below a board, the clock counted."""
+    depth, below = 1, config.board[board].below
+    while below is not None:
+        depth, below = depth + 1, config.board[below].below
+    return depth, is_planner
+
+
+class Recovery:
+    """The lost boards of one run, from their loss to their return.
+
+    A board is powered on again when everything that it depends on is present; it rejoins on the clock's grid.
+    """
+
+    def __init__(
+        self,
+        segment: Segment,
+        supervision: Supervision,
+        wirings: Mapping[str, TaskWiring | ClockWiring],
+        crate: CrateLine,
+    ) -> None:
+        self._segment, self._supervision, self._wirings, self._crate = segment, supervision, wirings, crate
+        self._waiting: list[str] = []
+        self._starting: list[str] = []
+
+    def lose(self, board: str, tick: int) -> Restart | None:
+        """Schedule the restart of a board whose process has ended; None when it is given up."""
+        self._starting = [name for name in self._starting if name != board]
+        restart = self._supervision.admit(board, tick)
+        if restart is not None:
+            self._waiting.append(board)
+        elif board != CLOCK:
+            # The clock sees this: it brakes the arm and ends the run.
+            self._segment.block(board)[Block.STATE] = TaskState.GIVEN_UP
+        return restart
+
+    def end_hanging(self, board: str) -> None:
+        """Kill a board that hangs, which is then lost like any other; one that is being restarted is left alone."""
+        if board not in (*self._waiting, *self._starting):
+            self._crate.ask(PowerOff(board))
+
+    def advance(self) -> list[str]:
+        """Power on the boards that are due; return them."""
+        self._starting = [name for name in self._starting if self._is_absent(name)]
+        due = []
+        for board in self._supervision.in_order(self._waiting):
+            absent = [name for name in (*self._waiting, *self._starting) if name != board]
+            if not self._supervision.must_wait(board, absent):
+                due.append(board)
+        for board in due:
+            self._waiting.remove(board)
+            self._starting.append(board)
+            self._crate.ask(PowerOn(board, self._wirings[board]))
+        return due
+
+    def _is_absent(self, board: str) -> bool:
+        if board == CLOCK:
+            return False
+        return self._segment.block(board)[Block.STATE] not in (TaskState.READY, TaskState.RUNNING)

@@ -1,0 +1,95 @@
+"""A board: one process on one core, from its power-on to the end of the run."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Callable
+
+from rack.backplane.errors import BackplaneError
+from rack.backplane.lines import UtilityLines
+from rack.backplane.process import die_with_parent, name_process, set_priority, take_processor
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, TaskState
+from rack.boards.classes import find_class
+from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
+from rack.boards.run.system_controller import run_clock
+from rack.boards.run.task import Task
+from rack.boards.wiring import ClockWiring, TaskWiring
+from rack.levels.errors import LevelError
+from rack.levels.level import Executor, Planner
+
+SELF_TEST_FAILED = 3
+"""Exit status of a board whose start-up test failed."""
+
+
+def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
+    """Run `board` in the forked child of the crate; return its exit status."""
+    die_with_parent(crate)
+    # Boards do not keep the crate's priority: each takes its own when it is ready.
+    set_priority(0)
+    name_process(f"{segment.rack}:{name}")
+    try:
+        return board(segment)
+    except (BackplaneError, LevelError) as error:
+        print(f"board '{name}': {error}", file=sys.stderr, flush=True)
+        return SELF_TEST_FAILED
+    except Exception:
+        print(f"board '{name}' failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+        return 1
+
+
+def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
+    """Build a task's level, test it, take the processor, and cycle until the run is over.
+
+    `attention` is an eventfd that the Rack waits on: a board writes to it when it is ready or rings an alarm.
+    """
+    block = segment.block(wiring.task)
+    block[Block.PID] = os.getpid()
+    block[Block.STATE] = TaskState.STARTING
+    try:
+        _run_level(segment, wiring, attention)
+    except BaseException:
+        block[Block.STATE] = TaskState.FAILED
+        UtilityLines(segment).assert_sysfail(segment.layout.task(wiring.task).slot)
+        raise
+    block[Block.STATE] = TaskState.ENDED
+    return 0
+
+
+def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
+    spec, block = segment.layout.task(wiring.task), segment.block(wiring.task)
+    kind: type[Executor] | type[Planner]
+    kind = find_class(wiring.target, Executor) if spec.role == "executor" else find_class(wiring.target, Planner)
+    level = kind(wiring.context)
+    try:
+        level.self_test()
+        if wiring.fails_self_test:
+            raise LevelError("self-test failed: a fault in the config asks for it")
+        UtilityLines(segment).release_sysfail(spec.slot)
+        block[Block.PRIORITY] = take_processor(spec)
+        block[Block.CORE] = spec.core
+        task = _task(segment, wiring, level, attention)
+        block[Block.STATE] = TaskState.READY
+        os.eventfd_write(attention, 1)
+        task.stopwatch.notify_clock()
+        task.run()
+    finally:
+        # Ordinary scheduling from here: closing files must not delay another board's cycle.
+        set_priority(0)
+        level.close()
+
+
+def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> int:
+    """Take the processor and run the system clock."""
+    os.sched_setaffinity(0, {wiring.core})
+    set_priority(wiring.priority)
+    run_clock(segment, wiring, attention)
+    return 0
+
+
+def _task(segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int) -> Task:
+    if isinstance(level, Executor):
+        return VirtualControlLoop(segment, wiring, level, attention)
+    return PlannerLoop(segment, wiring, level, attention)

@@ -1,0 +1,166 @@
+"""A level in execution: `procedure level()` of the paper (section 2).
+
+`VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin` is two processes: on
+one core, by priority (tightly coupled), or on two (loosely coupled). `lock` and `unlock` are left to the mailboxes:
+only protocol `lock` needs them. Stamps, trace and counts are kept by the stopwatch; faults take effect between cycles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rack.backplane.process import set_priority
+from rack.backplane.segment import Segment
+from rack.backplane.trace import Flag
+from rack.backplane.words import Block, Demand, System
+from rack.boards.run.task import Task, slowed
+from rack.boards.wiring import TaskWiring
+from rack.levels.level import Executor, Planner
+
+_DEMAND, _DEMANDS = int(System.DEMAND), tuple(Demand)
+
+
+class VirtualControlLoop(Task):
+    """The executor section of `procedure level()`: one virtual control loop, at the higher priority.
+
+        repeat
+            waituntil(next-cycle); update(next-cycle)
+            lock; read_command; unlock; lock; read_status; unlock
+            read plan
+            process
+            lock; write_command; unlock; lock; write_status; unlock
+        until forever
+
+    Before it reads, the exchange (C of fig. 4) brings a plan over the bus, from the processor of its planner.
+    """
+
+    def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None) -> None:
+        super().__init__(segment, wiring, executor, attention)
+        self.executor = executor
+        times = wiring.transfer
+        self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
+        self.read_command_and_status = slowed(self.inputs.read_command_and_status, times.read_ns)
+        self.read_plan = self.inputs.read_plan
+        self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
+
+    def run(self) -> None:
+        """Cycle until the run is over."""
+        self.begin()
+        while (tick := self.wait_until_next_cycle()) is not None:
+            self.cycle(tick)
+        self.stopwatch.count_bus()
+
+    def cycle(self, tick: int) -> None:
+        """Do the cycle released at `tick`."""
+        watch = self.stopwatch
+        watch.start(tick, self.next_cycle.skipped)
+        self.exchange(tick)
+        watch.exchanged()
+        self.read_command_and_status(tick)
+        self.read_plan()
+        watch.read()
+        self.process(tick)
+        watch.processed()
+        in_time = self.write_command_and_status(tick, self.clock.now(), self.inputs)
+        watch.written()
+        watch.finish(in_time, deadline=tick + self.spec.every, done=tick)
+
+    def process(self, tick: int) -> None:
+        """Let the level process, with the demand on the arm; ring what it has found, and count faults that acted."""
+        executor = self.executor
+        executor.demand = _DEMANDS[self.words[_DEMAND]]
+        executor.process(self.inputs.values, self.outputs.messages, tick)
+        if executor.findings or executor.acted or self.faults.loads:
+            self._report(tick)
+
+    def _report(self, tick: int) -> None:
+        executor = self.executor
+        for alarm, subject, value in executor.findings:
+            self.alarms.ring(tick, alarm, subject, value)
+        executor.findings.clear()
+        self.faults.count(executor.acted, tick)
+        executor.acted.clear()
+        self.faults.burn(tick)
+
+
+class PlannerLoop(Task):
+    """The planner of `procedure level()`: plans in the background, each plan within its cycles.
+
+        repeat
+            plan
+            lock; write_plan; unlock
+        until forever
+
+    It asks in every cycle whether a plan is wanted. Tightly coupled under protocol `lock`, writing the plan is the
+    paper's critical section, which the executor cannot preempt.
+    """
+
+    def __init__(self, segment: Segment, wiring: TaskWiring, planner: Planner, attention: int | None = None) -> None:
+        super().__init__(segment, wiring, planner, attention)
+        self.planner = planner
+        self.slice = self.spec.every * self.spec.within_cycles
+        self.write_plan = slowed(self.outputs.write, wiring.transfer.update_ns)
+        self._critical_priority = wiring.critical_priority
+        self._priority = self.block[Block.PRIORITY]
+
+    def run(self) -> None:
+        """Plan until the run is over."""
+        self.begin()
+        while (tick := self.wait_until_next_cycle()) is not None:
+            self.cycle(tick)
+        self.stopwatch.count_bus()
+
+    def cycle(self, tick: int) -> None:
+        """Plan in the cycle released at `tick`, if a plan is wanted."""
+        watch = self.stopwatch
+        watch.start(tick, self.next_cycle.skipped)
+        self.inputs.read(tick)
+        watch.read()
+        if not self.planner.wanted(self.inputs.values, tick):
+            self._pass(tick)
+            return
+        self._take_time_slice(tick)
+        self.plan(tick)
+        watch.processed()
+        with self._critical_section():
+            in_time = self.write_plan(tick, self.clock.now(), self.inputs)
+            # Stamped inside: after the section the executor may run first.
+            watch.written()
+        self.block[Block.PLANS] += 1
+        # A plan begun late has its whole slice: a release within it is answered by this plan.
+        done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
+        watch.finish(in_time, tick + self.slice, done, Flag.PLANNED)
+
+    def plan(self, tick: int) -> None:
+        """Let the level plan."""
+        self.planner.plan(self.inputs.values, self.outputs.messages.plan, tick)
+        self.faults.burn(tick)
+
+    def _take_time_slice(self, tick: int) -> None:
+        """Claim the slice of a plan: the clock releases nothing until its end."""
+        self.next_cycle.hold_until(tick + self.slice)
+        self.block[Block.DEADLINE] = tick + self.slice
+        self.stopwatch.notify_clock()
+
+    def _pass(self, tick: int) -> None:
+        """Let a release pass without a plan; trace it when it came too late, or others were skipped."""
+        self.outputs.flush(tick, self.clock.now())
+        in_time = self.clock.now() < tick + self.slice
+        if in_time and not self.next_cycle.skipped:
+            self.stopwatch.idle()
+            return
+        self.stopwatch.processed()
+        self.stopwatch.written()
+        self.stopwatch.finish(in_time, tick + self.slice, tick)
+
+    @contextmanager
+    def _critical_section(self) -> Iterator[None]:
+        """Take the executor's priority for the update of the plan, so that the executor cannot preempt it."""
+        if self._critical_priority:
+            set_priority(self._critical_priority)
+        try:
+            yield
+        finally:
+            if self._critical_priority:
+                set_priority(self._priority)

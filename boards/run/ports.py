@@ -1,0 +1,174 @@
+"""A task's ports on the bus: the readers and writers of its mailboxes, used once a cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
+from rack.backplane.watch.silence_watch import ReadingTask
+from rack.backplane.watch.watched_reader import watched
+from rack.boards.faults.writers import FaultyWriter
+from rack.levels.level import Ports, Reading, Verdict
+
+
+class InputPorts:
+    """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port."""
+
+    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, plan: str = "") -> None:
+        """Read `mailboxes` by port; `plan` is the mailbox that holds the task's own plan."""
+        self._task = ReadingTask()
+        found = {port: watched(segment, name, alarms, self._task) for port, name in mailboxes.items()}
+        self.readers = {port: one.reader for port, one in found.items()}
+        self.values = Ports(**{port: Reading(r.message, Verdict.NONE) for port, r in self.readers.items()})
+        self._by_port = self.values.__dict__
+        self._plan = [(port, one.read) for port, one in found.items() if mailboxes[port] == plan]
+        self._rest = [(port, one.read) for port, one in found.items() if mailboxes[port] != plan]
+        self._exchanged: list[tuple[str, Reading]] = []
+        self._statistics = [reader.statistics for reader in self.readers.values()]
+        self._counted = self._traffic
+
+    def read(self, tick: int) -> None:
+        """Read every mailbox as of `tick`."""
+        self.exchange(tick)
+        self.read_command_and_status(tick)
+        self.read_plan()
+
+    def exchange(self, tick: int) -> None:
+        """Begin a cycle released at `tick`: bring the plan over the bus, where the task reads one."""
+        self._task.reads(tick)
+        if self._plan:
+            self._exchanged = [(port, read(tick)) for port, read in self._plan]
+
+    def read_command_and_status(self, tick: int) -> None:
+        """Read every other mailbox as of `tick`: commands, statuses, world model."""
+        values = self._by_port
+        for port, read in self._rest:
+            values[port] = read(tick)
+
+    def read_plan(self) -> None:
+        """Take the plan that the exchange has brought."""
+        for port, reading in self._exchanged:
+            self._by_port[port] = reading
+
+    @property
+    def bad_reads(self) -> int:
+        """Reads so far with anything wrong."""
+        return sum([statistics.bad_reads for statistics in self._statistics])
+
+    @property
+    def bus_errors(self) -> int:
+        """Reads so far that their bound cut off."""
+        return sum([statistics.bus_errors for statistics in self._statistics])
+
+    @property
+    def corrupt(self) -> int:
+        """Reads so far that found a damaged message."""
+        return sum([statistics.corrupt for statistics in self._statistics])
+
+    def basis(self, port: str, tick: int) -> int:
+        """Return the tick of the oldest information that a port's message rests on; `tick` where there is none."""
+        reader = self.readers.get(port)
+        return reader.basis if reader is not None and reader.serial else tick
+
+    def take_traffic(self) -> tuple[int, int]:
+        """Return the accesses, and the bytes read, since the last call."""
+        before, self._counted = self._counted, self._traffic
+        return self._counted[0] - before[0], self._counted[1] - before[1]
+
+    @property
+    def _traffic(self) -> tuple[int, int]:
+        readers = self.readers.values()
+        accesses = sum(reader.statistics.accesses for reader in readers)
+        return accesses, sum(reader.statistics.transfers * reader.spec.size for reader in readers)
+
+
+class OutputPorts:
+    """The mailboxes that a task writes; `messages` holds the outgoing message of each port."""
+
+    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter) -> None:
+        self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
+        self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
+        self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
+        self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
+        self._faulty: dict[str, FaultyWriter] = {}
+        self._held_up = dict.fromkeys(self.writers, 0)
+        self._writers = list(self.writers.values())
+        self._counted = self._traffic
+        self._route()
+
+    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
+        """Write with these faults, by kind, from now on; what earlier ones held back goes out with the next write."""
+        for port, writer in self.writers.items():
+            index = self._indices[writer.spec.name]
+            chosen = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
+            if chosen or port in self._faulty:
+                self._faulty.setdefault(port, FaultyWriter(writer, index)).apply(chosen)
+        self._route()
+
+    def _route(self) -> None:
+        """Route each port to its writer, or to the faulty writer around it."""
+        self._lines = [(port, w, getattr(self._faulty.get(port), "write", w.write)) for port, w in self.writers.items()]
+
+    def message(self, port: str) -> Message | None:
+        """Return the outgoing message of a port, if there is such a port."""
+        writer = self.writers.get(port)
+        return writer.message if writer else None
+
+    @property
+    def bus_errors(self) -> int:
+        """Writes so far that their bound cut off."""
+        return sum([writer.bus_errors for writer in self._writers])
+
+    def write(self, tick: int, now: int, inputs: InputPorts) -> bool:
+        """Write every mailbox; False when a message came too late.
+
+        Each message carries the tick of the oldest information it rests on: a command that of the command it follows,
+        a status that of the status below it. So the response of the whole system can be measured.
+        """
+        in_time = True
+        for port, writer, write in self._lines:
+            in_time = write(tick, now, inputs.basis(port, tick)) and in_time
+            if writer.intruder or writer.held_up:
+                self._report(port, writer, tick)
+        if self._faulty:
+            self._drop_faulty_writers()
+        return in_time
+
+    def flush(self, tick: int, now: int) -> None:
+        """Publish what a fault has held back and is due, in a cycle that writes nothing."""
+        if self._faulty:
+            for faulty in self._faulty.values():
+                faulty.flush(tick, now)
+            self._drop_faulty_writers()
+
+    def _drop_faulty_writers(self) -> None:
+        """Write directly again where no fault is left and nothing is held back."""
+        over = [port for port, faulty in self._faulty.items() if faulty.is_over]
+        for port in over:
+            del self._faulty[port]
+        if over:
+            self._route()
+
+    def _report(self, port: str, writer: Writer, tick: int) -> None:
+        """Ring an alarm for what a writer has found in its own mailbox."""
+        if writer.intruder:
+            self._episodes[port].find(Alarm.MASQUERADE, writer.serial, tick, writer.intruder)
+            writer.intruder = 0
+        if writer.held_up != self._held_up[port]:
+            self._held_up[port] = writer.held_up
+            self._episodes[port].find(Alarm.LOCKED, writer.serial, tick)
+
+    def take_traffic(self) -> tuple[int, int]:
+        """Return the messages, and the bytes, written since the last call."""
+        before, self._counted = self._counted, self._traffic
+        return self._counted[0] - before[0], self._counted[1] - before[1]
+
+    @property
+    def _traffic(self) -> tuple[int, int]:
+        writers = self.writers.values()
+        return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)

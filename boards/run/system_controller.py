@@ -1,0 +1,140 @@
+"""The board in slot 1: the system controller, which runs the clock.
+
+At every tick, besides releasing the tasks, it begins and ends faults, issues operators' commands, lets restarted boards
+rejoin the grid, and tells the arm to stop or to brake.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.released_task import ReleasedTask
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.message import State
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
+from rack.backplane.words import Block, Demand, Run, System
+from rack.boards.faults.stage import FaultStage
+from rack.boards.faults.strikes import Strikes
+from rack.boards.operating.desk import OperatorDesk
+from rack.boards.wiring import ClockWiring
+
+HEAD_START_NS = 20_000_000
+"""Time from the start of the clock board to tick 0, so that its start-up is not a late tick."""
+# Plain integers for the hot path.
+_LOSSES, _EMERGENCY = int(System.LOSSES), int(System.EMERGENCY_STOP)
+
+
+class SystemController:
+    """What the clock does at every tick besides releasing tasks: see `rack.backplane.clock.driver.Controller`."""
+
+    def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
+        self._words, self._wiring, self._driver = segment.words, wiring, driver
+        self._faults = FaultStage(segment, Strikes(segment, driver), driver.alarms)
+        self._desk = OperatorDesk(segment, driver.alarms)
+        self._settled: tuple[int, int, int] | None = None
+        self._demand = Demand(self._words[System.DEMAND])
+
+    def begin(self, tick: int) -> None:
+        """Do the work due before the tasks of `tick` are released."""
+        if not self._faults.is_quiet:
+            self._faults.advance(tick)
+        if not self._desk.is_quiet:
+            self._desk.advance(tick)
+        words = self._words
+        if self._settled != (words[_LOSSES], self._driver.watchdog.losses, words[_EMERGENCY]):
+            self._handle_losses(tick)
+
+    def released(self, tick: int) -> None:
+        """Do the work due after the release."""
+        self._faults.within(tick)
+
+    def _handle_losses(self, tick: int) -> None:
+        """Let returned boards rejoin, latch for those given up, and put the demand of the other losses on the arm."""
+        words = self._words
+        seen = words[_LOSSES], self._driver.watchdog.losses
+        lost = [task for task in self._driver.tasks if task.lost_tick >= 0]
+        for task in lost:
+            self._handle_loss(task, tick)
+        lost = [task for task in lost if task.lost_tick >= 0]
+        self._set_demand(lost, tick)
+        self._settled = (*seen, words[_EMERGENCY]) if not lost else None
+
+    def _handle_loss(self, task: ReleasedTask, tick: int) -> None:
+        lockstep = self._wiring.lockstep
+        if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
+            return
+        self._driver.await_state(lambda: task.is_ready or task.is_given_up)
+        if task.is_ready:
+            away = tick - task.lost_tick
+            self._driver.settle()
+            task.rejoin()
+            self._driver.alarms.ring(tick, Alarm.REJOINED, task.index, away)
+        elif task.is_given_up:
+            # Even if the latch is already set, as it is before the start.
+            self._words[_EMERGENCY] = 1
+            # Time for the arm to come to rest before the run ends.
+            ends = tick + self._wiring.linger
+            self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
+
+    def _set_demand(self, lost: list[ReleasedTask], tick: int) -> None:
+        asked = [(self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost]
+        if self._words[_EMERGENCY]:
+            asked.append((Demand.BRAKE, -1))
+        demand, subject = max(asked, default=(Demand.NONE, -1))
+        if demand != self._demand:
+            self._driver.settle()
+            self._demand = demand
+            self._words[System.DEMAND] = demand
+            self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
+
+
+class EndOfRun:
+    """Decides, by ticks alone, where a run ends."""
+
+    def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
+        self._stop_tick = wiring.stop_tick or None
+        self._linger = wiring.linger
+        self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
+        self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
+        self._silent = wiring.silent
+        self._heard: int | None = None
+
+    def __call__(self, tick: int) -> int | None:
+        """Return the tick at which the run stops; None until it is known."""
+        if self._stop_tick is None and self._reader is not None and self._writer is not None:
+            reading = self._reader.read(tick)
+            if reading.is_new or self._heard is None or self._writer[Block.LOST]:
+                self._heard = tick
+            is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
+            if is_over or tick - self._heard >= self._silent:
+                self._stop_tick = tick + self._linger
+        return self._stop_tick
+
+
+def run_clock(segment: Segment, wiring: ClockWiring, attention: int | None = None) -> None:
+    """Run the clock until the run is over; a restarted clock continues on the grid that it finds."""
+    words = segment.words
+    words[System.CLOCK_PID] = os.getpid()
+    alarms = AlarmWriter(segment, CLOCK, attention)
+    if words[System.STATE] != Run.RUNNING:
+        words[System.EPOCH_NS] = time.monotonic_ns() + HEAD_START_NS
+    else:
+        now, newest = SystemClock(segment).now(), words[System.TICK]
+        alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
+    driver = driver_of_run(segment, wiring, EndOfRun(segment, wiring), alarms)
+    driver.controller = SystemController(segment, wiring, driver)
+    driver.run()
+
+
+def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: AlarmWriter) -> ClockDriver:
+    """Return the clock driver for the run's mode."""
+    if not wiring.lockstep:
+        return RealtimeDriver(segment, ended, alarms)
+    at_once = any(mailbox.protocol != "time-slice" for mailbox in segment.layout.mailboxes)
+    return LockstepDriver(segment, ended, at_once, wiring.history, alarms)

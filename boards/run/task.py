@@ -1,0 +1,120 @@
+"""A task on its board: what the executor's and the planner's loop have in common, and the fast tasks' clock guard."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from time import process_time_ns
+from typing import ParamSpec, TypeVar
+
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.clock.wake import NextCycle
+from rack.backplane.process import compute_until
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
+from rack.backplane.words import Block, System, TaskState
+from rack.boards.faults.task_faults import TaskFaults
+from rack.boards.run.ports import InputPorts, OutputPorts
+from rack.boards.run.stopwatch import Stopwatch
+from rack.boards.wiring import TaskWiring
+from rack.levels.level import Executor, Planner
+
+# Plain integers for the hot path.
+_FAULTS, _TICK_NS, _TICK, _CLOCK_SKIPPED = (
+    int(word) for word in (System.FAULTS, System.TICK_NS, System.TICK, System.CLOCK_SKIPPED)
+)
+PUNCTUAL_TICKS = 20
+"""Punctual ticks that end an episode of late ones."""
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+class Task(ABC):
+    """One task, around a level's executor or planner: its ports, its clock, its stopwatch, its faults."""
+
+    def __init__(
+        self, segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int | None = None
+    ) -> None:
+        self.spec = spec = segment.layout.task(wiring.task)
+        self.block = segment.block(wiring.task)
+        self.words = segment.words
+        self.clock = SystemClock(segment)
+        self.alarms = AlarmWriter(segment, wiring.task, attention)
+        self.next_cycle = NextCycle(segment, wiring.task, wiring.poll, self.alarms if wiring.guards_clock else None)
+        self.inputs = InputPorts(segment, wiring.inputs, self.alarms, f"{spec.board}.plan")
+        self.outputs = OutputPorts(segment, wiring.outputs, self.alarms)
+        self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
+        self.faults = TaskFaults(segment, spec, self.outputs, level)
+        self._generation = 0
+        self._guard = ClockGuard(segment, self.alarms) if wiring.guards_clock else None
+
+    def begin(self) -> None:
+        """Report on the backplane that the task runs, and start to count its processor time."""
+        self.block[Block.STATE] = TaskState.RUNNING
+        self.stopwatch.begin()
+
+    def wait_until_next_cycle(self) -> int | None:
+        """Wait for the next release and return its tick; None when the run is over.
+
+        Faults take effect here, between two cycles, and the clock is checked.
+        """
+        tick = self.next_cycle.wait()
+        if tick is None:
+            return None
+        if self.words[_FAULTS] != self._generation:
+            self._generation = self.faults.refresh()
+        if self._guard is not None:
+            self._guard.check(tick, self.next_cycle.skipped)
+        return tick
+
+    @abstractmethod
+    def run(self) -> None:
+        """Cycle until the run is over."""
+
+
+class ClockGuard:
+    """A fast task's check of the clock: compares, at every release, the clock's ticks with monotonic time.
+
+    A missing release was skipped by the clock, not by the task, if the clock has counted it so.
+    """
+
+    def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
+        self._words = segment.words
+        self._clock = SystemClock(segment)
+        self._alarms = alarms
+        self._late_ns = self._clock.period_ns // 2
+        self._skipped = self._words[_CLOCK_SKIPPED]
+        self._quiet_from = 0
+
+    def check(self, tick: int, skipped: int) -> None:
+        """Check the clock in the cycle released at `tick`, before which `skipped` releases passed."""
+        words = self._words
+        if skipped and words[_CLOCK_SKIPPED] != self._skipped:
+            by_clock = words[_CLOCK_SKIPPED] - self._skipped
+            self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=by_clock, since=tick - by_clock)
+        self._skipped = words[_CLOCK_SKIPPED]
+        late_ns = words[_TICK_NS] - self._clock.time_of(tick)
+        # Only now: the time belongs to this tick as long as the clock has not come to the next.
+        if self._clock.is_lockstep or words[_TICK] != tick:
+            return
+        if late_ns > self._late_ns:
+            if tick >= self._quiet_from:
+                self._alarms.ring(tick, Alarm.CLOCK_LATE, value=late_ns)
+            self._quiet_from = tick + PUNCTUAL_TICKS
+
+
+def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
+    """Return `access`, made to take at least `time_ns` of processor time; `access` itself where that is 0.
+
+    This emulates a slower bus: programmed transfers over VME took the processor's time.
+    """
+    if not time_ns:
+        return access
+
+    def take(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        end = process_time_ns() + time_ns
+        result = access(*args, **kwargs)
+        compute_until(end)
+        return result
+
+    return take

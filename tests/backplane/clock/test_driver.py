@@ -1,0 +1,176 @@
+"""The clock in real time: ticks on the grid, and the order of releases."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+
+from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.released_task import by_priority
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.words import Block, Head, Run, System
+from tests.backplane.bus import layout, task
+from tests.backplane.conftest import MakeBus
+from tests.processes import in_thread
+
+PERIOD_NS = 1_000_000
+HISTORY = 8
+
+
+def start(segment: Segment, lead_ns: int = 3 * PERIOD_NS) -> None:
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    segment.words[System.EPOCH_NS] = time.monotonic_ns() + lead_ns
+
+
+def given_out(segment: Segment, stop: int, meanwhile: Callable[[int], object] = id) -> list[tuple[int, int]]:
+    """Run the clock in real time up to `stop`; return every tick with the time at which it was decided on."""
+    ticks: list[tuple[int, int]] = []
+
+    def ended(tick: int) -> int | None:
+        ticks.append((tick, time.monotonic_ns()))
+        meanwhile(tick)
+        return stop if tick >= stop else None
+
+    RealtimeDriver(segment, ended).run()
+    return ticks
+
+
+def test_no_tick_comes_before_its_grid_point(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    start(segment)
+    epoch = segment.words[System.EPOCH_NS]
+    ticks = given_out(segment, 40)
+    assert all(at >= epoch + tick * PERIOD_NS for tick, at in ticks)
+    assert all(first < second for (first, _), (second, _) in pairwise(ticks))
+
+
+def test_a_run_stops_at_its_tick_and_wakes_everybody(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    start(segment)
+    posts = [wake_semaphore(segment.rack, name) for name in ("writer", "reader")]
+    ticks = given_out(segment, 10)
+    assert segment.words[System.TICK] < 10 <= ticks[-1][0]
+    assert len(ticks) > 1
+    assert (segment.words[System.STATE], segment.words[System.STOP_TICK]) == (Run.STOPPED, 10)
+    released = len(ticks) - 1
+    assert [post.value for post in posts] == [released + 1] * 2
+
+
+def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> None:
+    segment, held_up = make_bus(), []
+
+    def hold_up(tick: int) -> None:
+        if tick >= 10 and not held_up:
+            held_up.append(tick)
+            time.sleep(0.006)
+
+    start(segment)
+    numbers = [tick for tick, _ in given_out(segment, 30, hold_up)]
+    behind = numbers[numbers.index(held_up[0]) + 1]
+    assert behind - held_up[0] >= 6
+    left_out = sum(second - first - 1 for first, second in pairwise([-1, *numbers]))
+    assert segment.words[System.CLOCK_SKIPPED] == left_out
+
+
+class Lagging:
+    """A controller that takes six ticks for every one of a run."""
+
+    def __init__(self) -> None:
+        self.ticks: list[int] = []
+
+    def begin(self, tick: int) -> None:
+        self.ticks.append(tick)
+        time.sleep(0.006)
+
+    def released(self, tick: int) -> None:
+        pass
+
+
+def test_a_late_clock_makes_the_last_tick_of_a_run(make_bus: MakeBus) -> None:
+    segment, controller = make_bus(), Lagging()
+    start(segment)
+    # Known from the start: a machine that stalls before the first tick makes the last one all the same.
+    segment.words[System.STOP_TICK] = 5
+    driver = RealtimeDriver(segment, lambda _: None)
+    driver.controller = controller
+    driver.run()
+    assert controller.ticks[-1] == 4
+    assert segment.words[System.CLOCK_SKIPPED] == 5 - len(controller.ticks)
+
+
+def test_a_clock_that_starts_late_does_not_shift_its_grid(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    start(segment, -10 * PERIOD_NS)
+    first = given_out(segment, 30)[0][0]
+    assert first >= 10
+    assert segment.words[System.CLOCK_SKIPPED] >= first
+
+
+def test_a_task_is_released_at_its_own_grid_points(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast"), task("slow", every=4, slot=3))
+    start(segment)
+    fast, slow, seen = segment.block("fast"), segment.block("slow"), []
+    ticks = given_out(segment, 40, lambda tick: seen.append((fast[Block.RELEASED], slow[Block.RELEASED])))
+    # What is seen at a tick is what the tick before it released, also where ticks were left out.
+    before = [tick for tick, _ in ticks][:-1]
+    assert seen == [(-1, -1), *((tick, tick - tick % 4) for tick in before)]
+
+
+def test_nothing_is_released_to_a_planner_within_its_time_slice(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast"), task("planner", slot=3))
+    start(segment)
+    block, released = segment.block("planner"), []
+    end_of_slice = 20
+
+    def plan(tick: int) -> None:
+        if released or block[Block.RELEASED] >= 3:
+            released.append(block[Block.RELEASED])
+            block[Block.DEADLINE] = max(end_of_slice, block[Block.DEADLINE])
+
+    ticks = [tick for tick, _ in given_out(segment, 40, plan)][-len(released) :]
+    # What is seen at a tick is what the tick before it released.
+    within = [seen for tick, seen in zip(ticks[1:], released, strict=False) if tick < end_of_slice]
+    assert set(within) == {released[0]}
+    assert released[-1] > end_of_slice
+
+
+@pytest.mark.parametrize("driver", ["realtime", "lockstep"])
+def test_a_clock_without_a_launcher_ends(make_bus: MakeBus, driver: str) -> None:
+    segment = make_bus()
+    start(segment)
+    segment.words[Head.LAUNCHER_START] += 1
+    never: Ended = lambda tick: None  # noqa: E731
+    clock: ClockDriver = RealtimeDriver(segment, never)
+    if driver == "lockstep":
+        clock = LockstepDriver(segment, never, False, HISTORY)
+    with in_thread(clock.run):
+        pass
+    assert segment.words[System.STATE] == Run.STOPPED
+
+
+def test_a_stop_requested_from_outside_ends_at_the_next_tick(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    start(segment)
+
+    def request(tick: int) -> None:
+        segment.words[System.STOP_REQUEST] |= tick >= 5
+
+    ticks = given_out(segment, 10_000, request)
+    stopped = segment.words[System.STOP_TICK]
+    assert stopped > segment.words[System.TICK] >= 5
+    assert stopped > ticks[-1][0]
+
+
+def test_executors_go_before_planners_and_the_faster_first() -> None:
+    tasks = [
+        task("planner", every=1, slot=2, role="planner"),
+        task("slow", every=8, slot=3),
+        task("right", every=1, slot=5),
+        task("left", every=1, slot=4),
+    ]
+    assert [t.name for t in by_priority(layout("any", (), tasks))] == ["left", "right", "slow", "planner"]

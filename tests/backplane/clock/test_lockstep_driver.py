@@ -1,0 +1,149 @@
+"""The clock in lockstep: a tick begins when every due task has finished."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.wake import NextCycle
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.words import Block, Run, System
+from tests.backplane.bus import task
+from tests.backplane.conftest import MakeBus
+from tests.processes import BOUND_S, FORKS, forked, in_thread
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+HISTORY = 8
+
+
+def serve(segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, str, int]], work_s: float) -> None:
+    """Do a task's cycles, slowly, and tell the clock of each."""
+    block = segment.block(name)
+    while (tick := cycle.wait()) is not None:
+        log.append(("begin", name, tick))
+        time.sleep(work_s)
+        log.append(("end", name, tick))
+        block[Block.DONE] = tick
+        clock_semaphore(segment.rack).release()
+
+
+def lockstep(
+    segment: Segment, stop: int, one_at_a_time: bool, poll: bool = False
+) -> tuple[list[tuple[str, str, int]], list[int]]:
+    """Run lockstep over slow tasks; return the log of their cycles, and the ticks in the order given out."""
+    log: list[tuple[str, str, int]] = []
+    ticks: list[int] = []
+
+    def ended(tick: int) -> int | None:
+        ticks.append(tick)
+        log.append(("tick", "clock", tick))
+        return stop if tick >= stop else None
+
+    segment.words[System.LOCKSTEP] = 1
+    # There before the first release: a task that comes later waits for the next one.
+    cycles = {t.name: NextCycle(segment, t.name, poll) for t in segment.layout.tasks}
+    threads = [
+        threading.Thread(target=serve, args=(segment, t.name, cycles[t.name], log, 0.002 * t.slot), daemon=True)
+        for t in segment.layout.tasks
+    ]
+    for thread in threads:
+        thread.start()
+    LockstepDriver(segment, ended, one_at_a_time, HISTORY).run()
+    for thread in threads:
+        thread.join(BOUND_S)
+        assert not thread.is_alive()
+    return log, ticks
+
+
+def test_lockstep_makes_every_tick_once(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast", slot=2), task("slow", every=4, slot=3))
+    _, ticks = lockstep(segment, 13, False)
+    assert ticks == list(range(14))
+    assert [segment.words[w] for w in (System.TICK, System.STOP_TICK, System.STATE)] == [12, 13, Run.STOPPED]
+
+
+@pytest.mark.parametrize("poll", [False, True])
+def test_a_lockstep_tick_begins_when_every_task_due_has_finished(make_bus: MakeBus, poll: bool) -> None:
+    segment = make_bus(task("fast", slot=2), task("slow", every=4, slot=5))
+    log, _ = lockstep(segment, 12, False, poll)
+    every = {"fast": 1, "slow": 4}
+    for name, period in every.items():
+        assert [tick for what, who, tick in log if (what, who) == ("begin", name)] == list(range(0, 12, period))
+        for tick in range(0, 12 - period, period):
+            assert log.index(("end", name, tick)) < log.index(("tick", "clock", tick + period))
+
+
+@pytest.mark.parametrize("poll", [False, True])
+def test_one_at_a_time_means_one_after_the_other(make_bus: MakeBus, poll: bool) -> None:
+    planner = task("planner", slot=4, role="planner")
+    segment = make_bus(planner, task("slow", every=2, slot=3), task("fast", slot=2))
+    log, _ = lockstep(segment, 6, True, poll)
+    expected: list[tuple[str, str, int]] = []
+    for tick in range(6):
+        expected.append(("tick", "clock", tick))
+        due = ["fast", "slow", "planner"] if tick % 2 == 0 else ["fast", "planner"]
+        expected += [(what, name, tick) for name in due for what in ("begin", "end")]
+    assert log == [*expected, ("tick", "clock", 6)]
+
+
+def test_a_task_that_waits_long_for_its_turn_does_not_begin_before_it(
+    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Waits end many times within one turn of the other task.
+    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", 0.001)
+    segment = make_bus(task("first", slot=9), task("second", slot=10))
+    log, _ = lockstep(segment, 3, True)
+    names = [name for what, name, _ in log if what == "begin"]
+    assert names == ["first", "second"] * 3
+    assert log.index(("end", "first", 1)) < log.index(("begin", "second", 1))
+
+
+def test_lockstep_waits_for_its_recorder(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast"))
+    segment.words[System.FOLLOWER_PID] = os.getpid()
+    ahead: list[int] = []
+
+    def ended(tick: int) -> int | None:
+        ahead.append(tick - segment.words[System.FOLLOWER_TICK])
+        return 100 if tick >= 100 else None
+
+    def record() -> None:
+        while segment.words[System.STATE] != Run.STOPPED:
+            segment.words[System.FOLLOWER_TICK] = segment.words[System.TICK]
+            time.sleep(0.0005)
+
+    segment.words[System.LOCKSTEP] = 1
+    cycle = NextCycle(segment, "fast")
+    with in_thread(lambda: serve(segment, "fast", cycle, [], 0)), in_thread(record):
+        LockstepDriver(segment, ended, False, HISTORY).run()
+    assert len(ahead) == 101
+    assert max(ahead) <= HISTORY + 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, None], ids=["dead", "stopped", "idle"])
+def test_a_recorder_that_takes_nothing_over_is_not_waited_for_long(
+    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch, number: signal.Signals | None
+) -> None:
+    monkeypatch.setattr("rack.backplane.clock.lockstep.IDLE_S", 0.05 if number else 60.0)
+    monkeypatch.setattr("rack.backplane.clock.lockstep.SLOW_S", 60.0 if number else 0.05)
+    segment = make_bus(task("fast"))
+    with forked(signal.pause) as follower:
+        if number is not None:
+            os.kill(follower, number)
+        segment.words[System.FOLLOWER_PID] = follower
+        _, ticks = lockstep(segment, 3 * HISTORY, False)
+    assert len(ticks) == 3 * HISTORY + 1
+    assert segment.words[System.FOLLOWER_PID] == 0
+
+
+def test_a_stop_ends_lockstep_though_a_task_hangs(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast"))
+    with in_thread(LockstepDriver(segment, lambda tick: None, False, HISTORY).run):
+        segment.words[System.STOP_REQUEST] = 1
+    assert segment.words[System.STATE] == Run.STOPPED

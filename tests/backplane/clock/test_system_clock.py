@@ -1,0 +1,72 @@
+"""The system clock as boards see it, and the rates that its grid permits."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from rack.backplane.clock.system_clock import SystemClock, ticks_of
+from rack.backplane.errors import ClockError
+from rack.backplane.words import Run, System
+from tests.backplane.conftest import MakeBus
+
+CLOCK_NS = 2_500_000
+
+
+@pytest.mark.parametrize(("rate_hz", "ticks"), [(400, 1), (50, 8), (4, 100), (1, 400), (400 / 3, 3), (0.1, 4000)])
+def test_a_rate_on_the_grid_is_a_number_of_ticks(rate_hz: float, ticks: int) -> None:
+    assert ticks_of(rate_hz, CLOCK_NS, "level") == ticks
+
+
+def test_a_rate_off_the_grid_is_refused_with_its_neighbours() -> None:
+    with pytest.raises(ClockError) as error:
+        ticks_of(60, CLOCK_NS, "level 'primitive'")
+    assert str(error.value) == (
+        "level 'primitive': 60 Hz does not divide the 400 Hz clock; "
+        "nearest: 57.14 Hz (every 7 ticks), 66.67 Hz (every 6 ticks)"
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [401, 1e9])
+def test_above_the_clocks_rate_there_is_one_neighbour(rate_hz: float) -> None:
+    with pytest.raises(ClockError, match=r"nearest: 400 Hz \(every 1 tick\)$"):
+        ticks_of(rate_hz, CLOCK_NS, "level")
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -50.0, float("nan")])
+def test_an_impossible_rate_is_refused(rate_hz: float) -> None:
+    with pytest.raises(ClockError, match="is not a rate"):
+        ticks_of(rate_hz, CLOCK_NS, "level")
+
+
+def test_ticks_lie_on_one_grid(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    segment.words[System.EPOCH_NS], segment.words[System.PERIOD_NS] = 1_000, 2_500_000
+    clock = SystemClock(segment)
+    assert [clock.time_of(tick) for tick in (0, 1, 400)] == [1_000, 2_501_000, 1_000_001_000]
+
+
+def test_in_real_time_the_grid_says_which_tick_has_come(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    period_ns = 1_000_000_000_000
+    segment.words[System.PERIOD_NS] = period_ns
+    segment.words[System.EPOCH_NS] = time.monotonic_ns() - 7 * period_ns - period_ns // 2
+    clock = SystemClock(segment)
+    assert (clock.now(), clock.tick) == (7, 0)
+
+
+def test_in_lockstep_the_clock_board_says_it(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    segment.words[System.LOCKSTEP], segment.words[System.TICK] = 1, 12
+    clock = SystemClock(segment)
+    assert (clock.now(), clock.tick) == (12, 12)
+
+
+def test_the_end_of_a_run_is_seen(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    clock, seen = SystemClock(segment), []
+    for state in Run:
+        segment.words[System.STATE] = state
+        seen.append(clock.is_stopped)
+    assert seen == [False, False, True]

@@ -1,0 +1,171 @@
+"""Protocol lock: bounded waits, mutual exclusion, and holders that die anywhere."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+
+import pytest
+
+from rack.backplane.mailbox.mailbox import Verdict
+from rack.backplane.mailbox.protocols import MailboxLock, open_reader, open_writer
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import lock_semaphore
+from tests.backplane.bus import NAME, mailbox
+from tests.backplane.conftest import MakeBus
+from tests.processes import BOUND_S, FORKS, descriptors, fork, forked, kill, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+TOLD = 200
+"""Words in the free part of the segment's head by which workers tell how far they are."""
+COUNT = 220
+WON, LOST = 1, 2
+
+
+@pytest.fixture
+def bus(make_bus: MakeBus) -> Segment:
+    return make_bus(mailbox("lock"))
+
+
+def hold(segment: Segment) -> None:
+    """Take the lock and keep it."""
+    assert MailboxLock(segment, NAME, BOUND_S).acquire()
+    segment.words[TOLD] = WON
+    time.sleep(60)
+
+
+def obtains(lock: MailboxLock) -> bool:
+    """Say whether a lock can be had within a few of its bounds."""
+    return any(lock.acquire() for _ in range(3))
+
+
+def test_a_wait_for_a_living_holder_ends_at_its_bound(bus: Segment) -> None:
+    lock = MailboxLock(bus, NAME)
+    with forked(lambda: hold(bus)):
+        wait_until(lambda: bus.words[TOLD])
+        assert [lock.acquire() for _ in range(5)] == [False] * 5
+    assert obtains(lock)
+
+
+def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
+    writer, reader = open_writer(bus, NAME), open_reader(bus, NAME)
+    writer.message.id = 1
+    assert writer.write(0, now=0)
+    assert reader.read(0).is_new
+    with forked(lambda: hold(bus)):
+        wait_until(lambda: bus.words[TOLD])
+        cut_off = reader.read(1)
+        assert (cut_off.value.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
+        assert not writer.write(1, now=1)
+    assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (1, 1, 1)
+    assert writer.write(2, now=2)
+    assert reader.read(2).is_new
+
+
+def test_a_bus_error_before_the_first_message_gives_none(bus: Segment) -> None:
+    reader = open_reader(bus, NAME)
+    with forked(lambda: hold(bus)):
+        wait_until(lambda: bus.words[TOLD])
+        assert reader.read(0).verdict is Verdict.NONE
+    assert reader.statistics.bus_errors == 1
+
+
+def compete(segment: Segment, word: int) -> None:
+    """Wait for the holder's end, try once, tell how it went, and keep the lock where it was obtained."""
+    lock = MailboxLock(segment, NAME)
+    segment.words[word] = -1
+    while not segment.words[TOLD - 1]:
+        pass
+    segment.words[word] = WON if lock.acquire() else LOST
+    time.sleep(60)
+
+
+@pytest.mark.parametrize("trial", range(15))
+def test_of_several_waiters_one_takes_over_from_a_killed_holder(bus: Segment, trial: int) -> None:
+    told = [TOLD + 1, TOLD + 2, TOLD + 3]
+    holder = fork(lambda: hold(bus))
+    waiters = [fork(lambda word=word: compete(bus, word)) for word in told]
+    try:
+        wait_until(lambda: bus.words[TOLD] and all(bus.words[word] for word in told))
+        kill(holder)
+        bus.words[TOLD - 1] = 1
+        wait_until(lambda: all(bus.words[word] > 0 for word in told))
+        assert sorted(bus.words[word] for word in told) == [WON, LOST, LOST]
+    finally:
+        for pid in (holder, *waiters):
+            kill(pid)
+    assert obtains(MailboxLock(bus, NAME))
+
+
+def cycle(segment: Segment, word: int = TOLD) -> None:
+    """Count in the critical section, by a read and a write that anybody in between would spoil."""
+    lock = MailboxLock(segment, NAME)
+    while True:
+        if not lock.acquire():
+            continue
+        before = segment.words[COUNT]
+        segment.words[COUNT + 1] = before
+        segment.words[COUNT] = segment.words[COUNT + 1] + 1
+        lock.release()
+        segment.words[word] += 1
+
+
+def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
+    told = [TOLD + 1, TOLD + 2, TOLD + 3]
+    workers = [fork(lambda word=word: cycle(bus, word)) for word in told]
+    try:
+        wait_until(lambda: all(bus.words[word] > 3_000 for word in told))
+        # While this process has the lock nobody counts.
+        assert MailboxLock(bus, NAME, BOUND_S).acquire()
+        counted = bus.words[COUNT]
+    finally:
+        for pid in workers:
+            kill(pid)
+    # A worker tells of its count behind the critical section.
+    assert 0 <= counted - sum(bus.words[word] for word in told) <= len(told)
+
+
+@pytest.mark.parametrize("bystanders", [0, 2])
+def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystanders: int) -> None:
+    rng, lock = random.Random(3), MailboxLock(bus, NAME)
+    others = [fork(lambda word=word: cycle(bus, word)) for word in range(TOLD + 1, TOLD + 1 + bystanders)]
+    try:
+        for _ in range(30):
+            bus.words[TOLD] = 0
+            victim = fork(lambda: cycle(bus))
+            wait_until(lambda: bus.words[TOLD])
+            time.sleep(rng.uniform(0.0, 0.001))
+            kill(victim)
+            wait_until(lock.acquire)
+            lock.release()
+    finally:
+        for pid in others:
+            kill(pid)
+
+
+def test_a_holder_overtaken_between_its_two_steps_is_not_the_owner(bus: Segment) -> None:
+    slow, quick = MailboxLock(bus, NAME), MailboxLock(bus, NAME)
+    # The slow one has passed the semaphore, and loses its core before it owns the lock.
+    lock_semaphore(bus.rack, NAME).acquire(0)
+    assert quick.acquire()
+    assert not slow._owner.take()
+    quick.release()
+    assert lock_semaphore(bus.rack, NAME).value == 1
+    assert slow.acquire()
+
+
+def test_a_semaphore_posted_once_too_often_lets_no_second_one_in(bus: Segment) -> None:
+    first, second = MailboxLock(bus, NAME), MailboxLock(bus, NAME)
+    lock_semaphore(bus.rack, NAME).release()
+    assert first.acquire()
+    assert not second.acquire()
+    first.release()
+    assert lock_semaphore(bus.rack, NAME).value == 1
+
+
+@pytest.mark.parametrize("opened", [open_writer, MailboxLock], ids=["writer", "lock"])
+def test_a_closed_end_leaves_no_file_open(bus: Segment, opened: Callable[[Segment, str], MailboxLock]) -> None:
+    before = descriptors()
+    opened(bus, NAME).close()
+    assert descriptors() == before

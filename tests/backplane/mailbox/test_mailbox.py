@@ -1,0 +1,230 @@
+"""Mailboxes under time-slice: verdicts, visibility by ticks alone, damage, and the one writer."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.backplane.errors import MailboxError
+from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
+from rack.backplane.mailbox.protocols import open_reader, open_writer
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.segment import Segment
+from tests.backplane.bus import NAME, mailbox, message_address
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, exit_status, fork
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+NONE, OLD, NEW, BUS_ERROR = Verdict.NONE, Verdict.OLD, Verdict.NEW, Verdict.BUS_ERROR
+
+
+def ends(segment: Segment) -> tuple[Writer, Reader]:
+    return open_writer(segment, NAME), open_reader(segment, NAME)
+
+
+def write(writer: Writer, tick: int, now: int | None = None) -> bool:
+    """Write a message that carries its own serial."""
+    writer.message.id = writer.serial + 1
+    return writer.write(tick, now)
+
+
+def seen(reader: Reader, tick: int) -> tuple[int, Verdict]:
+    """Return the serial that a read at `tick` gives, and its verdict."""
+    reading = reader.read(tick)
+    return reading.value.id, reading.verdict
+
+
+def test_nothing_has_come_before_the_first_message(make_bus: MakeBus) -> None:
+    _, reader = ends(make_bus(mailbox()))
+    assert seen(reader, 100) == (0, NONE)
+    assert not reader.read(100).is_there
+
+
+def test_a_message_becomes_visible_at_the_end_of_its_slice(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(mailbox(every=4, delay=8)))
+    assert write(writer, 4, now=6)
+    assert [seen(reader, tick) for tick in (6, 11)] == [(0, NONE), (0, NONE)]
+    assert [seen(reader, tick) for tick in (12, 13)] == [(1, NEW), (1, OLD)]
+    assert reader.newest == 4
+
+
+@pytest.mark.parametrize(("every", "delay"), [(1, 1), (2, 2), (2, 6), (4, 4)])
+@pytest.mark.parametrize("ahead", [0, 3])
+def test_reads_depend_on_ticks_alone(make_bus: MakeBus, every: int, delay: int, ahead: int) -> None:
+    writer, reader = ends(make_bus(mailbox(every=every, delay=delay, depth=32)))
+    released = -every
+    for tick in range(40):
+        # However far the writer has come meanwhile, the reader sees the slices that have ended.
+        while released + every <= tick + ahead:
+            released += every
+            write(writer, released)
+        serial = max(0, (tick - delay) // every + 1)
+        assert seen(reader, tick)[0] == serial
+
+
+def test_a_late_message_becomes_visible_at_its_writers_next_boundary(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(mailbox(every=4, delay=4)))
+    assert write(writer, 0, now=3)
+    assert not write(writer, 4, now=9)
+    assert [seen(reader, tick) for tick in (4, 8, 11)] == [(1, NEW), (1, OLD), (1, OLD)]
+    assert seen(reader, 12) == (2, NEW)
+
+
+def test_a_message_at_the_very_boundary_is_late(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(mailbox()))
+    assert not write(writer, 0, now=1)
+    assert [seen(reader, tick) for tick in (1, 2)] == [(0, NONE), (1, NEW)]
+
+
+def test_a_slow_reader_takes_the_newest_visible(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(mailbox()))
+    for tick in range(6):
+        write(writer, tick)
+    assert seen(reader, 4) == (4, NEW)
+    assert seen(reader, 4) == (4, OLD)
+
+
+def test_messages_keep_the_tick_that_their_information_rests_on(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(mailbox()))
+    writer.write(7, basis=3)
+    reader.read(8)
+    assert reader.basis == 3
+    writer.write(8)
+    reader.read(9)
+    assert reader.basis == 8
+
+
+def test_the_host_peeks_at_the_newest_at_once(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox(every=8, delay=8))
+    writer, host, board = *ends(segment), open_reader(segment, NAME)
+    write(writer, 0)
+    assert (host.peek().value.id, host.serial) == (1, 1)
+    assert host.peek().verdict is OLD
+    assert seen(board, 0) == (0, NONE)
+
+
+def test_a_damaged_message_is_counted_and_the_last_good_one_kept(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    writer, reader = ends(segment)
+    write(writer, 0)
+    assert seen(reader, 1) == (1, NEW)
+    write(writer, 1)
+    segment.bytes[message_address(segment, 2) + 3] ^= 0x10
+    assert seen(reader, 2) == (1, OLD)
+    assert (reader.statistics.corrupt, reader.statistics.bus_errors) == (1, 0)
+    write(writer, 2)
+    assert seen(reader, 3) == (3, NEW)
+
+
+def test_every_bit_of_a_message_is_checked(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    writer, reader = ends(segment)
+    write(writer, 0)
+    first = message_address(segment, 1)
+    for at in range(first, first + writer.spec.size):
+        segment.bytes[at] ^= 1
+        assert seen(reader, 1) == (0, NONE)
+        segment.bytes[at] ^= 1
+    assert reader.statistics.corrupt == writer.spec.size
+    assert seen(reader, 1) == (1, NEW)
+
+
+def test_a_message_overwritten_before_it_is_read_is_a_bus_error(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox(depth=8))
+    writer, reader = ends(segment)
+    write(writer, 0)
+    assert seen(reader, 1) == (1, NEW)
+    for tick in range(1, 30):
+        write(writer, tick)
+    # Tick 10 saw message 10, and the slots reach back to 23 only: a later message would be the future's.
+    assert seen(reader, 10) == (1, BUS_ERROR)
+    assert (reader.statistics.bus_errors, reader.statistics.corrupt) == (1, 0)
+    assert seen(reader, 28) == (28, NEW)
+
+
+def test_a_bus_error_before_any_message_shows_no_message(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(mailbox(depth=8)))
+    for tick in range(30):
+        write(writer, tick)
+    assert seen(reader, 10) == (0, NONE)
+    assert not reader.read(10).is_there
+    assert reader.statistics.bus_errors == 2
+
+
+@pytest.mark.parametrize("depth", [4, 8, 32])
+def test_slots_reach_back_as_far_as_they_can(make_bus: MakeBus, depth: int) -> None:
+    writer, reader = ends(make_bus(mailbox(depth=depth)))
+    for tick in range(100):
+        write(writer, tick)
+    oldest = 100 - depth + 1
+    assert seen(reader, oldest - 1) == (0, NONE)
+    assert seen(reader, oldest) == (oldest, NEW)
+
+
+def test_a_second_writer_is_refused_with_the_first_ones_process(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    writer = open_writer(segment, NAME)
+
+    def second(pid: int) -> bool:
+        with pytest.raises(MailboxError, match=f"'{NAME}' has a writer already, process {pid}; permitted: one"):
+            open_writer(segment, NAME)
+        return True
+
+    pid = segment.launcher
+    assert second(pid)
+    assert exit_status(fork(lambda: second(pid))) == 0
+    writer.close()
+    open_writer(segment, NAME)
+
+
+def test_the_claim_ends_with_its_process(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    assert exit_status(fork(lambda: write(open_writer(segment, NAME), 0))) == 0
+    open_writer(segment, NAME)
+
+
+def test_a_new_writer_continues_after_the_last_message_in_a_new_epoch(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    slots = Slots(segment, segment.layout.mailbox(NAME))
+    first, reader = ends(segment)
+    write(first, 0)
+    first.close()
+    second = open_writer(segment, NAME)
+    assert second.serial == 1
+    write(second, 1)
+    assert [seen(reader, tick) for tick in (1, 2)] == [(1, NEW), (2, NEW)]
+    epochs = [slots.epoch for serial in (1, 2) if slots.fetch(serial)]
+    assert epochs == [1, 2]
+
+
+def test_the_chain_does_not_show_where_a_writer_was_replaced(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox(), mailbox(name="writer.other"))
+    whole, part = open_writer(segment, NAME), open_writer(segment, "writer.other")
+    for tick in range(6):
+        if tick == 3:
+            part.close()
+            part = open_writer(segment, "writer.other")
+        write(whole, tick)
+        write(part, tick)
+    chains = {name: open_reader(segment, name) for name in (NAME, "writer.other")}
+    for reader in chains.values():
+        reader.peek()
+    assert len({reader.chain for reader in chains.values()}) == 1
+
+
+def test_the_chain_depends_on_every_earlier_message(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox(), mailbox(name="writer.other"))
+    for name, first in ((NAME, 1), ("writer.other", 2)):
+        writer = open_writer(segment, name)
+        writer.message.id = first
+        writer.write(0)
+        writer.message.id = 9
+        writer.write(1)
+    readers = [open_reader(segment, name) for name in (NAME, "writer.other")]
+    assert {reader.peek().value.id for reader in readers} == {9}
+    assert readers[0].chain != readers[1].chain
+
+
+def test_an_unknown_mailbox_is_no_mailbox(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    with pytest.raises(KeyError, match="nobody"):
+        open_reader(segment, "nobody.status")

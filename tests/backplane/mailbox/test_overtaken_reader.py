@@ -1,0 +1,134 @@
+"""A reader that loses its core anywhere while its writer goes round the ring: what it judged by then proves nothing.
+
+The reader is stopped before each single instruction of a read in turn, as the kernel may stop it, and the writer goes
+on meanwhile, up to the middle of a message.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+import pytest
+
+import rack.backplane
+from rack.backplane.layout import Protocol
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.watch.alarms import Alarm
+from tests.backplane.bus import NAME
+from tests.link import Link, MakeLink, links
+
+DEPTH = 8
+READ_EVERY = 3
+LEAST = 300
+"""Instructions at which a reader is overtaken, at least: one that finds nothing new has fewer."""
+CODE = next(iter(rack.backplane.__path__))
+FAULTS = {
+    "": set(),
+    "drop": {Alarm.GAP},
+    "corrupt": {Alarm.DAMAGED},
+    "delay": {Alarm.HELD_BACK},
+    "reorder": {Alarm.DISORDER, Alarm.HELD_BACK},
+}
+"""Kinds of fault, and what a reader may ring for each."""
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    with links(rack_name) as make:
+        yield make
+
+
+class Interruption:
+    """Counts the instructions of `backplane` that are carried out, and before that number `at` calls `action`."""
+
+    def __init__(self, at: int, action: Callable[[], None]) -> None:
+        self._left, self._action = at, action
+
+    @property
+    def has_come(self) -> bool:
+        """Whether there were that many instructions."""
+        return self._left < 0
+
+    @contextmanager
+    def armed(self) -> Iterator[None]:
+        """Count in this block."""
+        before = sys.gettrace()
+        sys.settrace(self._trace)
+        try:
+            yield
+        finally:
+            sys.settrace(before)
+
+    def _trace(self, frame: FrameType, event: str, _: object) -> Any:
+        if not frame.f_code.co_filename.startswith(CODE):
+            return None
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        if event == "opcode":
+            self._left -= 1
+            if self._left == -1:
+                # Nothing of the writer's is traced: tracing is off in here.
+                self._action()
+        return self._trace
+
+
+class Overtaken:
+    """A link whose reader is overtaken by its writer, in the middle of a read."""
+
+    def __init__(self, rack: Link) -> None:
+        self.rack, self.tick = rack, 0
+        self._slots = Slots(rack.segment, rack.segment.layout.mailbox(NAME))
+
+    def write(self, cycles: int) -> None:
+        """Do cycles of the writer."""
+        for _ in range(cycles):
+            self.rack.writer.cycle(self.tick)
+            self.tick += 1
+
+    def read(self) -> None:
+        """Read as of now."""
+        self.rack.reader.cycle(self.tick - self.tick % READ_EVERY)
+
+    def is_overtaken(self, at: int, cycles: int, stops_halfway: bool) -> bool:
+        """Read, and have the writer do its cycles before that instruction; False when there are not so many."""
+
+        def overtake() -> None:
+            self.write(cycles)
+            if stops_halfway:
+                self._write_half()
+
+        interruption = Interruption(at, overtake)
+        with interruption.armed():
+            self.read()
+        return interruption.has_come
+
+    def _write_half(self) -> None:
+        """Leave the writer in the middle of the copy of one more message into its slot."""
+        serial, stride = self._slots.box[0] + 1, len(self._slots.ring) // DEPTH
+        self._slots.fetch(serial - 1)
+        half, start = len(self._slots.record) // 2, serial % DEPTH * stride
+        self._slots.ring[start : start + half] = self._slots.record[:half]
+
+
+@pytest.mark.parametrize("protocol", ["time-slice", "double-buffer"])
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_reader_overtaken_at_any_instruction_reports_nothing_false(
+    link: MakeLink, protocol: Protocol, kind: str
+) -> None:
+    rack = link(protocol, rates=(1, READ_EVERY), depth=DEPTH)
+    reader, rung, at = Overtaken(rack), set(), 0
+    reader.write(DEPTH)
+    reader.read()
+    if kind:
+        rack.fault(kind, *([0.5] if kind != "delay" else []))
+    # A message that is dropped is not in the middle of its copy.
+    while reader.is_overtaken(at, DEPTH - 2 + at % (DEPTH + 4), kind != "drop") or at < LEAST:
+        at += 2 if kind else 1
+        reader.write(READ_EVERY)
+        reader.read()
+        reader.write(READ_EVERY)
+        rung |= {code for _, code in rack.alarms()}
+    assert rung <= FAULTS[kind]

@@ -1,0 +1,121 @@
+"""The protocols compared: when a message becomes visible, and the state a dead writer leaves."""
+
+from __future__ import annotations
+
+import random
+import time
+from hashlib import blake2b
+
+import numpy as np
+import pytest
+
+from rack.backplane.address_map import SLOT_HEAD_SIZE
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.mailbox.mailbox import Reader, Verdict
+from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
+from rack.backplane.mailbox.slots import CHAIN_AT, CHAIN_FROM, Slots
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import lock_semaphore
+from tests.backplane.bus import NAME, mailbox
+from tests.backplane.conftest import MakeBus
+from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+READS = 100_000
+KILLS = 25
+AT_ONCE: tuple[Protocol, ...] = ("double-buffer", "lock")
+
+
+def hammer(segment: Segment) -> None:
+    """Write for ever; every place of a message holds its serial."""
+    writer = open_writer(segment, NAME)
+    while True:
+        # A write that the lock cut off has no serial.
+        serial = writer.serial + 1
+        writer.message.id = serial
+        writer.message.row[:] = serial
+        writer.write(serial)
+
+
+def is_whole(reader: Reader) -> bool:
+    """Say whether the last good message holds its own serial everywhere."""
+    row = reader.message.row
+    return reader.message.id == row[0] == reader.serial and bool((row == row[0]).all())
+
+
+@pytest.mark.parametrize("protocol", AT_ONCE)
+def test_a_message_shows_at_once(make_bus: MakeBus, protocol: Protocol) -> None:
+    segment = make_bus(mailbox(protocol, every=8, delay=8))
+    writer, reader = open_writer(segment, NAME), open_reader(segment, NAME)
+    assert reader.read(0).verdict is Verdict.NONE
+    assert writer.write(0, now=2)
+    assert [reader.read(0).verdict for _ in range(2)] == [Verdict.NEW, Verdict.OLD]
+
+
+@pytest.mark.parametrize("protocol", AT_ONCE)
+def test_a_late_message_is_reported_under_every_protocol(make_bus: MakeBus, protocol: Protocol) -> None:
+    writer = open_writer(make_bus(mailbox(protocol, every=2, delay=4)), NAME)
+    assert [writer.write(0, now) for now in (None, 3, 4, 9)] == [True, True, False, False]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_an_observer_reads_by_its_protocol_and_never_waits(make_bus: MakeBus, protocol: Protocol) -> None:
+    segment = make_bus(mailbox(protocol, every=4, delay=4))
+    writer, observer = open_writer(segment, NAME), open_observer(segment, NAME)
+    writer.write(0)
+    if protocol == "lock":
+        lock_semaphore(segment.rack, NAME).acquire(0)
+    expected = Verdict.NONE if protocol == "time-slice" else Verdict.NEW
+    assert observer.read(0).verdict is expected
+    assert observer.read(4).is_there
+    assert observer.statistics.bus_errors == 0
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_reader_never_gets_half_a_message(make_bus: MakeBus, protocol: Protocol) -> None:
+    segment = make_bus(mailbox(protocol, depth=4))
+    reader, latest, fresh = open_reader(segment, NAME), np.iinfo(np.int64).max, 0
+    with forked(lambda: hammer(segment)):
+        deadline = time.monotonic() + BOUND_S
+        while reader.statistics.accesses < READS or fresh < READS // 100:
+            fresh += reader.read(latest).is_new
+            assert is_whole(reader)
+            assert time.monotonic() < deadline
+    assert reader.statistics.corrupt == 0
+
+
+def follows(slots: Slots, serial: int) -> bool:
+    """Say whether a message's chain follows from the message before it."""
+    assert slots.fetch(serial - 1)
+    before = slots.chain
+    assert slots.fetch(serial)
+    linked = bytearray(slots.record)
+    linked[CHAIN_AT:SLOT_HEAD_SIZE] = before
+    return blake2b(linked[CHAIN_FROM:], digest_size=8).digest() == slots.chain
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_writer_killed_anywhere_leaves_its_last_whole_message(make_bus: MakeBus, protocol: Protocol) -> None:
+    segment = make_bus(mailbox(protocol, depth=4))
+    reader, slots = open_reader(segment, NAME), Slots(segment, segment.layout.mailbox(NAME))
+    rng, latest = random.Random(7), np.iinfo(np.int64).max
+    for _ in range(KILLS):
+        writer, known = fork(lambda: hammer(segment)), reader.serial
+        wait_until(lambda: reader.peek().is_there and reader.serial > known)  # noqa: B023  called before the next turn
+        time.sleep(rng.uniform(0.0, 0.002))
+        kill(writer)
+        assert reader.read(latest).is_there
+        assert reader.serial == slots.box[0]
+        assert is_whole(reader)
+        successor = open_writer(segment, NAME)
+        assert successor.serial == reader.serial
+        successor.message.id = successor.serial + 1
+        successor.message.row[:] = successor.serial + 1
+        successor.write(successor.serial + 1)
+        successor.close()
+        assert follows(slots, reader.serial + 1)
+        assert reader.read(latest).is_new
+    # A hammering writer may overtake a reader: a bus error. It never shows a damaged message.
+    assert reader.statistics.corrupt == 0
+    assert slots.fetch(reader.serial)
+    assert slots.epoch == 2 * KILLS

@@ -1,0 +1,173 @@
+"""Checks on messages: no alarm for a slow machine, and one alarm an episode for each fault."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.watch.alarms import CLEAN_READS, Alarm
+from tests.backplane.bus import NAME, message_address
+from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    with links(rack_name) as make:
+        yield make
+
+
+def publish(rack: Link, tick: int, visible_at: int) -> None:
+    """Publish a message behind the back of its task."""
+    writer = rack.writer.ports.writers["point"]
+    writer.message.id = tick
+    writer.message.row = tick
+    writer.publish(tick, visible_at, tick)
+
+
+def test_messages_before_the_first_read_are_not_judged(link: MakeLink) -> None:
+    rack = link()
+    rack.fault("drop", 0.5)
+    rack.fault("corrupt", 0.5)
+    rack.fault("reorder", 0.5)
+    for tick in range(40):
+        rack.writer.cycle(tick)
+    rack.heal()
+    rack.writer.cycle(40)
+    rack.reader.cycle(41)
+    assert rack.alarms() == []
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_reader_that_skips_cycles_reports_nothing_false(link: MakeLink, protocol: Protocol) -> None:
+    rack = link(protocol)
+    for pause in (1, 2, 18, 100):
+        start = rack.reader.seen[-1].tick + 1 if rack.reader.seen else 0
+        rack.run(start, start + 30)
+        for tick in range(start + 30, start + 30 + pause):
+            rack.writer.cycle(tick)
+        rack.run(start + 30 + pause, start + 60 + pause)
+    assert rack.alarms() == []
+    assert not any(seen.is_lost for seen in rack.reader.seen)
+
+
+def test_a_late_reader_reports_nothing_false(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    # It was released at 20, and lost its core while its writer went on.
+    for tick in range(20, 38):
+        rack.writer.cycle(tick)
+    assert rack.reader.cycle(20).value.id == 19
+    assert rack.reader.cycle(38).value.id == 37
+    assert rack.alarms() == []
+
+
+def test_a_reader_that_finds_everything_overwritten_continues(link: MakeLink) -> None:
+    rack = link(depth=8)
+    rack.run(0, 20)
+    for tick in range(20, 100):
+        rack.writer.cycle(tick)
+    rack.run(100, 120)
+    assert rack.alarms() == []
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("late", [1, 2, 18])
+def test_a_writer_that_is_late_or_skips_cycles_is_no_fault(link: MakeLink, protocol: Protocol, late: int) -> None:
+    rack = link(protocol)
+    rack.run(0, 20)
+    for tick in range(20, 20 + late):
+        rack.reader.cycle(tick)
+    # Released at 20, finished at 20 + late: the releases in between are skipped.
+    rack.writer.cycle(20, now=20 + late)
+    rack.run(20 + late, 80)
+    assert rack.alarms() == []
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_writer_that_loses_its_core_between_the_clock_and_its_slot_is_no_fault(
+    link: MakeLink, protocol: Protocol
+) -> None:
+    rack = link(protocol)
+    rack.run(0, 20)
+    for tick in range(20, 38):
+        rack.reader.cycle(tick)
+    # It asked for the time in time, then stood still: the message names a tick that has passed long ago.
+    publish(rack, 20, 21)
+    rack.reader.cycle(38)
+    rack.writer.end(20)
+    rack.run(39, 80)
+    assert rack.alarms() == []
+
+
+def test_a_message_after_the_end_of_its_cycle_was_held_back(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.writer.end(20)
+    publish(rack, 20, 25)
+    rack.run(25, 30)
+    assert rack.alarms() == [(25, Alarm.HELD_BACK)]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_restarted_reader_reports_nothing_false(link: MakeLink, protocol: Protocol) -> None:
+    rack = link(protocol)
+    rack.run(0, 50)
+    for tick in range(50, 450):
+        rack.writer.cycle(tick)
+    rack.reader = ReadingTask(rack.segment)
+    rack.run(450, 500)
+    assert rack.alarms() == []
+    assert not any(seen.is_lost for seen in rack.reader.seen)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("published", [False, True])
+def test_a_restarted_writer_is_not_taken_for_a_fault(link: MakeLink, protocol: Protocol, published: bool) -> None:
+    rack = link(protocol)
+    rack.run(0, 50)
+    if published:
+        # Killed behind its write, before the end of its cycle.
+        publish(rack, 50, 51)
+    rack.writer.close()
+    rack.reader.cycle(50)
+    for tick in range(51, 250):
+        rack.reader.cycle(tick)
+    rack.writer = WritingTask(rack.segment)
+    rack.run(250, 300)
+    assert rack.alarms() == []
+    assert rack.alarms("writer") == []
+    assert rack.reader.seen[-1].released == 299 - (protocol == "time-slice")
+
+
+def test_an_episode_rings_once_and_a_later_one_again(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    for first in (20, 200):
+        rack.fault("corrupt", 0.7)
+        rack.run(first, first + 100)
+        rack.heal()
+        rack.run(first + 100, first + 102 + CLEAN_READS)
+    assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED] * 2
+
+
+@pytest.mark.parametrize("rates", [(1, 8), (1, 24)])
+def test_a_slow_reader_finds_damage_in_messages_it_skips(link: MakeLink, rates: tuple[int, int]) -> None:
+    rack = link(rates=rates)
+    rack.run(0, 97)
+    rack.writer.cycle(97)
+    # The message of tick 97: its reader takes a later one.
+    rack.segment.bytes[message_address(rack.segment, 98, NAME) + 9] ^= 4
+    rack.run(98, 121)
+    assert rack.reader.ports.corrupt == 0
+    assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED]
+
+
+def test_a_slot_whose_head_is_damaged_is_damaged_and_not_lost(link: MakeLink) -> None:
+    rack = link(rates=(1, 8))
+    rack.run(0, 20)
+    for at in range(-64, 0):
+        rack.segment.bytes[message_address(rack.segment, 19) + at] ^= 0x80
+    rack.run(20, 40)
+    assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED]

@@ -1,0 +1,170 @@
+"""Checks on silence: an alarm needs proof; silence alone is a reason to hold."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.mailbox.protocols import MailboxLock
+from rack.backplane.process import state_of
+from rack.backplane.trace import Flag
+from rack.backplane.watch.alarms import Alarm
+from rack.backplane.words import Block
+from tests.backplane.bus import NAME
+from tests.link import MakeLink, ReadingTask, WritingTask, links
+from tests.processes import FORKS, forked, kill, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    with links(rack_name) as make:
+        yield make
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_writer_that_is_only_late_is_neither_mute_nor_stale(link: MakeLink, protocol: Protocol) -> None:
+    rack = link(protocol)
+    rack.run(0, 20)
+    for tick in range(20, 60):
+        rack.reader.cycle(tick)
+    assert rack.alarms() == []
+    # But who reads it holds: a cycle and the slice are lawful, three more are not.
+    age = 3 + rack.segment.layout.mailbox(NAME).delay
+    assert [seen.tick for seen in rack.reader.seen if seen.is_lost] == [*range(19 + age, 60)]
+
+
+def test_a_writer_that_finishes_cycles_without_a_message_is_mute(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    for tick in range(20, 30):
+        rack.writer.end(tick)
+        rack.reader.cycle(tick)
+    assert rack.alarms() == [(22, Alarm.MUTE)]
+    # The next good message ends the episode, and the next silence is another.
+    rack.run(30, 40)
+    for tick in range(40, 50):
+        rack.writer.end(tick)
+        rack.reader.cycle(tick)
+    assert rack.alarms() == [(42, Alarm.MUTE)]
+
+
+def test_a_write_cut_off_by_a_lock_is_not_mute(link: MakeLink) -> None:
+    rack = link("lock")
+    rack.run(0, 20)
+    for tick in range(20, 30):
+        rack.writer.end(tick, int(Flag.BUS_ERROR))
+        rack.reader.cycle(tick)
+    assert rack.alarms() == []
+
+
+def test_the_clock_may_say_for_a_lost_task_that_it_has_finished(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.segment.block("writer")[Block.DONE] = 25
+    for tick in range(20, 60):
+        rack.reader.cycle(tick)
+    assert rack.alarms() == []
+
+
+@pytest.mark.parametrize(("number", "state"), [(signal.SIGSTOP, "T"), (signal.SIGKILL, "Z")])
+def test_a_message_whose_writer_is_dead_or_stopped_is_stale(link: MakeLink, number: signal.Signals, state: str) -> None:
+    rack = link()
+    rack.writer.close()
+
+    def write() -> None:
+        writer = WritingTask(rack.segment)
+        for tick in range(20):
+            writer.cycle(tick)
+        signal.pause()
+
+    with forked(write) as pid:
+        wait_until(lambda: rack.segment.block("writer")[Block.DONE] == 19)
+        rack.reader.cycle(19)
+        for tick in range(20, 30):
+            rack.reader.cycle(tick)
+        assert rack.alarms() == []
+        os.kill(pid, number)
+        wait_until(lambda: state_of(pid) == state)
+        for tick in range(30, 40):
+            rack.reader.cycle(tick)
+        assert rack.alarms() == [(30, Alarm.STALE)]
+        kill(pid)
+    rack.writer = WritingTask(rack.segment)
+    rack.run(40, 60)
+    assert rack.alarms() == []
+
+
+def test_a_neighbour_finds_a_death_four_cycles_old(link: MakeLink) -> None:
+    rack = link()
+    rack.writer.close()
+
+    def write() -> None:
+        writer = WritingTask(rack.segment)
+        for tick in range(20):
+            writer.cycle(tick)
+
+    with forked(write) as pid:
+        wait_until(lambda: state_of(pid) == "Z")
+        for tick in range(18, 40):
+            rack.reader.cycle(tick)
+    assert rack.alarms() == [(23, Alarm.STALE)]
+
+
+def test_a_marked_loss_shows_from_the_next_tick(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.segment.block("writer")[Block.LOST] = 1 + 20
+    assert [rack.reader.cycle(tick).is_lost for tick in (20, 21, 22)] == [False, True, True]
+    rack.segment.block("writer")[Block.LOST] = 0
+    assert not rack.reader.cycle(22).is_lost
+
+
+def test_a_lost_writer_that_never_wrote_gives_nothing_to_hold(link: MakeLink) -> None:
+    rack = link()
+    rack.segment.block("writer")[Block.LOST] = 1
+    assert not rack.reader.cycle(5).is_lost
+    assert not rack.reader.cycle(500).is_lost
+
+
+@pytest.mark.parametrize("rates", [(1, 1), (1, 8), (8, 1)])
+def test_after_a_pause_of_the_clock_no_writer_is_silent(link: MakeLink, rates: tuple[int, int]) -> None:
+    rack = link(rates=rates)
+    rack.run(0, 80)
+    # It left 40 ticks out: nobody was released, and every message is old.
+    rack.run(120, 200)
+    assert rack.alarms() == []
+    assert not any(seen.is_lost for seen in rack.reader.seen)
+
+
+def test_a_pause_does_not_hide_a_writer_that_stays_away(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    lost = [rack.reader.cycle(tick).is_lost for tick in range(60, 70)]
+    assert lost == [False] * 4 + [True] * 6
+
+
+def test_a_restarted_reader_gives_its_writer_time(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.reader = ReadingTask(rack.segment)
+    assert not rack.reader.cycle(300).is_lost
+    assert rack.alarms() == []
+
+
+def test_whoever_waits_for_a_living_holder_is_not_held_up(link: MakeLink) -> None:
+    rack = link("lock")
+    rack.run(0, 20)
+    holder = MailboxLock(rack.segment, NAME)
+    assert holder.acquire()
+    for tick in range(20, 30):
+        rack.reader.cycle(tick)
+        assert not rack.writer.cycle(tick)
+    holder.release()
+    assert rack.alarms() == rack.alarms("writer") == []
+    assert rack.reader.ports.bus_errors == rack.writer.ports.bus_errors == 10

@@ -1,0 +1,89 @@
+"""Reading a mailbox of the clock: silence is not a fault; a damaged or forged message is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.slots import claim
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.silence_watch import ReadingTask
+from rack.backplane.watch.watched_reader import SporadicReader, WatchedReader, watched
+from rack.backplane.words import Slot
+from tests.backplane.bus import mailbox, message_address
+from tests.backplane.conftest import MakeBus
+
+BOX = "reader.operator"
+
+
+@pytest.fixture
+def segment(make_bus: MakeBus) -> Segment:
+    return make_bus(mailbox(), mailbox(name=BOX, writer="clock"))
+
+
+@pytest.fixture
+def writer(segment: Segment) -> Iterator[Writer]:
+    made = Writer(segment, BOX)
+    yield made
+    made.close()
+
+
+def open_reader(segment: Segment, name: str = BOX) -> WatchedReader | SporadicReader:
+    return watched(segment, name, AlarmWriter(segment, "reader"), ReadingTask())
+
+
+def rung(segment: Segment) -> list[Alarm]:
+    return [Alarm(int(row["code"])) for row in alarm_ring(segment, "reader").drain().rows]
+
+
+def test_only_mailboxes_of_the_clock_are_sporadic(segment: Segment) -> None:
+    assert isinstance(open_reader(segment), SporadicReader)
+    assert isinstance(open_reader(segment, "writer.point"), WatchedReader)
+
+
+def test_silence_is_no_loss(segment: Segment, writer: Writer) -> None:
+    reader = open_reader(segment)
+    assert not reader.read(5).is_there
+    writer.message.id = 7
+    writer.write(10)
+    assert not reader.read(10).is_there
+    assert reader.read(11).is_new
+    late = reader.read(10_000)
+    assert (late.value.id, late.is_lost, late.is_new) == (7, False, False)
+    assert rung(segment) == []
+
+
+def test_several_messages_of_one_tick_are_no_babble(segment: Segment, writer: Writer) -> None:
+    reader = open_reader(segment)
+    for number in range(1, 6):
+        writer.message.id = number
+        writer.write(10)
+    assert reader.read(11).value.id == 5
+    assert rung(segment) == []
+
+
+def test_a_damaged_message_is_rejected_and_reported(segment: Segment, writer: Writer) -> None:
+    reader = open_reader(segment)
+    for number in (1, 2):
+        writer.message.id = number
+        writer.write(10 * number)
+    segment.bytes[message_address(segment, 2, BOX)] ^= 1
+    assert reader.read(30).value.id == 1
+    assert rung(segment) == [Alarm.DAMAGED]
+
+
+def test_a_forged_message_is_rejected_and_reported(segment: Segment, writer: Writer) -> None:
+    reader = open_reader(segment)
+    writer.message.id = 1
+    writer.write(10)
+    assert reader.read(11).value.id == 1
+    # Whoever has no claim signs as another process.
+    writer._slots._words[Slot.EPOCH] = claim(1, os.getpid() + 1)
+    writer.message.id = 2
+    writer.write(20)
+    assert reader.read(21).value.id == 1
+    assert rung(segment) == [Alarm.MASQUERADE]

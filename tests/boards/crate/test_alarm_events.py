@@ -1,0 +1,176 @@
+"""Alarms as events: rung into the rings of a real segment, and read as the Rack reads them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from functools import partial
+
+import pytest
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.fault_table import FaultTable
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.watch.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
+from rack.backplane.words import Demand
+from rack.boards.config import load, wire
+from rack.boards.config.cell import geom_name
+from rack.boards.crate.alarm_events import AlarmEvents
+from rack.boards.events import Event
+from rack.boards.faults.request import injections
+from rack.levels.robot.cell import build_cell
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import rack
+
+JOINTS = ("shoulder", "elbow")
+FAULTS = (
+    {"kind": "mute", "board": "wave", "mailbox": "wave.status", "for": "100ms"},
+    {"kind": "sensor-bias", "board": "driven", "joint": 1, "size": 0.1},
+    {"kind": "kill", "board": "clock"},
+)
+KINDS = {
+    **dict.fromkeys(Alarm, "detection"),
+    **dict.fromkeys(MISSES, "miss"),
+    Alarm.FAULT_BEGINS: "fault",
+    Alarm.FAULT_ENDS: "fault",
+    Alarm.REJOINED: "recovery",
+    Alarm.DEMAND: "reaction",
+    Alarm.BRAKES_CLOSED: "reaction",
+    Alarm.BRAKES_OPENED: "recovery",
+    Alarm.RE_REFERENCED: "recovery",
+    Alarm.LATCHED: "reaction",
+}
+
+
+@pytest.fixture
+def segment(config: MakeConfig, rack_name: str) -> Iterator[Segment]:
+    found = rack(config, *FAULTS)
+    layout = wire(found)
+    made = Segment.create(layout, found.text())
+    for fault in injections(found, layout):
+        FaultTable(made).add(fault)
+    yield made
+    made.close()
+    unlink(rack_name)
+
+
+def heard(
+    segment: Segment, owner: str, alarm: Alarm, subject: int = -1, value: float = 0.0, since: int | None = None
+) -> Event:
+    """Ring an alarm at tick 400 and return the event that it makes."""
+    AlarmWriter(segment, owner).ring(400, alarm, subject, value, since)
+    row = alarm_ring(segment, owner).drain().rows[-1]
+    return AlarmEvents(segment, JOINTS).of(row, owner)
+
+
+# What an operator says is told from the operator table: test_operator.py.
+TOLD_HERE = [alarm for alarm in Alarm if alarm is not Alarm.COMMANDED]
+
+
+@pytest.mark.parametrize("alarm", TOLD_HERE, ids=lambda alarm: alarm.name.lower())
+def test_every_alarm_makes_an_event_of_its_kind(segment: Segment, alarm: Alarm) -> None:
+    event = heard(segment, "wave", alarm, subject=0, value=2.0)
+    assert (event.kind, event.tick, event.value) == (KINDS[alarm], 400, 2.0)
+    assert event.text
+    assert "{" not in event.text
+    if event.kind != "fault":
+        assert event.code == alarm.name.lower()
+
+
+def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
+    before = time.time_ns()
+    event = heard(segment, "wave", Alarm.LATE, 0)
+    # Two clocks are compared, which are adjusted by less than a second.
+    assert abs(event.time_ns - before) < 10**9
+
+
+@pytest.mark.parametrize(
+    ("owner", "alarm", "subject", "value", "text"),
+    [
+        (CLOCK, Alarm.HANG, 2, 4, "'watch' is not responding: 4 releases missed since tick 360"),
+        (CLOCK, Alarm.LATE, 0, 1, "'wave' missed its deadline: still running at its next release"),
+        (CLOCK, Alarm.STARVED, 1, 4, "'wave.planner' is not getting its core: 4 releases missed since tick 360"),
+        ("watch", Alarm.STALE, 0, 12, "'wave.status' is stale, 12 ticks (30 ms): its writer 'wave' is dead or stopped"),
+        ("watch", Alarm.MUTE, 0, 3, "'wave.status' is stale, 3 ticks (7.5 ms): 'wave' is running but not writing"),
+        ("watch", Alarm.GAP, 0, 2, "'wave.status': 2 messages lost, serials are missing"),
+        ("watch", Alarm.MASQUERADE, 0, 4711, "'wave.status': a message comes from process 4711, which is not"),
+        ("wave", Alarm.CLOCK_STOPPED, -1, 3, "clock stopped: no tick for 3 ticks (7.5 ms)"),
+        ("wave", Alarm.CLOCK_SKIPPED, -1, 1, "clock skipped 1 tick"),
+        ("wave", Alarm.CLOCK_SKIPPED, -1, 3, "clock skipped 3 ticks"),
+        ("wave", Alarm.CLOCK_LATE, -1, 1_300_000, "clock late: a tick came 1.300 ms late"),
+        ("driven", Alarm.SENSOR_RANGE, 1, float("nan"), "sensor elbow out of range: nan rad"),
+        ("driven", Alarm.SENSOR_MODEL, -1, 0.05, "sensor all joints disagrees with the model: off by 0.05"),
+        ("driven", Alarm.ACTUATOR, 7, 0.5, "actuator joint 7 does not follow its torque: off by 0.5"),
+        ("driven", Alarm.COMMAND_LIMIT, 0, 512.25, "torque of shoulder cut to its limit: 512 N m was commanded"),
+        ("driven", Alarm.BRAKES_CLOSED, -1, 0, "brakes engaged"),
+        ("driven", Alarm.BRAKES_CLOSED, -1, 4, "brakes engaged: no torque for 4 ticks (10 ms)"),
+        ("driven", Alarm.BRAKES_OPENED, -1, 40, "brakes released after 40 ticks (100 ms)"),
+    ],
+)
+def test_an_alarm_has_names_and_units(
+    segment: Segment, owner: str, alarm: Alarm, subject: int, value: float, text: str
+) -> None:
+    event = heard(segment, owner, alarm, subject, value, since=360)
+    assert event.text.startswith(text)
+    assert (event.board, event.since, event.fault) == (owner, 360, -1)
+
+
+def test_subjects_have_names_for_programs_too(segment: Segment) -> None:
+    assert heard(segment, CLOCK, Alarm.LATE, 0).subject == "wave"
+    assert heard(segment, "watch", Alarm.GAP, 2).subject == "watch.status"
+    assert heard(segment, "driven", Alarm.ACTUATOR, 0).subject == "shoulder"
+    assert heard(segment, "wave", Alarm.CLOCK_STOPPED).subject == ""
+
+
+def test_a_return_names_the_returned_task(segment: Segment) -> None:
+    event = heard(segment, CLOCK, Alarm.REJOINED, 2, 200)
+    assert (event.board, event.subject, event.text) == ("watch", "watch", "'watch' rejoined after 200 ticks (500 ms)")
+    assert heard(segment, CLOCK, Alarm.REJOINED, -1, 4).board == CLOCK
+
+
+@pytest.mark.parametrize(
+    ("subject", "demand", "kind", "text"),
+    [
+        (0, Demand.STOP, "reaction", "the arm must ramp to rest, then brake: 'wave' is lost"),
+        (-1, Demand.BRAKE, "reaction", "the arm must brake at once: the emergency stop is latched"),
+        (-1, Demand.NONE, "recovery", "arm released: no stop is requested"),
+    ],
+)
+def test_a_demand_is_a_reaction_and_its_end_a_recovery(
+    segment: Segment, subject: int, demand: Demand, kind: str, text: str
+) -> None:
+    event = heard(segment, CLOCK, Alarm.DEMAND, subject, demand)
+    assert (event.kind, event.code, event.text) == (kind, "demand", text)
+    assert event.subject == ("wave" if subject == 0 else "emergency stop")
+
+
+@pytest.mark.parametrize(
+    ("fault", "board", "subject", "text"),
+    [
+        (0, "wave", "wave.status", "mute (wave.status) begins, for 40 ticks (100 ms)"),
+        (1, "driven", "elbow", "sensor-bias (elbow, size 0.1 rad) begins"),
+        (2, CLOCK, "", "kill begins"),
+    ],
+)
+def test_a_fault_names_its_target(segment: Segment, fault: int, board: str, subject: str, text: str) -> None:
+    event = heard(segment, CLOCK, Alarm.FAULT_BEGINS, fault)
+    assert (event.code, event.fault, event.board, event.subject, event.text) == ("begins", fault, board, subject, text)
+
+
+def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
+    FaultTable(segment).entries[2].acted(400, 1)
+    event = heard(segment, CLOCK, Alarm.FAULT_ENDS, 2, 1.0)
+    assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; acted 1 time")
+
+
+def test_a_collision_names_both_geoms(segment: Segment) -> None:
+    config = load("crossing")
+    assert config.robot is not None
+    robot, scene, clock_ns = config.robot, config.scene, config.clock_ns
+    cell = build_cell(robot, scene, clock_ns)
+    post, palm = (cell.model.geom(name).id for name in ("post", "palm"))
+    AlarmWriter(segment, "wave").ring(400, Alarm.COLLISION, post, palm)
+    row = alarm_ring(segment, "wave").drain().rows[-1]
+    event = AlarmEvents(segment, JOINTS, partial(geom_name, robot, scene, clock_ns)).of(row, "wave")
+    assert (event.code, event.subject) == ("collision", "post")
+    assert event.text == "unintended contact: 'post' touches 'palm'"

@@ -1,0 +1,211 @@
+"""Removal of what killed racks left: never a rack in use, and never twice."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rack.backplane import semaphores
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.errors import SegmentError
+from rack.backplane.layout import Layout
+from rack.backplane.segment import SHM_FOLDER, VERSION, Segment, racks, shm_path, unlink
+from rack.backplane.words import Head, System
+from rack.boards.crate.clean import clean, remove_dead, remove_own
+from tests.backplane.bus import layout, mailbox
+from tests.processes import FORKS, descriptors, exit_status, fork, kill, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+STRANGER = 65_533
+as_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+
+
+@pytest.fixture
+def spec(rack_name: str) -> Iterator[Layout]:
+    """A layout; whatever is made of it is removed."""
+    yield layout(rack_name, [mailbox("lock")])
+    semaphores.unlink_all(rack_name)
+    unlink(rack_name)
+
+
+def leave_dead(spec: Layout) -> None:
+    """Leave a segment and its semaphores as a launcher that was killed would."""
+
+    def launch() -> None:
+        Segment.create(spec, "")
+        semaphores.create(spec)
+
+    assert exit_status(fork(launch)) == 0
+
+
+def left(rack: str) -> list[str]:
+    return [path.name for path in SHM_FOLDER.iterdir() if rack in path.name]
+
+
+def test_a_dead_racks_segment_and_semaphores_are_removed(spec: Layout) -> None:
+    leave_dead(spec)
+    assert len(left(spec.rack)) == 1 + len(semaphores.names(spec))
+    assert remove_dead(spec.rack)
+    assert left(spec.rack) == []
+
+
+def test_nothing_there_is_nothing_removed(rack_name: str) -> None:
+    assert not remove_dead(rack_name)
+
+
+def test_a_live_rack_is_refused_with_its_launcher(spec: Layout) -> None:
+    segment = Segment.create(spec, "")
+    with pytest.raises(SegmentError, match=f"rack '{spec.rack}' is already running, launched by process {os.getpid()}"):
+        remove_dead(spec.rack)
+    assert segment.has_its_name
+    segment.close()
+
+
+def test_a_live_rack_of_another_version_is_refused_too(spec: Layout) -> None:
+    segment = Segment.create(spec, "")
+    segment.words[Head.VERSION] = VERSION + 1
+    with pytest.raises(SegmentError, match="is already running"):
+        remove_dead(spec.rack)
+    segment.words[Head.LAUNCHER_START] += 1
+    assert remove_dead(spec.rack)
+    segment.close()
+
+
+@pytest.mark.parametrize("size", [0, 100, 8192])
+def test_a_file_too_small_for_a_segment_is_removed(rack_name: str, size: int) -> None:
+    shm_path(rack_name).write_bytes(bytes(size))
+    assert remove_dead(rack_name)
+    assert rack_name not in racks()
+
+
+def test_removing_leaves_no_file_open(spec: Layout) -> None:
+    before = descriptors()
+    leave_dead(spec)
+    remove_dead(spec.rack)
+    assert descriptors() == before
+
+
+@as_root
+def test_another_users_rack_is_left_alone(spec: Layout) -> None:
+    leave_dead(spec)
+
+    def remove() -> None:
+        os.setuid(STRANGER)
+        with pytest.raises(SegmentError, match="belongs to another user"):
+            remove_dead(spec.rack)
+        assert spec.rack in clean()[1]
+
+    assert exit_status(fork(remove)) == 0
+    assert spec.rack in racks()
+
+
+def test_clean_names_racks_removed_and_in_use(spec: Layout, rack_name: str) -> None:
+    leave_dead(spec)
+    live = Segment.create(layout(f"{rack_name}-live"), "")
+    try:
+        removed, in_use, _ = clean()
+        assert spec.rack in removed
+        assert live.rack in in_use
+        assert live.rack not in removed
+        assert live.rack in racks()
+    finally:
+        unlink(live.rack)
+        live.close()
+
+
+def test_a_rack_removed_and_launched_meanwhile_is_not_removed(spec: Layout, monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_dead(spec)
+    found = Segment.open(spec.rack)
+    assert remove_dead(spec.rack)
+    again = Segment.create(spec, "")
+    # Who has looked before all that finds a dead rack still.
+    monkeypatch.setattr(Segment, "open", lambda rack: found)
+    assert not remove_dead(spec.rack)
+    assert again.has_its_name
+    again.close()
+
+
+def test_a_removal_under_way_is_left_alone(spec: Layout) -> None:
+    leave_dead(spec)
+    found = Segment.open(spec.rack)
+    other = ByteLock(found, 8 * Head.MAGIC)
+    assert other.take()
+    assert not remove_dead(spec.rack)
+    assert found.has_its_name
+    other.close()
+    assert remove_dead(spec.rack)
+    found.close()
+
+
+def contend(spec: Layout, start: Segment, word: int) -> bool:
+    """Launch as others do: remove what is dead, take the name; keep it until killed."""
+    start.words[word] = 1
+    while not start.words[System.TICK]:
+        pass
+    try:
+        remove_dead(spec.rack)
+        segment = Segment.create(spec, "")
+    except SegmentError:
+        start.words[word] = 2
+        return False
+    start.words[word] = 3 if segment.has_its_name else 4
+    time.sleep(60)
+    return True
+
+
+@pytest.mark.parametrize("trial", range(10))
+def test_of_several_launches_one_takes_a_dead_racks_name_and_keeps_it(spec: Layout, rack_name: str, trial: int) -> None:
+    leave_dead(spec)
+    start = Segment.create(layout(f"{rack_name}-start"), "")
+    words = [300, 301, 302, 303]
+    launchers = [fork(lambda word=word: contend(spec, start, word)) for word in words]
+    try:
+        wait_until(lambda: all(start.words[word] == 1 for word in words))
+        start.words[System.TICK] = 1
+        wait_until(lambda: all(start.words[word] > 1 for word in words))
+        assert sorted(start.words[word] for word in words) == [2, 2, 2, 3]
+        winner = launchers[[start.words[word] for word in words].index(3)]
+        found = Segment.attach(spec.rack)
+        assert found.launcher == winner
+        found.close()
+    finally:
+        for pid in launchers:
+            kill(pid)
+        unlink(start.rack)
+        start.close()
+
+
+@pytest.mark.parametrize("kind", ["directory", "symbolic link"])
+def test_a_foreign_entry_is_named_and_left_alone(rack_name: str, tmp_path: Path, kind: str) -> None:
+    place, target = shm_path(rack_name), tmp_path / "target"
+    target.write_bytes(bytes(8192))
+    place.mkdir() if kind == "directory" else place.symlink_to(target)
+    why = f"rack '{rack_name}': {place} is a {kind}, not a segment"
+    try:
+        assert why in clean()[2]
+        with pytest.raises(SegmentError, match=re.escape(why)):
+            remove_dead(rack_name)
+        with pytest.raises(SegmentError, match=re.escape(why)):
+            Segment.attach(rack_name)
+        assert place.is_dir() if kind == "directory" else place.is_symlink()
+        assert target.read_bytes() == bytes(8192)
+    finally:
+        place.rmdir() if kind == "directory" else place.unlink()
+
+
+def test_only_the_own_racks_of_a_process_are_removed_by_it(spec: Layout, rack_name: str) -> None:
+    own = Segment.create(spec, "")
+    semaphores.create(spec)
+    other = layout(f"{rack_name}-other")
+    assert exit_status(fork(lambda: Segment.create(other, "").close())) == 0
+    try:
+        remove_own()
+        assert left(spec.rack) == [shm_path(other.rack).name]
+    finally:
+        unlink(other.rack)
+        own.close()

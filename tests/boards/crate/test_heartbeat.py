@@ -1,0 +1,177 @@
+"""Heartbeats: a task without progress for longer than its bound hangs."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.process import state_of
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block, Run, System
+from rack.boards.crate import heartbeat
+from rack.boards.crate.heartbeat import LOCKSTEP_S, Heartbeat
+from tests.backplane.bus import layout, task
+from tests.processes import FORKS, forked, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+
+PERIOD_NS = 2_500_000
+FAST, SLOW = "fast", "slow"
+
+
+class Clock:
+    """Time that a test sets."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        """Return the time, in s."""
+        return self.now_s
+
+
+@pytest.fixture
+def bus(rack_name: str) -> Iterator[Segment]:
+    slow = task(SLOW, every=400, slot=3, within_cycles=2)
+    segment = Segment.create(layout(rack_name, (), [task(FAST), slow]), "")
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    segment.words[System.STATE] = Run.RUNNING
+    segment.words[System.LOCKSTEP] = 1
+    yield segment
+    unlink(rack_name)
+    segment.close()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(heartbeat, "time", clock)
+    return clock
+
+
+def compute() -> None:
+    """Never wait."""
+    while True:
+        pass
+
+
+def run_on(segment: Segment, clock: Clock, seconds: float, *hanging: str) -> None:
+    """Let time pass: all tasks but those are released and finish."""
+    clock.now_s += seconds
+    tick = segment.words[System.TICK] = segment.words[System.TICK] + round(seconds * 1e9 / PERIOD_NS)
+    for name in (FAST, SLOW):
+        block = segment.block(name)
+        block[Block.RELEASED] = tick
+        if name not in hanging:
+            block[Block.DONE] = tick
+
+
+def test_a_progressing_task_does_not_hang(bus: Segment, clock: Clock) -> None:
+    beat = Heartbeat(bus)
+    for _ in range(100):
+        run_on(bus, clock, 0.5)
+        assert beat.hanging() == []
+
+
+def test_a_task_that_finishes_nothing_hangs_once(bus: Segment, clock: Clock) -> None:
+    beat, told = Heartbeat(bus), []
+    for _ in range(10):
+        run_on(bus, clock, LOCKSTEP_S / 8, FAST)
+        told += beat.hanging()
+    assert told == [FAST]
+
+
+def test_a_task_that_recovered_and_hangs_again_is_reported_again(bus: Segment, clock: Clock) -> None:
+    beat, told = Heartbeat(bus), []
+    for hanging in ((FAST,), (), (FAST,)):
+        run_on(bus, clock, 2 * LOCKSTEP_S, *hanging)
+        told += beat.hanging()
+    assert told == [FAST, FAST]
+
+
+def test_a_lost_task_is_known_to_be(bus: Segment, clock: Clock) -> None:
+    beat = Heartbeat(bus)
+    bus.block(FAST)[Block.LOST] = 1
+    run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
+    assert beat.hanging() == []
+
+
+def test_in_real_time_the_tasks_are_the_clocks_to_watch(bus: Segment, clock: Clock) -> None:
+    bus.words[System.LOCKSTEP] = 0
+    beat = Heartbeat(bus)
+    run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
+    assert beat.hanging() == []
+
+
+def test_an_idle_task_does_not_hang(bus: Segment, clock: Clock) -> None:
+    beat = Heartbeat(bus)
+    for name in (FAST, SLOW):
+        bus.block(name)[Block.RELEASED] = bus.block(name)[Block.DONE] = 8
+    for _ in range(20):
+        clock.now_s += 1.0
+        bus.words[System.TICK] += 1
+        assert beat.hanging() == []
+
+
+def test_a_clock_that_makes_no_tick_hangs(bus: Segment, clock: Clock) -> None:
+    bus.words[System.LOCKSTEP] = 0
+    beat = Heartbeat(bus)
+    run_on(bus, clock, 0.5)
+    assert beat.hanging() == []
+    clock.now_s += 2.5
+    assert beat.hanging() == [CLOCK]
+    assert beat.hanging() == []
+
+
+@pytest.mark.parametrize(
+    ("doing", "number", "looks"),
+    [
+        ("computes", 0, [[], [], []]),
+        ("waits", 0, [[], [CLOCK], []]),
+        ("waits", signal.SIGSTOP, [[CLOCK], [], []]),
+    ],
+)
+def test_a_silent_clock_hangs_only_where_it_waits_or_was_stopped(
+    bus: Segment, clock: Clock, doing: str, number: int, looks: list[list[str]]
+) -> None:
+    bus.words[System.LOCKSTEP] = 0
+    with forked(compute if doing == "computes" else signal.pause) as pid:
+        bus.words[System.CLOCK_PID] = pid
+        if number:
+            os.kill(pid, number)
+        state = "T" if number else "S" if doing == "waits" else "R"
+        wait_until(lambda: state_of(pid) == state)
+        beat = Heartbeat(bus)
+        run_on(bus, clock, 0.5)
+        assert beat.hanging() == []
+        clock.now_s += 2.5
+        assert [beat.hanging() for _ in range(3)] == looks
+
+
+@pytest.mark.parametrize("state", [Run.STARTING, Run.STOPPED])
+def test_no_task_hangs_before_or_after_the_run(bus: Segment, clock: Clock, state: Run) -> None:
+    beat = Heartbeat(bus)
+    bus.words[System.STATE] = state
+    clock.now_s += 1000.0
+    assert beat.hanging() == []
+
+
+def test_bounds_stretch_with_the_wall_clock(bus: Segment, clock: Clock) -> None:
+    bus.words[System.PERIOD_NS], bus.words[System.LOCKSTEP] = 1000 * PERIOD_NS, 0
+    beat = Heartbeat(bus)
+    assert beat.hanging() == []
+    clock.now_s += 9.0
+    assert beat.hanging() == []
+    clock.now_s += 2.0
+    assert CLOCK in beat.hanging()
+
+
+def test_in_lockstep_a_plan_takes_as_long_as_it_takes(bus: Segment, clock: Clock) -> None:
+    bus.words[System.LOCKSTEP] = 1
+    beat = Heartbeat(bus)
+    clock.now_s += 30.0
+    assert beat.hanging() == []

@@ -1,0 +1,98 @@
+"""Two racks on one machine: a core held by one is not taken by the other without a warning."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rack.boards import Rack
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError
+from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
+from tests.machine import needs_fifo, needs_two_cores
+from tests.processes import RACK
+
+ROOT = Path(__file__).resolve().parents[3]
+BOUND_S = 60
+FIFO = ("clock.mode=realtime", "board.wave.priority=5")
+ELSEWHERE = f"""{CLOCK}
+[board.wave]
+slot = 2
+rate_hz = 400
+priority = 5
+executor = "wave_levels:Wave"
+"""
+"""A rack whose board names no core."""
+
+
+@pytest.fixture
+def first(config: MakeConfig, rack_name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rack]:
+    """A rack whose wave holds core 0; no other test's racks are seen."""
+    monkeypatch.setattr("rack.boards.crate.neighbours.racks", lambda: [rack_name])
+    with Rack(config(*FIFO, "board.wave.core=0", text=PLAIN)) as rack:
+        yield rack
+
+
+def second(config: MakeConfig, rack: Rack, *settings: str, text: str = PLAIN) -> RackConfig:
+    return config(*FIFO, f"name={rack.config.name}b", *settings, text=text)
+
+
+@needs_fifo
+def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack) -> None:
+    with pytest.raises(ConfigError) as refused:
+        Rack(second(config, first, "board.wave.core=0"), share=False).launch()
+    holder = f"rack '{first.config.name}' (process {os.getpid()}) runs wave there at real-time priority"
+    wanted = f"core 0, asked for by wave: {holder}: stop that rack, choose other cores, or give --share"
+    assert str(refused.value) == wanted
+
+
+@needs_fifo
+def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
+    with Rack(second(config, first, "board.wave.core=0")) as rack:
+        ready = [event.text for event in rack.events if event.kind == "ready"]
+    assert ready[0].startswith(f"core 0, asked for by wave: rack '{first.config.name}'")
+
+
+@needs_fifo
+@pytest.mark.parametrize("setting", ["clock.mode=lockstep", "board.wave.priority=0"])
+def test_waiting_racks_hold_no_core(config: MakeConfig, first: Rack, setting: str) -> None:
+    with Rack(second(config, first, "board.wave.core=0", setting), share=False) as rack:
+        assert not [event for event in rack.events if event.kind == "ready"]
+
+
+@needs_fifo
+@needs_two_cores
+def test_a_board_that_names_no_core_gets_another(config: MakeConfig, first: Rack) -> None:
+    with Rack(second(config, first, text=ELSEWHERE), share=False) as rack:
+        ready = [event.text for event in rack.events if event.kind == "ready"]
+        core = rack.segment.layout.task("wave").core
+    assert core == min(os.sched_getaffinity(0) - {0})
+    assert ready[0].startswith(f"wave on core {core}: rack '{first.config.name}'")
+
+
+@pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="needs to drop CAP_SYS_NICE")
+@pytest.mark.parametrize("policy", ["warn", "refuse"])
+def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_path: Path, policy: str) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(config(*FIFO, f"clock.on_no_realtime={policy}", text=PLAIN).text())
+    command = [
+        "setpriv",
+        "--bounding-set",
+        "-sys_nice",
+        "--inh-caps",
+        "-sys_nice",
+        *RACK,
+    ]
+    words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
+    done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    told = done.stderr if policy == "refuse" else done.stdout
+    assert done.returncode == (1 if policy == "refuse" else 0), done.stderr
+    assert "SCHED_FIFO refused, ordinary scheduling for wave" in told
+    assert "@GROUP - rtprio 99" in told
+    # It stands in every look at the rack, too.
+    assert policy == "refuse" or "NO REAL-TIME PRIORITY: wave" in told.splitlines()[-3]

@@ -1,0 +1,174 @@
+"""The Rack: launched, run and ended, and its events."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.errors import SegmentError
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment, racks, shm_path
+from rack.backplane.words import Block, Run, System, TaskState
+from rack.boards import Rack
+from rack.boards.events import Event, Outcome
+from tests.boards.conftest import PLAIN, MakeConfig
+from tests.processes import descriptors
+
+
+def run(rack: Rack, seconds: float | None = None) -> Outcome:
+    with rack:
+        return rack.run(seconds)
+
+
+def test_a_run_ends_when_its_task_is_done(config: MakeConfig) -> None:
+    outcome = run(Rack(config("board.wave.params.done_at=40")))
+    # Written at 40, read by the level that ends the run at 48, visible at 56; then half a second to see it at rest.
+    assert (outcome.cause, outcome.state, outcome.ticks, outcome.worked) == ("task done", "done", 56 + 200, True)
+
+
+def test_a_task_that_ends_in_error_has_failed_with_its_reason(config: MakeConfig) -> None:
+    outcome = run(Rack(config("board.wave.params.done_at=8", "board.wave.params.final=ERROR")))
+    assert (outcome.cause, outcome.state, outcome.reason) == ("task failed", "error", "the tide")
+    assert not outcome.worked
+
+
+@pytest.mark.parametrize(("moves", "cause"), [(0, "task refused"), (3, "task failed")])
+def test_a_task_that_was_never_begun_is_refused_and_any_other_has_failed(
+    config: MakeConfig, moves: int, cause: str
+) -> None:
+    program = f'executor = "wave_levels:Program"\nparams = {{ moves = {moves} }}'
+    text = PLAIN.replace('executor = "wave_levels:Watch"', program).replace('below = "wave"\n', "")
+    assert run(Rack(config(text=text))).cause == cause
+
+
+@pytest.mark.parametrize(("seconds", "ticks"), [(0.1, 40), (0.0025, 1), (0.5051, 202)])
+def test_a_run_of_some_seconds_ends_at_its_very_tick(config: MakeConfig, seconds: float, ticks: int) -> None:
+    rack = Rack(config())
+    outcome = run(rack, seconds)
+    assert (outcome.cause, outcome.ticks) == ("time over", ticks)
+    assert rack.segment.words[System.TICK] == ticks - 1
+    assert rack.segment.block("wave")[Block.CYCLES] == ticks
+
+
+def test_events_tell_the_run_in_order(config: MakeConfig) -> None:
+    told: list[Event] = []
+    rack = Rack(config(), told.append)
+    run(rack, 0.1)
+    assert told == rack.events
+    assert [event.kind for event in told if event.kind != "ready"] == ["launch", "start", "end"]
+    assert (told[0].tick, told[-1].tick, told[-1].text) == (-1, 39, "time over after 40 ticks")
+    assert [event.time_ns for event in told] == sorted(event.time_ns for event in told)
+
+
+def test_output_of_a_board_becomes_an_event(config: MakeConfig) -> None:
+    rack = Rack(config("board.wave.params={ trouble = 'print', at = 5 }"))
+    run(rack, 0.1)
+    assert [event.text for event in rack.events if event.kind == "printed"] == ["a wave 5"]
+
+
+def test_boards_are_ready_before_the_clock_runs(config: MakeConfig) -> None:
+    with Rack(config()) as rack:
+        words = rack.segment.words
+        assert (words[System.STATE], words[System.TICK]) == (Run.STARTING, 0)
+        assert UtilityLines(rack.segment).sysfail == []
+        states = {t.name: rack.segment.block(t.name)[Block.STATE] for t in rack.segment.layout.tasks}
+        assert all(TaskState.READY <= state <= TaskState.RUNNING for state in states.values())
+        assert rack.run(0.1).cause == "time over"
+    states = {t.name: rack.segment.block(t.name)[Block.STATE] for t in rack.segment.layout.tasks}
+    assert set(states.values()) == {TaskState.ENDED}
+
+
+def test_after_the_launch_only_the_segment_has_a_name(config: MakeConfig) -> None:
+    with Rack(config("protocol.default=lock")) as rack:
+        folder = shm_path(rack.config.name).parent
+        assert [p.name for p in folder.iterdir() if rack.config.name in p.name] == [shm_path(rack.config.name).name]
+    assert rack.config.name not in racks()
+
+
+def test_a_stop_ends_the_run_at_the_next_tick(config: MakeConfig) -> None:
+    with Rack(config("clock.mode=realtime")) as rack:
+        rack.start()
+        rack.stop("enough")
+        while rack.watch(0.5):
+            pass
+    assert rack.outcome is not None
+    assert (rack.outcome.cause, rack.outcome.worked) == ("stopped", False)
+    assert "enough" in [event.text for event in rack.events if event.kind == "stop"]
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -> None:
+    with Rack(config(f"clock.mode={mode}")) as rack:
+        rack.start()
+        Segment.attach(rack.config.name).words[System.STOP_REQUEST] = 1
+        while rack.watch(0.5):
+            pass
+    assert rack.outcome is not None
+    assert rack.outcome.cause == "stopped"
+
+
+def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConfig) -> None:
+    with Rack(config("clock.mode=realtime")) as first:
+        first.start(0.25)
+        with pytest.raises(SegmentError, match=f"rack '{first.config.name}' is already running, launched by process"):
+            Rack(config()).launch()
+        while first.watch(0.5):
+            pass
+    assert first.outcome is not None
+    assert first.outcome.cause == "time over"
+
+
+def test_racks_side_by_side_do_not_touch_each_other(config: MakeConfig, rack_name: str) -> None:
+    alone = run(Rack(config()), 0.5)
+    pair = [Rack(config(f"name={rack_name}-{end}")) for end in ("a", "b")]
+    with pair[0], pair[1]:
+        for rack in pair:
+            rack.start(0.5)
+        while pair[0].watch(0.02) | pair[1].watch(0.02):
+            pass
+    assert [rack.outcome and rack.outcome.digest for rack in pair] == [alone.digest] * 2
+
+
+def test_racks_one_after_the_other_leave_no_file_open(config: MakeConfig) -> None:
+    run(Rack(config()), 0.0025)
+    before = descriptors()
+    for _ in range(2):
+        run(Rack(config()), 0.0025)
+    assert descriptors() == before
+
+
+def test_a_rack_that_is_gone_gives_its_memory_back(config: MakeConfig) -> None:
+    rack = Rack(config())
+    run(rack, 0.0025)
+    name = shm_path(rack.config.name).name
+    maps = Path("/proc/self/maps")
+    # Deleted by name, and still mapped: who reads the counters of a run that has ended has them.
+    assert rack.segment.block("wave")[Block.CYCLES] == 1
+    before = maps.read_text().count("(deleted)")
+    del rack
+    gc.collect()
+    assert maps.read_text().count("(deleted)") < before, name
+
+
+def test_counters_show_the_bus_traffic(config: MakeConfig) -> None:
+    rack = Rack(config(text=PLAIN))
+    run(rack, 0.4)
+    wave, watch = (rack.segment.block(name) for name in ("wave", "watch"))
+    size = rack.segment.layout.mailbox("wave.status").size
+    assert [wave[w] for w in (Block.CYCLES, Block.WRITES, Block.WRITE_BYTES)] == [160, 160, 160 * size]
+    # At tick 0 there is nothing yet to read.
+    assert [watch[w] for w in (Block.CYCLES, Block.READS, Block.READ_BYTES)] == [20, 20, 19 * size]
+    assert [block[w] for block in (wave, watch) for w in (Block.MISSED, Block.CORRUPT, Block.BUS_ERRORS)] == [0] * 6
+
+
+def text_of(events: Sequence[Event], kind: str) -> str:
+    return "\n".join(event.text for event in events if event.kind == kind)
+
+
+def test_a_board_without_the_core_it_asks_for_says_so(config: MakeConfig) -> None:
+    rack = Rack(config("board.watch.core=1000"))
+    with rack:
+        assert "core 1000 is not available" in text_of(rack.events, "ready")

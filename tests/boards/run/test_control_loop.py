@@ -1,0 +1,209 @@
+"""One cycle of a task: its counts, its trace, and the age of the information it passes on."""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+
+from rack.backplane import semaphores
+from rack.backplane.errors import MailboxError
+from rack.backplane.mailbox.protocols import MailboxLock, open_writer
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.process import die_with_parent, set_priority, take_processor
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.trace import Flag, trace_ring
+from rack.backplane.words import Block, System
+from rack.boards.classes import find_class
+from rack.boards.config import Resolved, resolve
+from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
+from rack.levels.level import Executor, Planner
+from tests.backplane.bus import task as task_spec
+from tests.boards.conftest import MakeConfig
+from tests.processes import FORKS, exit_status, fork, runs, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+TROUBLE = Flag.MISSED | Flag.SKIPPED | Flag.BUS_ERROR | Flag.CORRUPT
+HOUR_NS = 3_600_000_000_000
+MakeBench = Callable[..., "Bench"]
+
+
+class Bench:
+    """A wired rack whose tasks a test cycles itself; the clock stands at tick 0 and ticks last an hour."""
+
+    def __init__(self, plan: Resolved) -> None:
+        self.plan = plan
+        self.segment = Segment.create(plan.layout, "")
+        semaphores.create(plan.layout)
+        self.segment.words[System.PERIOD_NS] = HOUR_NS
+        self.to(0)
+
+    def to(self, tick: int) -> None:
+        """Set the clock to the middle of a tick."""
+        self.segment.words[System.EPOCH_NS] = time.monotonic_ns() - tick * HOUR_NS - HOUR_NS // 2
+
+    def task(self, name: str) -> VirtualControlLoop | PlannerLoop:
+        """Return a task, ready to cycle."""
+        wiring = next(wiring for wiring in self.plan.tasks if wiring.task == name)
+        if name.endswith(".planner"):
+            return PlannerLoop(self.segment, wiring, find_class(wiring.target, Planner)(wiring.context))
+        return VirtualControlLoop(self.segment, wiring, find_class(wiring.target, Executor)(wiring.context))
+
+    def flags(self, name: str) -> list[Flag]:
+        """Return the trouble in every cycle of a task so far."""
+        return [Flag(int(flags)) & TROUBLE for flags in trace_ring(self.segment, name).drain().rows["flags"]]
+
+
+@pytest.fixture
+def bench(config: MakeConfig) -> Iterator[MakeBench]:
+    made: list[Bench] = []
+
+    def make(*settings: str) -> Bench:
+        made.append(Bench(resolve(config("clock.mode=realtime", *settings))))
+        return made[-1]
+
+    yield make
+    for found in made:
+        semaphores.unlink(found.plan.layout)
+        unlink(found.segment.rack)
+        found.segment.close()
+
+
+def test_a_cycle_in_time_has_no_trouble(bench: MakeBench) -> None:
+    rack = bench()
+    wave = rack.task("wave")
+    for tick in range(3):
+        rack.to(tick)
+        wave.cycle(tick)
+    assert rack.flags("wave") == [Flag(0)] * 3
+    assert [rack.segment.block("wave")[w] for w in (Block.CYCLES, Block.DONE, Block.MISSED)] == [3, 2, 0]
+
+
+def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
+    rack = bench()
+    wave = rack.task("wave")
+    rack.to(1)
+    wave.cycle(0)
+    assert rack.flags("wave") == [Flag.MISSED]
+    assert rack.segment.block("wave")[Block.MISSED] == 1
+
+
+def test_a_slow_level_has_its_whole_cycle(bench: MakeBench) -> None:
+    rack = bench()
+    watch = rack.task("watch")
+    rack.to(7)
+    watch.cycle(0)
+    rack.to(16)
+    watch.cycle(8)
+    assert rack.flags("watch") == [Flag(0), Flag.MISSED]
+
+
+def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) -> None:
+    rack = bench()
+    wave, watch = rack.task("wave"), rack.task("watch")
+    wave.cycle(0)
+    slots = Slots(rack.segment, rack.segment.layout.mailbox("wave.status"))
+    assert slots.fetch(1)
+    slots.ring[:] = bytes(b ^ 0x80 for b in slots.ring)
+    rack.to(8)
+    watch.cycle(8)
+    rack.to(15)
+    wave.cycle(15)
+    rack.to(16)
+    watch.cycle(16)
+    assert rack.flags("watch") == [Flag.CORRUPT, Flag(0)]
+    assert rack.segment.block("watch")[Block.CORRUPT] == 1
+
+
+def test_a_cut_off_access_shows_in_the_trace_and_the_cycle_continues(bench: MakeBench) -> None:
+    rack = bench("protocol.mailbox={ 'wave.status' = 'lock' }")
+    wave, watch = rack.task("wave"), rack.task("watch")
+    wave.cycle(0)
+    watch.cycle(0)
+    # Somebody is in the critical section, and stays.
+    holder = MailboxLock(rack.segment, "wave.status")
+    assert holder.acquire()
+    rack.to(8)
+    watch.cycle(8)
+    wave.cycle(8)
+    assert rack.flags("watch") == [Flag(0), Flag.BUS_ERROR]
+    # What could not be written did not come in time.
+    assert rack.flags("wave") == [Flag(0), Flag.BUS_ERROR | Flag.MISSED]
+    assert [rack.segment.block(name)[Block.BUS_ERRORS] for name in ("wave", "watch")] == [1, 1]
+
+
+def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -> None:
+    rack = bench()
+    wave, watch = rack.task("wave"), rack.task("watch")
+    for tick in range(4):
+        rack.to(tick)
+        wave.cycle(tick)
+    rack.to(8)
+    watch.cycle(8)
+    slots = Slots(rack.segment, rack.segment.layout.mailbox("watch.status"))
+    assert slots.fetch(1)
+    assert (slots.tick, slots.basis) == (8, 3)
+
+
+def test_a_planner_traces_its_plans_and_not_every_question(bench: MakeBench) -> None:
+    rack = bench("board.wave.params.plan_every=4")
+    planner = rack.task("wave.planner")
+    for tick in (0, 4, 5, 6, 8):
+        rack.to(tick)
+        planner.cycle(tick)
+    rows = trace_ring(rack.segment, "wave.planner").drain().rows
+    assert rows["tick"].tolist() == [0, 4, 8]
+    assert (rows["flags"] & Flag.PLANNED).all()
+    block = rack.segment.block("wave.planner")
+    assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.MISSED)] == [5, 3, 8, 0]
+
+
+def test_a_second_task_on_a_mailbox_is_refused(bench: MakeBench) -> None:
+    rack = bench()
+    writer = open_writer(rack.segment, "wave.status")
+    with pytest.raises(MailboxError, match=r"'wave\.status' has a writer already"):
+        rack.task("wave")
+    writer.close()
+    rack.task("wave")
+
+
+def test_a_board_takes_its_core_and_stops_its_garbage_collector() -> None:
+    core = max(os.sched_getaffinity(0))
+
+    def take() -> bool:
+        priority = take_processor(replace(task_spec("board"), core=core))
+        return os.sched_getaffinity(0) == {core} and priority == 0 and not gc.isenabled()
+
+    assert exit_status(fork(take)) == 0
+
+
+def test_ordinary_scheduling_can_always_be_had() -> None:
+    assert set_priority(0)
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+def test_a_board_dies_with_its_crate() -> None:
+    told, tell = os.pipe()
+
+    def crate() -> None:
+        parent = os.getpid()
+
+        def board() -> None:
+            die_with_parent(parent)
+            os.write(tell, b"%d\n" % os.getpid())
+            time.sleep(60)
+
+        fork(board)
+        time.sleep(60)
+
+    pid = fork(crate)
+    with os.fdopen(told) as lines:
+        board = int(lines.readline())
+    os.close(tell)
+    os.kill(pid, 9)
+    assert exit_status(pid) == -9
+    wait_until(lambda: not runs(board))

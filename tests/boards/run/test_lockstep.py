@@ -1,0 +1,167 @@
+"""Determinism: lockstep is repeatable, and real time is lockstep up to its first miss."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.trace import Flag
+from rack.backplane.words import Block, System
+from rack.boards import Rack
+from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
+from tests.boards.messages import Written
+
+SECONDS = 0.25
+TICKS = 100
+REALTIME = "clock.mode=realtime"
+SLOW = ("clock.mode=realtime", "clock.speed=0.5")
+"""Real time with room: on a machine that does other work too, most cycles are in time."""
+
+LATE = "board.wave.params={ trouble = 'late', at = 40, ticks = 9 }"
+
+
+def written(rack: Rack, seconds: float = SECONDS) -> Written:
+    """Run a rack, and return what it wrote."""
+    with rack:
+        rack.run(seconds)
+        return Written.on(rack.segment)
+
+
+def digest(rack: Rack, seconds: float = SECONDS) -> str:
+    with rack:
+        return rack.run(seconds).digest
+
+
+def test_ten_runs_in_lockstep_have_one_digest(config: MakeConfig) -> None:
+    assert len({digest(Rack(config())) for _ in range(10)}) == 1
+
+
+def test_the_digest_distinguishes_runs(config: MakeConfig) -> None:
+    settings = ("board.wave.params.done_at=90", "board.wave.within_cycles=5", "board.wave.params.plan_every=3")
+    digests = {digest(Rack(config(*extra))) for extra in [(), *((one,) for one in settings)]}
+    assert len(digests) == 1 + len(settings)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_every_protocol_is_repeatable_in_lockstep(config: MakeConfig, protocol: Protocol) -> None:
+    racks = [Rack(config(f"protocol.default={protocol}")) for _ in range(3)]
+    assert len({digest(rack) for rack in racks}) == 1
+    for rack in racks:
+        assert counted(rack, Block.CORRUPT, Block.BUS_ERRORS, Block.MISSED, Block.SKIPPED) == 0
+
+
+def test_one_mailbox_may_have_a_protocol_of_its_own(config: MakeConfig) -> None:
+    shared = "protocol.mailbox={ 'wave.plan' = 'double-buffer' }"
+    time_slice, mixed = written(Rack(config())), written(Rack(config(shared)))
+    again = written(Rack(config(shared)))
+    assert mixed.until(TICKS) == again.until(TICKS)
+    assert mixed.messages["wave.plan"]["visible_at"][0] == 0
+    assert time_slice.messages["wave.plan"]["visible_at"][0] == 4
+    assert mixed.messages["wave.status"]["visible_at"][0] == 1
+
+
+def test_under_time_slice_a_level_reads_by_ticks_alone(config: MakeConfig) -> None:
+    found = written(Rack(config(text=PLAIN)))
+    seen, made = found.messages["watch.status"], found.messages["wave.status"]
+    assert seen["tick"].tolist() == list(range(0, TICKS, 8))
+    # What the wave wrote one tick earlier, and nothing at tick 0.
+    expected = [0.0, *(made["message"]["value"][tick - 1] for tick in range(8, TICKS, 8))]
+    assert seen["message"]["value"].tolist() == expected
+    assert seen["basis"].tolist() == [0, *(tick - 1 for tick in range(8, TICKS, 8))]
+
+
+@pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
+def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig, coupling: tuple[str, ...]) -> None:
+    exact = Rack(config(*coupling))
+    lockstep = written(exact)
+    for _ in range(3):
+        rack = Rack(config(*SLOW, *coupling))
+        realtime = written(rack)
+        same = realtime.first_miss(TICKS)
+        assert realtime.until(same) == lockstep.until(same)
+        assert rack.outcome is not None
+        assert exact.outcome is not None
+        if same == TICKS:
+            assert rack.outcome.digest == exact.outcome.digest
+            return
+        assert rack.segment.words[System.CLOCK_SKIPPED] + counted(rack, Block.MISSED, Block.SKIPPED) > 0
+
+
+def counted(rack: Rack, *words: Block) -> int:
+    """Return the sum of these words over all tasks."""
+    return sum(rack.segment.block(task.name)[word] for task in rack.segment.layout.tasks for word in words)
+
+
+def test_a_late_cycle_is_counted_and_the_board_rejoins_the_grid(config: MakeConfig) -> None:
+    rack = Rack(config(*SLOW, LATE, text=PLAIN))
+    found = written(rack)
+    cycles, words = found.cycles["wave"], rack.segment.words
+    ticks = cycles["tick"]
+    at = ticks.tolist().index(40)
+    assert cycles["flags"][at] & Flag.MISSED
+    # Nine ticks of simulated time take four and a half here.
+    assert ticks[at + 1] >= 44
+    assert cycles["flags"][at + 1] & Flag.SKIPPED
+    block = rack.segment.block("wave")
+    assert block[Block.SKIPPED] == np.sum(np.diff(ticks) - 1) + ticks[0]
+    assert block[Block.MISSED] == np.count_nonzero(cycles["flags"] & Flag.MISSED)
+    assert (cycles["release_ns"] == words[System.EPOCH_NS] + ticks * words[System.PERIOD_NS]).all()
+
+
+def test_a_late_message_shows_from_the_next_boundary(config: MakeConfig) -> None:
+    messages = written(Rack(config(*SLOW, LATE, text=PLAIN))).messages["wave.status"]
+    assert messages[messages["tick"] == 40]["visible_at"][0] >= 45
+    behind = messages[messages["tick"] > 40]
+    assert len(behind)
+    assert (behind["visible_at"] > behind["tick"]).all()
+
+
+def test_up_to_a_late_cycle_a_run_is_as_ever(config: MakeConfig) -> None:
+    lockstep, realtime = written(Rack(config(text=PLAIN))), written(Rack(config(*SLOW, LATE, text=PLAIN)))
+    same = realtime.first_miss(TICKS)
+    assert same <= 40
+    assert realtime.until(same) == lockstep.until(same)
+    assert realtime.until(TICKS) != lockstep.until(TICKS)
+
+
+@pytest.mark.alone
+def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
+    late = "board.wave.params={ trouble = 'late', at = 40, ticks = 20 }"
+    rack = Rack(config(*SLOW, *LOOSE, "board.wave.executor=wave_levels:Steady", late))
+    found = written(rack)
+    plans, cycles = found.messages["wave.plan"], found.cycles["wave.planner"]
+    flags = cycles[cycles["tick"] == 40]["flags"][0]
+    assert flags & Flag.MISSED
+    assert flags & Flag.PLANNED
+    assert plans[plans["tick"] == 40]["visible_at"][0] > 44
+    assert rack.segment.block("wave.planner")[Block.MISSED] >= 1
+    assert rack.segment.block("wave.planner")[Block.PLANS] == len(plans)
+
+
+def test_the_same_trouble_costs_lockstep_nothing(config: MakeConfig) -> None:
+    quiet, slow = (
+        Rack(config(text=PLAIN)),
+        Rack(config("board.wave.params={ trouble='late', at=40, ticks=9 }", text=PLAIN)),
+    )
+    assert digest(quiet) == digest(slow)
+    assert counted(slow, Block.MISSED, Block.SKIPPED) == 0
+
+
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+def test_speed_stretches_the_grid_and_not_the_run(config: MakeConfig, speed: float) -> None:
+    rack = Rack(config(REALTIME, f"clock.speed={speed}", text=PLAIN))
+    cycles = written(rack, 0.25).cycles["wave"]
+    assert rack.outcome is not None
+    assert rack.outcome.ticks == 100
+    period_ns = 2_500_000 / speed
+    assert (np.diff(cycles["release_ns"]) == np.diff(cycles["tick"]) * period_ns).all()
+    assert (cycles["start_ns"] >= cycles["release_ns"]).all()
+
+
+def test_simulated_time_is_the_tick_whatever_the_boards_miss(config: MakeConfig) -> None:
+    rack = Rack(config(REALTIME, "board.wave.params={ trouble = 'late', at = 40, ticks = 40 }", text=PLAIN))
+    with rack:
+        outcome = rack.run(SECONDS)
+    assert outcome.ticks == TICKS
+    assert counted(rack, Block.SKIPPED) >= 30
