@@ -19,7 +19,8 @@ Role = Literal["executor", "planner"]
 class FieldSpec:
     """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit, meaning.
 
-    `fields` is not empty for a group of fields (a nested message).
+    `fields` is not empty for a group of fields (a nested message). `values` are names and numbers, in lower case, of a
+    field whose unit is an enum.
     """
 
     name: str
@@ -29,6 +30,7 @@ class FieldSpec:
     unit: str
     meaning: str
     fields: tuple[FieldSpec, ...] = ()
+    values: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True)

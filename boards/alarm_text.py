@@ -14,7 +14,7 @@ from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
 from rack.backplane.layout import Layout
 from rack.backplane.words import Demand
 from rack.boards.events import Event, EventKind
-from rack.boards.faults.text import board_of, joint_name, subject_of, what
+from rack.boards.faults.describe import board_of, describe_kind, joint_name, subject_of
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]
 EMERGENCY_STOP = "emergency stop"
@@ -82,7 +82,7 @@ def event_of(
         entry = faults.entries[number]
         subject, board, fault = subject_of(entry, layout, joints), board_of(entry, layout), number
         code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
-        text = f"{what(entry, layout, joints)} {code}{_course(entry, code, layout)}"
+        text = f"{describe_kind(entry, layout, joints)} {code}{_course(entry, code, layout)}"
     elif alarm == Alarm.DEMAND:
         subject, demand = _task(number, layout, EMERGENCY_STOP), Demand(int(value))
         kind, text = ("reaction" if demand else "recovery"), _demand(demand, subject)

@@ -27,7 +27,7 @@ from rack.boards.board import enter, run_clock_board, run_task_board
 from rack.boards.channel import Channel
 from rack.boards.clock_wiring import ClockWiring
 from rack.boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
-from rack.boards.faults.hog import hog
+from rack.boards.faults.tasks import hog
 from rack.boards.processor import set_priority
 from rack.boards.wiring import TaskWiring
 

@@ -13,12 +13,12 @@ from rack.backplane.words import Block, Demand, System
 from rack.boards.clock_wiring import ClockWiring
 from rack.boards.config import context, shared_out, wire
 from rack.boards.config.cores import obtained_core
+from rack.boards.config.faults import injections
 from rack.boards.config.ports import TaskPorts, all_ports
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import is_critical
 from rack.boards.errors import LaunchError
-from rack.boards.faults.kinds import KINDS
-from rack.boards.faults.request import injections
+from rack.boards.faults.kind import KINDS
 from rack.boards.outcome import Cause
 from rack.boards.transfer import Transfer
 from rack.boards.wiring import TaskWiring

@@ -13,7 +13,7 @@ from rack.backplane.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.silence_watch import Witness
 from rack.backplane.watched_reader import watched
-from rack.boards.faults.writers import FaultyWriter
+from rack.boards.faults.messages import FaultyWriter
 from rack.levels.level import Ports, Reading, Verdict
 
 

@@ -31,7 +31,7 @@ from rack.boards.crate_line import CrateLine
 from rack.boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.events import Event
-from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.kind import KINDS
 from rack.boards.heartbeat import Heartbeat
 from rack.boards.journal import Journal
 from rack.boards.launch import Launch, modules

@@ -12,8 +12,7 @@ from rack.backplane.released_task import ReleasedTask
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, System
 from rack.boards.clock_wiring import ClockWiring
-from rack.boards.faults.stage import FaultStage
-from rack.boards.faults.strikes import Strikes
+from rack.boards.faults.clock_board import FaultStage
 from rack.boards.operating.desk import OperatorDesk
 
 # Plain integers for the hot path.
@@ -25,7 +24,7 @@ class SystemController:
 
     def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
         self._words, self._wiring, self._driver = segment.words, wiring, driver
-        self._faults = FaultStage(segment, Strikes(segment, driver), driver.alarms)
+        self._faults = FaultStage(segment, driver)
         self._desk = OperatorDesk(segment, driver.alarms)
         self._settled: tuple[int, int, int] | None = None
         self._demand = Demand(self._words[System.DEMAND])

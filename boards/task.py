@@ -13,7 +13,7 @@ from rack.backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
 from rack.backplane.wake import NextCycle
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.clock_guard import ClockGuard
-from rack.boards.faults.task_faults import TaskFaults
+from rack.boards.faults.tasks import TaskFaults
 from rack.boards.ports import InputPorts, OutputPorts
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner

@@ -61,15 +61,17 @@ class Pace(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """A fault that is injected into what a level drives: its kind, as in "sensor-nan", and what the kind takes.
+    """A fault that is injected into what a level drives: its kind, as in "sensor-nan", and the kind's parameters.
 
-    `seed` makes everything random in it repeatable; `since` is the tick at which it began.
+    `seed` makes everything random in it repeatable; `since` is the tick at which it began. `step` is what acts, of one
+    of the classes that the level names in `faults`.
     """
 
     kind: str
     parameters: Mapping[str, float]
     seed: int
     since: int
+    step: object
 
 
 class Finding(NamedTuple):
@@ -119,8 +121,8 @@ class Executor(ABC):
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, MessageType]] = {}
-    faults: ClassVar[tuple[str, ...]] = ()
-    """Kinds of faults that can be injected into what the level drives."""
+    faults: ClassVar[tuple[type, ...]] = ()
+    """Classes of steps by which faults can strike what the level drives: see `rack.levels.faults`."""
     commands: ClassVar[Commands] = {}
     """What an operator may tell the level, and how goals are given: of one that reads "own.operator"."""
     params: ClassVar[type[Table] | None] = None

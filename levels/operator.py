@@ -49,8 +49,8 @@ class Answer(IntEnum):
 OPERATOR_COMMAND = command(
     "operator_command",
     1,
-    Field("what", "u1", "What", "what to do"),
-    Field("goal", "u1", "Goal", "how the goal is given"),
+    Field("what", "u1", What, "what to do"),
+    Field("goal", "u1", Goal, "how the goal is given"),
     Field("count", "u1", "1", "joints that follow"),
     Field("joints", "f8", "rad", "joint positions, for goal joints", (MOST_JOINTS,)),
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
@@ -62,8 +62,8 @@ RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or 
 ANSWER = (
     RESTS_ON,
     Field("order", "u4", "1", "newest command that an operator gave to this level; 0: none yet"),
-    Field("answer", "u1", "Answer", "what has become of it"),
-    Field("standing", "u1", "What", "what an operator has the level do; 0: its own work"),
+    Field("answer", "u1", Answer, "what has become of it"),
+    Field("standing", "u1", What, "what an operator has the level do; 0: its own work"),
     Field("objection", f"S{REASON_BYTES}", "ASCII", "why it was refused, readable"),
 )
 """Fields of a status that answer an operator."""

@@ -23,7 +23,7 @@ def commands() -> typer.Typer:
 
     from rack.tools.analyze import analyze
     from rack.tools.bench.command import bench
-    from rack.tools.campaign.command import campaign
+    from rack.tools.campaign import campaign
     from rack.tools.check import check
     from rack.tools.clean import clean
     from rack.tools.command import EXAMPLES as COMMANDING
@@ -31,8 +31,7 @@ def commands() -> typer.Typer:
     from rack.tools.estop import estop
     from rack.tools.gantt import gantt
     from rack.tools.inject import EXAMPLES as INJECTING
-    from rack.tools.inject import inject
-    from rack.tools.injecting.kinds import KindsCommand
+    from rack.tools.inject import KindsCommand, inject
     from rack.tools.list import list_racks
     from rack.tools.record import record
     from rack.tools.replay import replay

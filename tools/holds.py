@@ -17,7 +17,7 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.events import Event
 from rack.boards.operating.text import describe
 from rack.levels.operator import Answer, What
-from rack.tools.campaign.ending import arm_of
+from rack.tools.faults.ending import arm_of
 
 STILL_S = 5.0
 """Simulated time without motion after which a rack that is held says so as an event."""

@@ -16,9 +16,9 @@ from rack.boards.events import Event
 from rack.boards.outcome import Outcome
 from rack.boards.rack import Rack
 from rack.tools.answer import Failure
-from rack.tools.campaign.ending import Strike, strikes
 from rack.tools.display import Display
 from rack.tools.event_log import EventLog
+from rack.tools.faults.ending import Strike, strikes
 from rack.tools.holds import Standstill
 from rack.tools.interrupt import INTERRUPT
 from rack.tools.recorder.process import RecorderProcess

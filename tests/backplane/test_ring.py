@@ -12,7 +12,7 @@ from rack.backplane.protocols import open_writer
 from rack.backplane.ring import Ring, mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.slots import claim
-from rack.boards.faults.masquerade import masquerade
+from rack.boards.faults.messages import forge
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork, kill, wait_until
@@ -95,7 +95,7 @@ def test_a_forged_message_is_no_row_and_the_true_one_in_its_place_is(bus: Segmen
     writer, ring = open_writer(bus, NAME), mailbox_ring(bus, NAME)
     write(writer, 2)
     assert serials(ring) == ([1, 2], 0)
-    assert exit_status(fork(lambda: masquerade(bus, NAME, 20))) == 0
+    assert exit_status(fork(lambda: forge(bus, NAME, 20))) == 0
     assert serials(ring) == serials(ring) == ([], 0)
     write(writer, 2)
     assert serials(ring) == ([3, 4], 0)

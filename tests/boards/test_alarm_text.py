@@ -16,8 +16,8 @@ from rack.backplane.words import Demand
 from rack.boards.alarm_text import MISSES, event_of
 from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
+from rack.boards.config.faults import injections
 from rack.boards.events import Event
-from rack.boards.faults.request import injections
 from rack.levels.cell import build_cell
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack

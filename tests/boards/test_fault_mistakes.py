@@ -9,18 +9,18 @@ import pytest
 
 from rack.backplane.address_map import FAULT_ENTRIES
 from rack.boards.config import load, wire
+from rack.boards.config.faults import injections
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
-from rack.boards.faults.request import injections
+from rack.boards.faults.kind import KINDS, Kind, Parameter
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import LOCKED, TARGETS, inline, rack
 
 Fault = dict[str, Any]
 TASKS = "wave, wave.planner, watch, driven, clock"
 MISTAKES: Mapping[str, tuple[Fault, str]] = {
-    "no kind": ({"board": "wave"}, "fault[0].kind: missing; what goes wrong"),
-    "no board": ({"kind": "kill"}, "fault[0].board: missing; task concerned"),
-    "unknown kind": ({"kind": "kil", "board": "wave"}, f'.kind = "kil": no such kind; kinds: {", ".join(NUMBERS)}'),
+    "no kind": ({"board": "wave"}, "fault[0].kind: missing; kind of fault"),
+    "no board": ({"kind": "kill"}, "fault[0].board: missing; task to strike"),
+    "unknown kind": ({"kind": "kil", "board": "wave"}, f'.kind = "kil": no such kind; kinds: {", ".join(KINDS.names)}'),
     "unknown board": ({"kind": "kill", "board": "wve"}, f'.board = "wve": no such task; tasks: {TASKS}'),
     "no such planner": ({"kind": "kill", "board": "watch.planner"}, f"no such task; tasks: {TASKS}"),
     "tick below 0": ({"kind": "kill", "board": "wave", "tick": -1}, ".tick = -1: should be greater than or equal to 0"),
@@ -53,31 +53,31 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
     "no mailbox": ({"kind": "mute", "board": "watch", "mailbox": "sea"}, "does not write it; it writes: watch.status"),
     "overrun of a planner": (
         {"kind": "overrun", "board": "wave.planner"},
-        "overrun is of executors; executors: wave, watch, driven",
+        "overrun strikes executors; executors: wave, watch, driven",
     ),
     "slow executor": (
         {"kind": "planner-slow", "board": "wave"},
-        '.board = "wave": planner-slow is of planners; planners: wave.planner',
+        '.board = "wave": planner-slow strikes planners; planners: wave.planner',
     ),
     "nothing driven": (
         {"kind": "sensor-nan", "board": "wave"},
         "drives nothing that can have sensor-nan; boards: driven",
     ),
-    "clock kind": ({"kind": "clock-skip", "board": "wave"}, 'clock-skip is of the clock; permitted: "clock"'),
+    "clock kind": ({"kind": "clock-skip", "board": "wave"}, 'clock-skip strikes the clock; permitted: "clock"'),
     "no kind of the clock": (
         {"kind": "mute", "board": "clock"},
-        "the clock has no mute; its kinds: kill, clock-stop, clock-skip, clock-jitter",
+        "the clock cannot have mute; its kinds: kill, clock-stop, clock-skip, clock-jitter",
     ),
-    "clock that hangs": ({"kind": "hang", "board": "clock"}, "the clock has no hang; its kinds: kill, clock-stop"),
+    "clock that hangs": ({"kind": "hang", "board": "clock"}, "the clock cannot have hang; its kinds: kill, clock-stop"),
     "no lock": ({"kind": "lock-held", "board": "wave"}, "needs protocol lock; mailboxes of 'wave' with it: none"),
-    "nobody reads": ({"kind": "masquerade", "board": "watch"}, "missing; nobody reads what 'watch' writes"),
+    "nobody reads": ({"kind": "masquerade", "board": "watch"}, "missing; what 'watch' writes has no reader"),
     "condition": (
         {"kind": "kill", "board": "wave", "when": "wave.status.state > 1"},
         'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"',
     ),
     "condition, mailbox": (
         {"kind": "kill", "board": "wave", "when": "sea.status.state == done"},
-        "no mailbox is called 'sea.status'; mailboxes: wave.status, wave.plan, watch.status, driven.status",
+        "there is no mailbox 'sea.status'; mailboxes: wave.status, wave.plan, watch.status, driven.status",
     ),
     "condition, field": (
         {"kind": "kill", "board": "wave", "when": "wave.status.height == 1"},
@@ -89,11 +89,11 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
     ),
     "condition, name": (
         {"kind": "kill", "board": "wave", "when": "wave.status.state == gone"},
-        "'gone' is no value of 'state'; permitted: idle, executing, done, error",
+        "'gone' is not a value of 'state'; permitted: idle, executing, done, error",
     ),
     "condition, number": (
         {"kind": "kill", "board": "wave", "when": "driven.status.mode == 40000"},
-        "'40000' is no value of 'mode'; permitted: a number from -32768 to 32767",
+        "'40000' is not a value of 'mode'; permitted: a number from -32768 to 32767",
     ),
 }
 PARAMETERS = [(kind, parameter) for kind in KINDS for parameter in kind.parameters]
@@ -164,12 +164,12 @@ def test_half_of_something_that_is_counted_is_refused(config: MakeConfig, kind: 
 def test_a_kind_that_needs_real_time_says_so_in_lockstep(config: MakeConfig, kind: Kind) -> None:
     line = told(config, fault_of(kind), settings=("clock.mode=lockstep", *settings_for(kind)))
     assert line == (
-        f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for everybody; '
+        f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for every task; '
         "run without --lockstep"
     )
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_phase], ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", [k for k in KINDS if not k.within_tick], ids=lambda kind: kind.name)
 def test_a_kind_that_begins_with_a_cycle_has_no_phase(config: MakeConfig, kind: Kind) -> None:
     line = told(config, fault_of(kind, phase=0.5), settings=settings_for(kind))
     assert line == (
@@ -183,19 +183,19 @@ def test_a_kind_that_begins_with_a_cycle_has_no_phase(config: MakeConfig, kind: 
 def test_a_kind_that_strikes_once_does_not_last(config: MakeConfig, kind: Kind, key: str) -> None:
     line = told(config, fault_of(kind, **{key: 1}), settings=settings_for(kind))
     assert f"fault[0].{key} = 1" in line
-    assert f"{kind.name} strikes once, it does not last; leave it out" in line
+    assert f"{kind.name} strikes once and has no duration; leave it out" in line
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_mailbox], ids=lambda kind: kind.name)
 def test_a_kind_that_is_of_no_mailbox_lists_those_that_are(config: MakeConfig, kind: Kind) -> None:
     takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
     line = told(config, fault_of(kind, mailbox="wave.status"))
-    assert line == f'fault[0].mailbox = "wave.status": {kind.name} is of no mailbox; kinds that are: {takers}'
+    assert line == f'fault[0].mailbox = "wave.status": {kind.name} does not strike mailboxes; kinds that do: {takers}'
 
 
 @pytest.mark.parametrize("begin", [{"tick": 4}, {"at": 1.0}, {"when": "wave.status.state == executing"}])
 def test_a_self_test_fails_at_the_start_and_at_no_other_time(config: MakeConfig, begin: Fault) -> None:
-    line = told(config, fault_of(KINDS[NUMBERS["self-test"]], **begin))
+    line = told(config, fault_of(KINDS["self-test"], **begin))
     assert "self-test strikes as the board starts; leave it out" in line
 
 
@@ -214,7 +214,7 @@ def test_a_joint_that_the_arm_lacks_is_refused() -> None:
 
 def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None:
     faults = [{"kind": "kill", "board": "wave", "tick": tick} for tick in range(FAULT_ENTRIES + 1)]
-    assert told(config, *faults) == f"fault = {len(faults)}: more than one run can have; permitted: {FAULT_ENTRIES}"
+    assert told(config, *faults) == f"fault = {len(faults)}: too many for one run; permitted: {FAULT_ENTRIES}"
 
 
 def test_all_mistakes_of_all_faults_are_told_at_once(config: MakeConfig) -> None:

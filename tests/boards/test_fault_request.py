@@ -10,11 +10,11 @@ from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stag
 from rack.backplane.message import State
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config import wire
+from rack.boards.config.faults import injection, injections
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
-from rack.boards.faults.kinds import NUMBERS
-from rack.boards.faults.request import injection, injections
-from rack.boards.faults.text import describe, document
+from rack.boards.faults.describe import describe, document
+from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
@@ -94,7 +94,7 @@ def test_verbs_of_elemental_moves_have_names() -> None:
 
 def test_parameters_stand_in_the_order_of_their_kind(config: MakeConfig) -> None:
     (found,) = injected(config, {"kind": "sensor-bias", "board": "driven", "joint": 3})
-    assert found.parameters == (0.02, 3.0)
+    assert found.parameters == (3.0, 0.02)
     (found,) = injected(config, {"kind": "overrun", "board": "wave", "random": True})
     assert found.parameters == (1.5, 1.0)
 
@@ -133,13 +133,13 @@ def test_the_table_holds_and_tells_what_was_asked_for(config: MakeConfig, rack_n
         table = FaultTable(segment)
         entries = [table.add(each) for each in injections(found, layout)]
         assert [entry.stage for entry in entries] == [Stage.WAITING] * 2
-        assert (entries[0][Entry.KIND], entries[0][Entry.FROM]) == (NUMBERS["corrupt"], 8)
+        assert (entries[0][Entry.KIND], entries[0][Entry.FROM]) == (KINDS["corrupt"].number, 8)
         assert describe(entries[0], layout, ()) == "corrupt of wave (wave.status, probability 1, bits 5)"
         assert describe(entries[1], layout, ("a", "b")) == "sensor-bias of driven (b, size 0.1 rad)"
         assert document(entries[0], layout, ())["until"] is None
         entries[1].words[Entry.STAGE], entries[1].words[Entry.UNTIL] = Stage.ACTIVE, NEVER
         told = document(entries[1], layout, ("a", "b"))
-        assert (told["stage"], told["until"], told["parameters"]) == ("active", None, {"size": 0.1, "joint": 1.0})
+        assert (told["stage"], told["until"], told["parameters"]) == ("active", None, {"joint": 1.0, "size": 0.1})
     finally:
         segment.close()
         unlink(rack_name)

@@ -10,9 +10,8 @@ from rack.backplane.lockstep_driver import LockstepDriver
 from rack.backplane.semaphores import clock_semaphore
 from rack.backplane.wake import NextCycle
 from rack.backplane.words import Block, System
-from rack.boards.faults.kinds import NUMBERS
-from rack.boards.faults.stage import FaultStage
-from rack.boards.faults.strikes import Strikes
+from rack.boards.faults.clock_board import FaultStage
+from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.processes import BOUND_S
@@ -25,7 +24,7 @@ def test_no_fault_begins_or_ends_while_a_cycle_is_under_way(make_bus: MakeBus) -
     segment = make_bus(task("writer", every=8), mailbox(every=8, delay=8))
     segment.words[System.LOCKSTEP] = 1
     table = FaultTable(segment)
-    entry = table.add(Injection(NUMBERS["mute"], 0, mailbox=0, tick=3, ticks=6))
+    entry = table.add(Injection(KINDS["mute"].number, 0, mailbox=0, tick=3, ticks=6))
     cycle, seen = NextCycle(segment, "writer"), []
 
     def serve() -> None:
@@ -39,7 +38,7 @@ def test_no_fault_begins_or_ends_while_a_cycle_is_under_way(make_bus: MakeBus) -
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
     driver = LockstepDriver(segment, lambda _: 24, False, 8)
-    stage = FaultStage(segment, Strikes(segment, driver), driver.alarms)
+    stage = FaultStage(segment, driver)
 
     class Controller:
         def begin(self, tick: int) -> None:

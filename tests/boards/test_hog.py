@@ -9,8 +9,8 @@ import pytest
 from rack.backplane.fault_table import FaultTable, Injection
 from rack.backplane.process import processor_ns
 from rack.backplane.words import Block, Run, System
-from rack.boards.faults.hog import run_hog
-from rack.boards.faults.kinds import NUMBERS
+from rack.boards.faults.kind import KINDS
+from rack.boards.faults.tasks import take_core
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.machine import needs_fifo
@@ -26,8 +26,8 @@ def test_a_hog_that_waits_for_the_start_leaves_the_core_to_those_who_do_it(make_
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = 2_500_000
     segment.block("level")[Block.CORE] = 0
-    entry = FaultTable(segment).add(Injection(NUMBERS["hog"], 0, tick=40, ticks=400))
-    with forked(lambda: run_hog(segment, entry)) as pid:
+    entry = FaultTable(segment).add(Injection(KINDS["hog"].number, 0, tick=40, ticks=400))
+    with forked(lambda: take_core(segment, entry)) as pid:
         begun = time.monotonic()
         wait_until(lambda: time.monotonic() - begun > LEAST_S, BOUND_S)
         assert processor_ns(pid) < 0.5 * (time.monotonic() - begun) * 1e9

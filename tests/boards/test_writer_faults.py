@@ -13,9 +13,8 @@ from rack.backplane.fault_table import Entry, FaultTable, Injection
 from rack.backplane.layout import PROTOCOLS, Protocol
 from rack.backplane.mailbox import Verdict
 from rack.backplane.process import state_of
-from rack.boards.faults.bounds import bound_ticks
-from rack.boards.faults.kinds import KINDS, NUMBERS
-from rack.boards.faults.masquerade import masquerade
+from rack.boards.faults import messages
+from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME
 from tests.link import Link, MakeLink, WritingTask, links, struck
 from tests.processes import FORKS, exit_status, fork, forked, wait_until
@@ -44,7 +43,7 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 def forge(rack: Link, tick: int) -> None:
     """Publish a forged message from a process of its own."""
-    assert exit_status(fork(lambda: masquerade(rack.segment, NAME, tick))) == 0
+    assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 
 @pytest.mark.parametrize("reader_first", [False, True])
@@ -72,15 +71,15 @@ def test_a_fault_is_found_within_its_bound_and_for_what_it_is(
     rack.run(BEGIN, END)
     rack.heal()
     rack.run(END, LAST)
-    about = KINDS[NUMBERS[kind]]
-    injection = Injection(NUMBERS[kind], 0, 0, parameters=FAULTS[kind])
-    bound = bound_ticks(about, injection, rack.segment.layout, "reader")
+    about = KINDS[kind]
+    injection = Injection(KINDS[kind].number, 0, 0, parameters=FAULTS[kind])
+    bound = about.bound_ticks(injection, rack.segment.layout, "reader")
     alarms = rack.alarms()
-    found = [tick for tick, code in alarms if code in about.seen_as]
+    found = [tick for tick, code in alarms if code in about.detected_as]
     assert found
     assert bound is not None
     assert found[0] - struck(entry) <= bound
-    assert {code for _, code in alarms} - set(about.seen_as) <= ALSO.get(kind, set())
+    assert {code for _, code in alarms} - set(about.detected_as) <= ALSO.get(kind, set())
     assert len(found) <= 2
 
 
@@ -295,7 +294,7 @@ def test_a_process_that_ends_inside_the_critical_section_is_found_by_the_next_wa
     rack = link("lock")
     rack.run(0, 4)
     rack.writer.close()
-    entry = FaultTable(rack.segment).add(Injection(NUMBERS["lock-held"], 0, parameters=(float(is_killed),)))
+    entry = FaultTable(rack.segment).add(Injection(KINDS["lock-held"].number, 0, parameters=(float(is_killed),)))
 
     def write() -> None:
         writer = WritingTask(rack.segment)

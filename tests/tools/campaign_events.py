@@ -8,9 +8,8 @@ from typing import Any
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 from rack.boards.events import Event, EventKind
-from rack.boards.faults.kinds import KINDS, NUMBERS
-from rack.tools.campaign.ending import Strike
-from rack.tools.campaign.plan import EXTERNAL
+from rack.boards.faults.kind import KINDS
+from rack.tools.faults.ending import EXTERNAL, Strike
 
 TICK_NS = 2_500_000
 TASKS = (
@@ -42,7 +41,7 @@ def found(tick: int, code: str, board: str, subject: str = "") -> Event:
 
 def strike(kind: str, board: str, tick: int, ends: int = -1, place: int = 0, **more: Any) -> Strike:
     """Return a fault that struck at the beginning of a tick, and is over at `ends`; once, where that is not said."""
-    number = NUMBERS["kill" if kind == EXTERNAL else kind]
+    number = KINDS["kill" if kind == EXTERNAL else kind].number
     parameters = tuple(parameter.default or 0.0 for parameter in KINDS[number].parameters)
     tasks = [task.name for task in TASKS]
     made = Strike(

@@ -15,8 +15,7 @@ import pytest
 
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards.processor import name_process
-from rack.tools.campaign.leftovers import children, left_behind
-from rack.tools.campaign.load import load
+from rack.tools.campaigns.environment import children, left_behind, load
 from tests.processes import FORKS, RACK, forked, runs, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -149,7 +148,7 @@ def test_a_file_left_in_shared_memory_is_noticed(rack_name: str) -> None:
 
 @pytest.mark.filterwarnings(FORKS)
 def test_a_process_left_behind_is_noticed_whoever_its_parent_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rack.tools.campaign.leftovers.BOUND_S", 0.05)
+    monkeypatch.setattr("rack.tools.campaigns.environment.BOUND_S", 0.05)
     rack = f"p{os.getpid()}x"
 
     def board() -> None:

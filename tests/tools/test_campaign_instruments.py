@@ -7,7 +7,7 @@ import pytest
 from rack.boards.config import load
 from rack.levels.arm.limit_monitor import LimitMonitor
 from rack.tools.answer import Failure
-from rack.tools.campaign.instruments import examine
+from rack.tools.campaigns.environment import examine
 
 
 def test_a_counter_of_violations_that_counts_passes() -> None:

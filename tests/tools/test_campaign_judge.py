@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 
 from rack.boards.events import Event
-from rack.tools.campaign.ending import Strike
-from rack.tools.campaign.judge import Circumstances, Judgement, Verdict, judge
-from rack.tools.campaign.plan import EXTERNAL
+from rack.tools.faults.ending import EXTERNAL, Strike
+from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, judge
 from tests.tools.campaign_events import LAYOUT, TICK_NS, event, found, strike
 
 END = event(10_000, "end", "")
@@ -19,7 +18,7 @@ REAL_TIME = Circumstances(LAYOUT, offset_ns=0)
 LOCKSTEP = replace(REAL_TIME, is_lockstep=True)
 
 
-def verdict(strikes: list[Strike], *events: Event, run: Circumstances = REAL_TIME) -> Verdict:
+def verdict(strikes: list[Strike], *events: Event, run: Circumstances = REAL_TIME) -> FaultVerdict:
     return judge(strikes, [*events, END], run)
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from rack.boards.events import Event
 from rack.boards.outcome import Cause, Outcome
-from rack.tools.campaign.ending import Arm, Strike
-from rack.tools.campaign.plan import Plan
-from rack.tools.campaign.results import Faultless, Judged, Results, keep, kept, misses_of
-from rack.tools.campaign.trial import Trial
+from rack.tools.campaigns.plan import Plan
+from rack.tools.campaigns.results import Faultless, Judged, Results, keep, kept, misses_of
+from rack.tools.campaigns.trial import Trial
+from rack.tools.faults.ending import ArmEnd, Strike
 from tests.tools.campaign_events import LAYOUT, event, found, strike
 
 FAULT = strike("mute", "lower", 100, 150)
@@ -31,7 +31,7 @@ def trial(*events: Event, strikes: tuple[Strike, ...] = (FAULT,)) -> Trial:
         refused="",
         events=(*events, event(9999, "end", "")),
         strikes=strikes,
-        arm=Arm(),
+        arm=ArmEnd(),
         left=(),
         wall_s=1.0,
         offset_ns=0,
@@ -68,7 +68,7 @@ def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_noth
             replace(trial(SEEN), outcome=outcome("task failed", "level 'lower': blocked")),
             "the task is not done, and no fault had to end it: task failed; level 'lower': blocked",
         ),
-        (replace(trial(SEEN), arm=Arm(violations=3)), "limits violated at 3 substeps"),
+        (replace(trial(SEEN), arm=ArmEnd(violations=3)), "limits violated at 3 substeps"),
         (replace(trial(SEEN), left=("process 7 (x:servo)",)), "left behind: process 7 (x:servo)"),
         (trial(SEEN, found(9000, "gap", "upper", "lower.status")), "upper: gap: no fault explains it (tick 9000)"),
         (
@@ -84,8 +84,8 @@ def test_each_shortfall_is_a_line(bad: Trial, line: str) -> None:
 def test_a_task_is_safely_stopped_when_the_arm_stands_and_no_limit_was_violated() -> None:
     lost = replace(trial(SEEN), outcome=outcome("board lost", "board 'lower' ended"))
     assert Judged.of(lost).ended == "safely stopped"
-    assert Judged.of(replace(lost, arm=Arm(is_at_rest=False))).ended == "neither"
-    assert Judged.of(replace(lost, arm=Arm(violations=1))).ended == "neither"
+    assert Judged.of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
+    assert Judged.of(replace(lost, arm=ArmEnd(violations=1))).ended == "neither"
 
 
 def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -> None:
@@ -131,7 +131,7 @@ def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
 
 def test_what_any_run_breaks_counts_whatever_the_run_is_for() -> None:
     nominal = Judged.of(trial(strikes=())).finding()
-    swept = Judged.of(replace(trial(SEEN), arm=Arm(violations=2))).finding()
+    swept = Judged.of(replace(trial(SEEN), arm=ArmEnd(violations=2))).finding()
     results = Results(nominal, trials=[Judged.of(trial(SEEN)).finding()], sizes=[swept])
     assert sum(run.violations for run in results.runs) == 2
     assert len(results.faults) == 1

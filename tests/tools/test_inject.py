@@ -16,11 +16,11 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, System
 from rack.boards.config import load
 from rack.boards.errors import ConfigError
-from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.kind import KINDS
 from rack.boards.rack import Rack
 from rack.tools.answer import Failure
-from rack.tools.injecting import live
-from rack.tools.injecting.live import LiveRack
+from rack.tools.faults import live
+from rack.tools.faults.live import LiveRack
 from tests.boards.fault_racks import DRIVEN
 from tests.processes import RACK, wait_until
 

@@ -11,9 +11,9 @@ from typing import Any
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
+from rack.tools.faults.judge import faults
 from rack.tools.recording import Recording
 from rack.tools.reporting.difference import first_difference
-from rack.tools.reporting.faults import faults
 from rack.tools.reporting.holds import holds
 from rack.tools.reporting.markdown import markdown
 from rack.tools.reporting.misses import counted, misses
