@@ -62,7 +62,7 @@ class ActiveFault:
 
 @dataclass(frozen=True)
 class SensorStep:
-    """Spoils a sample. `act` returns the spoilt sample, and whether it can be told from the truth."""
+    """Spoils a sample. `act` returns the spoilt sample, and whether it differs from the truth."""
 
     act: Callable[[Sensed, ActiveFault], tuple[Sensed, bool]]
 

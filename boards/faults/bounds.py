@@ -138,7 +138,7 @@ def delayed(parameter: str) -> Bound:
 
 def skipped(parameter: str) -> Bound:
     """Return as many ticks as a parameter says: seen at the first tick that is not skipped."""
-    return Bound("the first tick after", lambda case: int(case.parameters[parameter]))
+    return Bound("the next tick", lambda case: int(case.parameters[parameter]))
 
 
 def by_rack_or(count: int) -> Bound:
@@ -147,14 +147,14 @@ def by_rack_or(count: int) -> Bound:
     def ticks(case: BoundCase) -> int:
         return ceil(RACK_NS / case.layout.clock_ns) if case.reader is None else count * case.cycle + case.read
 
-    return Bound(f"{RACK_NS * 1e-6:g} ms by the Rack, {count} cycles + 1 read by a reader", ticks)
+    return Bound(f"{RACK_NS * 1e-6:g} ms by the Rack; {count} cycles + 1 read by a reader", ticks)
 
 
 READ = Bound("1 read", lambda case: case.read)
 DELIVERY = Bound("1 delivery", lambda case: case.delivery)
 SLICE = Bound("1 time slice", lambda case: case.cycle)
 RELEASE = Bound("1 cycle", lambda case: case.period)
-LOCK_WAIT = Bound("the time-out of a lock", lambda case: ceil(WAIT_S * 1e9 / case.layout.clock_ns))
+LOCK_WAIT = Bound("the lock's time-out", lambda case: ceil(WAIT_S * 1e9 / case.layout.clock_ns))
 BY_SIZE = Bound("depends on its size", lambda case: None)
 NOT_ARMED = Bound("the rack does not arm", lambda case: None)
 

@@ -142,8 +142,8 @@ class Kind:
     def bound_ticks(self, injection: Injection, layout: Layout, reader: str | None = None) -> int | None:
         """Return the ticks from the tick at which a fault first acted to its detection; None: there is no bound.
 
-        `reader` is the task that finds it; None: whichever finds it first, for a death the Rack. A mailbox that nobody
-        reads has no bound.
+        `reader` is the task that finds it; None: whichever finds it first, for a death the Rack. A mailbox without
+        readers has no bound.
         """
         given = {p.name: value for p, value in zip(self.parameters, injection.parameters, strict=False)}
         case = BoundCase(layout, injection, given, reader)

@@ -123,7 +123,7 @@ KINDS.add(
     Kind(
         name="hog",
         where="core",
-        means="another process runs on the board's core at a higher priority",
+        means="a process of higher priority takes the board's core",
         step=tasks.take_core,
         detected_as=(Alarm.STARVED,),
         bound=cycles(4 + 1),

@@ -36,7 +36,7 @@ class FaultyLink:
         self._limits = limits = cell.bounds.torque
         # Friction that helped may now resist: it hides twice its value.
         self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
-        # What carried may now press.
+        # A push that carried may now press.
         self._pressed = 2.0 * PRESSING * limits
         self._sensors: list[tuple[SensorStep, ActiveFault]] = []
         self._motors: list[tuple[float, ActiveFault]] = []  # with the part of its torque limit that a motor still gives

@@ -48,7 +48,7 @@ def test_a_run_with_a_script_repeats_with_its_faults(small: Path, rack_name: str
     ("script", "line"),
     [
         ("noisy", f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'),
-        ("[[fault]]\nkind = 'kill'", "fault[0].board: missing; task concerned"),
+        ("[[fault]]\nkind = 'kill'", "fault[0].board: missing; task to strike"),
         ("[[fault]]\nkind = 'kill'\nboard = 'servo'", 'fault[0].board = "servo": no such task; tasks: upper, lower'),
         ("[[fault]]\nkind = 'hog'\nboard = 'lower'", 'fault[0].kind = "hog": hog needs real time: in lockstep time'),
         ("[[fault]\n", "script.toml: not TOML: "),

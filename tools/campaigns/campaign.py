@@ -62,7 +62,7 @@ class Order:
 
 
 class Campaign:
-    """One campaign. Raises `ConfigError`, and `Failure` for a task that is the task is not done even without faults."""
+    """One campaign. Raises `ConfigError`, and `Failure` for a task that is not done even without faults."""
 
     def __init__(self, order: Order, folder: Path, progress: Progress) -> None:
         self.order, self.folder = order, folder

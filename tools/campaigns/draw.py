@@ -11,8 +11,8 @@ from typing import Any
 from rack.backplane.fault_table import Injection
 from rack.boards.faults.clock_board import PHASES
 from rack.boards.faults.drawing import Drawing, swept
-from rack.tools.campaigns.plan import Kill, Plan, Purpose, Target, Targets, record_of
-from rack.tools.faults.ending import EXTERNAL
+from rack.tools.campaigns.plan import Kill, Plan, Purpose, Target, Targets
+from rack.tools.faults.ending import EXTERNAL, record_of
 
 MOST_FAULTS = 40
 """Faults of one trial: as many as fit into the task, and into the fault table."""
@@ -50,63 +50,66 @@ class RackUnderTest:
         """Return the tick up to which faults may begin, and their consequences last."""
         return max(self.first() + 1, self.ticks - round(TAIL_S * self.second))
 
-    def window(self, target: Target, shape: Shape) -> int:
+    def window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
         """Return the ticks from the beginning of a fault to the next: it is found, over, and recovered from."""
         layout, kind = self.targets.layout, target.record
-        found = kind.bound_ticks(self._injection(target, shape), layout, None) or 0
-        if kind.is_over_when_found:
-            lasts = found
-        else:
-            lasts = max(shape.ticks, 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS, found)
-        return lasts + kind.recovery_ticks(target.board, layout, self.restart_s) + round(SETTLE_S * self.second)
-
-    def _injection(self, target: Target, shape: Shape) -> Injection:
-        layout, kind = self.targets.layout, target.record
         tasks, boxes = [task.name for task in layout.tasks], [box.name for box in layout.mailboxes]
-        return Injection(
+        entry = Injection(
             kind.number,
             tasks.index(target.board) if target.board in tasks else -1,
             -1 if target.mailbox is None else boxes.index(target.mailbox),
-            parameters=tuple(shape.parameters.get(p.name, p.default or 0.0) for p in kind.parameters),
+            parameters=tuple(parameters.get(p.name, p.default or 0.0) for p in kind.parameters),
         )
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Length of a fault in ticks, 0 for a kind that strikes once, and its parameters by name."""
-
-    ticks: int
-    parameters: Mapping[str, float]
-
-    @classmethod
-    def of(cls, target: Target, drawing: Drawing) -> Shape:
-        """Draw length and parameters as the kind's record says."""
-        kind = target.record
-        ticks = kind.lasts(drawing) if kind.lasts is not None else 0
-        return cls(ticks, {p.name: p.drawn(drawing) for p in kind.parameters if p.drawn is not None})
-
-    def with_size(self, size: float, drawing: Drawing) -> Shape:
-        """Return the shape with that size, of a single joint: a point of a curve."""
-        joint = {"joint": drawing.rng.randrange(drawing.joints)} if "joint" in self.parameters else {}
-        return Shape(self.ticks, {**self.parameters, **joint, "size": size})
+        lasts = kind.bound_ticks(entry, layout) or 0
+        if not kind.is_over_when_found:
+            lasts = max(lasts, ticks, 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS)
+        return lasts + kind.recovery_ticks(target.board, layout, self.restart_s) + round(SETTLE_S * self.second)
 
 
 @dataclass(frozen=True)
 class Card:
-    """One fault that waits for its place in a trial."""
+    """One fault that waits for its place in a trial. `ticks`: its length, 0 for a kind that strikes once."""
 
     target: Target
-    shape: Shape
+    ticks: int
+    parameters: Mapping[str, float]
     window: int
     seed: int
     phase: float
 
+    @classmethod
+    def draw(cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None) -> Card:
+        """Draw a fault as the kind's record says; with a `size`, of a single joint, as a point of a curve."""
+        target = rng.choice(rack.targets.by_kind[kind])
+        record, joints = target.record, rack.targets.joints
+        drawing = Drawing(rng, target.cycle, target.reader, rack.second, joints)
+        ticks = record.lasts(drawing) if record.lasts is not None else 0
+        parameters = {p.name: p.drawn(drawing) for p in record.parameters if p.drawn is not None}
+        if size is not None:
+            parameters |= {"joint": rng.randrange(joints)} if "joint" in parameters else {}
+            parameters["size"] = size
+        window = rack.window(target, ticks, parameters)
+        return cls(target, ticks, parameters, window, rng.randrange(SEEDS), _phase(rng))
+
     @property
     def quiet(self) -> int:
         """Ticks from the last message that a fault has touched to the next fault."""
-        is_held = self.target.record.where == "writer"
-        held = self.shape.parameters.get("by", 0) * self.target.cycle if is_held else 0
-        return self.window - self.shape.ticks - round(held)
+        held = self.parameters.get("by", 0) * self.target.cycle if self.target.record.where == "writer" else 0
+        return self.window - self.ticks - round(held)
+
+    def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> dict[str, Any]:
+        """Return the fault as a `[[fault]]` table that begins at `tick`."""
+        target, kind = self.target, self.target.record
+        table: dict[str, Any] = {"kind": kind.name, "board": target.board}
+        if kind.where != "start":
+            table["tick"] = tick
+        if self.ticks and not kind.once:
+            table["for"] = round(self.ticks / rack.second, 6)
+        if self.phase and kind.within_tick and not lockstep:
+            table["phase"] = self.phase
+        if target.mailbox is not None:
+            table["mailbox"] = target.mailbox
+        return {**table, "seed": self.seed, **self.parameters}
 
 
 def fault_plans(rack: RackUnderTest, counts: Mapping[str, int], seed: str, lockstep: bool, first: int) -> list[Plan]:
@@ -117,7 +120,7 @@ def fault_plans(rack: RackUnderTest, counts: Mapping[str, int], seed: str, locks
     rng = Random(f"{seed} {'lockstep' if lockstep else 'realtime'}")
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
     rng.shuffle(kinds)
-    return _packed(rack, first, lockstep, "faults", [_card(rack, kind, rng) for kind in kinds], rng)
+    return _packed(rack, first, lockstep, "faults", [Card.draw(rack, kind, rng) for kind in kinds], rng)
 
 
 def kill_plans(rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int) -> Iterator[Plan]:
@@ -142,7 +145,7 @@ def size_plans(rack: RackUnderTest, kinds: Sequence[str], count: int, seed: int,
     rng = Random(f"{seed} sizes")
     sizes = [(kind, size) for kind in kinds for size in swept_sizes(kind, count)]
     rng.shuffle(sizes)
-    cards = [_card(rack, kind, rng, size) for kind, size in sizes]
+    cards = [Card.draw(rack, kind, rng, size) for kind, size in sizes]
     return _packed(rack, first, True, "sizes", cards, rng)
 
 
@@ -152,15 +155,6 @@ def swept_sizes(kind: str, count: int) -> list[float]:
     if record.visible_from is None or record.size is None:
         return []
     return swept(record.size.least, record.visible_from, count)
-
-
-def _card(rack: RackUnderTest, kind: str, rng: Random, size: float | None = None) -> Card:
-    target = rng.choice(rack.targets.by_kind[kind])
-    drawing = Drawing(rng, target.cycle, target.reader, rack.second, rack.targets.joints)
-    shape = Shape.of(target, drawing)
-    if size is not None:
-        shape = shape.with_size(size, drawing)
-    return Card(target, shape, rack.window(target, shape), rng.randrange(SEEDS), _phase(rng))
 
 
 def _packed(
@@ -175,7 +169,7 @@ def _packed(
             if card.target.kind == EXTERNAL:
                 kills.append(Kill(card.target.board, start, card.phase))
             else:
-                faults.append(_table(rack, card, start, 0.0 if lockstep else card.phase))
+                faults.append(card.table(rack, start, lockstep))
         plans.append(Plan(first + len(plans), purpose, lockstep, tuple(faults), tuple(kills)))
     return plans
 
@@ -189,9 +183,8 @@ def _chosen(rack: RackUnderTest, waiting: list[Card]) -> list[Card]:
     for card in waiting[:AHEAD]:
         target, is_first = card.target, not chosen
         is_reported = target.mailbox is None or target.mailbox not in busy
-        if is_first or (
-            card.window <= free and is_reported and len(chosen) < MOST_FAULTS and target.record.recoverable
-        ):
+        fits = card.window <= free and is_reported and target.record.recoverable and len(chosen) < MOST_FAULTS
+        if is_first or fits:
             chosen.append(card)
             waiting.remove(card)
             free -= card.window
@@ -210,20 +203,6 @@ def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[in
         starts.append(at + gap)
         at += gap + window
     return starts
-
-
-def _table(rack: RackUnderTest, card: Card, tick: int, phase: float) -> dict[str, Any]:
-    target, shape, kind = card.target, card.shape, card.target.record
-    table: dict[str, Any] = {"kind": kind.name, "board": target.board}
-    if kind.where != "start":
-        table["tick"] = tick
-    if shape.ticks and not kind.once:
-        table["for"] = round(shape.ticks / rack.second, 6)
-    if phase and kind.within_tick:
-        table["phase"] = phase
-    if target.mailbox is not None:
-        table["mailbox"] = target.mailbox
-    return {**table, "seed": card.seed, **shape.parameters}
 
 
 def _phase(rng: Random) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from rack.backplane.address_map import CLOCK
@@ -16,7 +16,7 @@ from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind
 from rack.levels.level import Executor
 from rack.tools.answer import Failure
-from rack.tools.faults.ending import EXTERNAL
+from rack.tools.faults.ending import EXTERNAL, record_of
 
 Purpose = Literal["faults", "kills", "sizes", "nominal", "faultless"]
 
@@ -49,21 +49,12 @@ class Plan:
             update={"name": rack, "clock": config.clock.model_copy(update=clock), "fault": config.fault + faults}
         )
 
-    def document(self) -> dict[str, Any]:
-        """Return the plan as plain data."""
-        return asdict(self)
-
     def toml(self, config: str) -> str:
         """Return the faults as a file for `--faults`; kills from outside, which no file can hold, as comments."""
         mode = " --lockstep" if self.lockstep else ""
         lines = [f"# Trial {self.number}: rack run {config}{mode} --faults THIS_FILE"]
         lines += [f"# {EXTERNAL}: {kill.board} at tick {kill.tick} + {kill.phase:g}" for kill in self.kills]
         return "\n".join([*lines, "", to_toml({"fault": [dict(table) for table in self.faults]})])
-
-
-def record_of(kind: str) -> Kind:
-    """Return the record of a kind of a campaign: a kill from outside is like any other."""
-    return KINDS["kill" if kind == EXTERNAL else kind]
 
 
 def needs_real_time(kind: str) -> bool:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Report = dict[str, Any]
 SIZE_IN = (13.0, 8.0)
 DOT, MIDDLE, BOUND = "#4477aa", "#222222", "#cc3311"
-"""Colours that people with any sight tell apart (Paul Tol's)."""
+"""Colours that people with any kind of colour vision can distinguish (Paul Tol's)."""
 WIDEST = 1.5
 """Part of a bound up to which delays are drawn; later ones are arrows at the edge."""
 

@@ -137,7 +137,7 @@ def markdown(report: Report) -> str:
 
 def _lines(report: Report) -> Iterator[str]:
     summary = report["summary"]
-    verdict = "falls short" if report["shortfalls"] else "as it must be"
+    verdict = "fell short" if report["shortfalls"] else "passed"
     yield f"# Campaign on {report['config']}, seed {report['seed']}: {verdict}"
     yield ""
     yield (
@@ -226,17 +226,19 @@ def _faultless(parts: list[Report]) -> Iterator[str]:
 
 def _sizes(sizes: Report) -> Iterator[str]:
     for kind, found in sizes.items():
+        size = KINDS[kind].size
+        unit = size.unit if size is not None else ""
         yield from (
             "",
             f"## {kind}: size against delay",
             "",
-            f"Must be found from {found['judged_from']:g} rad.",
+            f"Must be found from {found['judged_from']:g} {unit}.",
             "",
         )
         rows = [
             [f"{point['size']:.4g}", point["joint"] or "all", _or_dash(point["delay_ms"])] for point in found["curve"]
         ]
-        yield from table(["size, rad", "joint", "found after, ms"], rows)
+        yield from table([f"size, {unit}", "joint", "found after, ms"], rows)
 
 
 def _listed(lines: list[str]) -> Iterator[str]:

@@ -8,8 +8,7 @@ from statistics import median
 from typing import Any
 
 from rack.boards.faults.kind import KINDS
-from rack.tools.campaigns.plan import record_of
-from rack.tools.faults.ending import EXTERNAL
+from rack.tools.faults.ending import EXTERNAL, record_of
 from rack.tools.faults.judge import Judgement
 
 Figures = dict[str, Any]

@@ -23,6 +23,11 @@ AT_REST = 0.02
 """Joint velocity below which an arm is at rest, rad/s."""
 
 
+def record_of(kind: str) -> Kind:
+    """Return the record of a kind in reports; a kill from outside is like any other."""
+    return KINDS["kill" if kind == EXTERNAL else kind]
+
+
 @dataclass(frozen=True)
 class Killed:
     """A kill from outside, at `tick` and at CLOCK_MONOTONIC `time_ns`."""
@@ -56,8 +61,8 @@ class Strike:
 
     @property
     def record(self) -> Kind:
-        """The kind's record; a kill from outside is like any other."""
-        return KINDS["kill" if self.kind == EXTERNAL else self.kind]
+        """The kind's record."""
+        return record_of(self.kind)
 
 
 @dataclass(frozen=True)

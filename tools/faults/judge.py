@@ -128,7 +128,7 @@ class _Judge:
             horizon = self._horizon(place, windows[place][1])
             judgement = self._judgement(strike, best, horizon)
             if not judgement.is_recovered and self._last < strike.tick + (judgement.recovery_bound or 0):
-                # The run ended too early to tell: to be drawn again.
+                # The run ended too early to decide: a campaign draws it again.
                 judgement = self._judgement(replace(strike, tick=-1), None, horizon)
             judged.append(judgement)
         stray = [event for event in self._events if self._is_stray(event, windows)]

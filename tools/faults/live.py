@@ -49,8 +49,11 @@ class LiveRack:
         if self._is_over:
             raise Failure(f"rack '{self._segment.rack}': its run is over")
         fault = self._fault({key: value for key, value in given.items() if value is not None})
-        entry = self._table.add(injection(fault, self._config, self._segment.layout))
-        if _acts_here(fault.kind):
+        checked = injection(fault, self._config, self._segment.layout)
+        self._check(fault)
+        entry = self._table.add(checked)
+        if KINDS[fault.kind].where == "core":
+            # This very process takes the core.
             if entry.stage == Stage.WAITING:
                 print(self._state(entry), file=sys.stderr, flush=True)
             act_on_core(self._segment, entry)
@@ -97,23 +100,30 @@ class LiveRack:
         yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"], rows, width)
 
     def _fault(self, given: dict[str, Any]) -> FaultConfig:
-        """Return the fault, checked for a rack that runs. Raises `ConfigError`, `Failure`."""
-        words = self._segment.words
+        """Return a fault as in a config. Raises `ConfigError`."""
         # Two faults of one run must not draw the same random numbers.
-        given.setdefault("seed", (self._config.seed + words[System.INJECTED]) % SEEDS)
+        given.setdefault("seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS)
         try:
             # A command line holds text: numbers are read from it, as they are not from a config.
-            fault = FaultConfig.model_validate(given, strict=False)
+            return FaultConfig.model_validate(given, strict=False)
         except ValidationError as error:
             raise ConfigError(mistakes_of(error, FaultConfig, given)) from None
-        if fault.kind in KINDS and KINDS[fault.kind].where == "start":
+
+    def _check(self, fault: FaultConfig) -> None:
+        """Refuse a fault that a running rack, or this process, cannot have. Raises `ConfigError`, `Failure`."""
+        tick, where = self._segment.words[System.TICK], KINDS[fault.kind].where
+        if where == "start":
             why = "a running rack has passed its self-tests; give it in the config or with 'rack run --faults'"
             raise ConfigError([Mistake("kind", fault.kind, why)])
-        if fault.tick is not None and fault.tick <= words[System.TICK]:
-            raise ConfigError([Mistake("tick", fault.tick, f"has passed; the rack is at tick {words[System.TICK]}")])
-        if _acts_here(fault.kind):
-            _check_here(fault)
-        return fault
+        if fault.tick is not None and fault.tick <= tick:
+            raise ConfigError([Mistake("tick", fault.tick, f"has passed; the rack is at tick {tick}")])
+        if where != "core":
+            return
+        if fault.lasts is None and fault.cycles is None:
+            raise ConfigError([Mistake("for", None, f"missing; a {fault.kind} must have an end: --for or --cycles")])
+        if not set_priority(1):
+            raise Failure(f"{fault.kind}: SCHED_FIFO is refused to this user; no core can be taken from a board")
+        set_priority(0)
 
     def _await_begin(self, entry: FaultEntry) -> None:
         deadline = time.monotonic() + BEGIN_S
@@ -166,20 +176,6 @@ class LiveRack:
     @property
     def _is_over(self) -> bool:
         return self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
-
-
-def _acts_here(kind: str) -> bool:
-    """Say whether this very process acts the fault: it takes the core."""
-    return kind in KINDS and KINDS[kind].where == "core"
-
-
-def _check_here(fault: FaultConfig) -> None:
-    """Refuse a fault of this process that would not end, or could take no core. Raises `ConfigError`, `Failure`."""
-    if fault.lasts is None and fault.cycles is None:
-        raise ConfigError([Mistake("for", None, f"missing; a {fault.kind} must have an end: --for or --cycles")])
-    if not set_priority(1):
-        raise Failure(f"{fault.kind}: SCHED_FIFO is refused to this user; without it no core can be taken from a board")
-    set_priority(0)
 
 
 def _numbers(fault: Mapping[str, Any]) -> list[int | None]:
