@@ -9,14 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from rack.levels.arm.arm import Sensed
-    from rack.levels.level import Fault
+from rack.levels.level import Fault
 
 Array = NDArray[np.float64]
 Key = tuple[str, int, int, int]
@@ -24,6 +22,27 @@ Key = tuple[str, int, int, int]
 APART = np.array([[1e-2], [1e-2]])
 """Distance from the truth, rad and rad/s, from which a stuck sensor counts as wrong: while a joint only creeps, that
 need not be noticed before the joint has moved so far."""
+
+
+class Sample(Protocol):
+    """A sample of an arm's sensors: the fields of a `rack.levels.arm.Sensed` that faults spoil."""
+
+    @property
+    def position(self) -> Array:
+        """Joint positions (joints,), rad."""
+
+    @property
+    def velocity(self) -> Array:
+        """Joint velocities (joints,), rad/s."""
+
+    @property
+    def tick(self) -> int:
+        """Tick of the sample."""
+
+    def _replace(self, *args: Any, **changes: Any) -> Self: ...
+
+
+S = TypeVar("S", bound=Sample)
 
 
 @dataclass(frozen=True)
@@ -37,7 +56,7 @@ class ActiveFault:
     fault: Fault
     joints: NDArray[np.bool_]
     every: int
-    kept: dict[Key, Sensed]
+    kept: dict[Key, Any]
 
     @cached_property
     def key(self) -> Key:
@@ -52,19 +71,20 @@ class ActiveFault:
         """Return the random numbers of one tick: a restarted board draws the same."""
         return np.random.default_rng((self.fault.seed, tick))
 
-    def first(self, sample: Sensed) -> Sensed:
+    def first(self, sample: S) -> S:
         """Return the sample with which the fault began."""
         if self.key not in self.kept:
             copy = sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
             self.kept[self.key] = copy
-        return self.kept[self.key]
+        first: S = self.kept[self.key]
+        return first
 
 
 @dataclass(frozen=True)
 class SensorStep:
     """Spoils a sample. `act` returns the spoilt sample, and whether it differs from the truth."""
 
-    act: Callable[[Sensed, ActiveFault], tuple[Sensed, bool]]
+    act: Callable[[Any, ActiveFault], tuple[Any, bool]]
 
 
 @dataclass(frozen=True)
@@ -81,33 +101,33 @@ class CommandStep:
     act: Callable[[Array, Array, ActiveFault], Array]
 
 
-def _with_position(sample: Sensed, position: Array, fault: ActiveFault) -> tuple[Sensed, bool]:
+def _with_position(sample: S, position: Array, fault: ActiveFault) -> tuple[S, bool]:
     return sample._replace(position=position), bool(fault.joints.any())
 
 
-def position_nan(sample: Sensed, fault: ActiveFault) -> tuple[Sensed, bool]:
+def position_nan(sample: S, fault: ActiveFault) -> tuple[S, bool]:
     """Make positions NaN."""
     return _with_position(sample, np.where(fault.joints, np.nan, sample.position), fault)
 
 
-def position_biased(sample: Sensed, fault: ActiveFault) -> tuple[Sensed, bool]:
+def position_biased(sample: S, fault: ActiveFault) -> tuple[S, bool]:
     """Add `size`, rad, to positions."""
     return _with_position(sample, sample.position + fault["size"] * fault.joints, fault)
 
 
-def position_noisy(sample: Sensed, fault: ActiveFault) -> tuple[Sensed, bool]:
+def position_noisy(sample: S, fault: ActiveFault) -> tuple[S, bool]:
     """Add noise of standard deviation `size`, rad, to positions."""
     noise = fault["size"] * fault.draw(sample.tick).standard_normal(len(fault.joints))
     return _with_position(sample, sample.position + noise * fault.joints, fault)
 
 
-def sample_missing(sample: Sensed, fault: ActiveFault) -> tuple[Sensed, bool]:
+def sample_missing(sample: S, fault: ActiveFault) -> tuple[S, bool]:
     """Repeat the sample of the cycle before the fault."""
     first = fault.first(sample)
     return first._replace(tick=first.tick - fault.every), True
 
 
-def sample_stuck(sample: Sensed, fault: ActiveFault) -> tuple[Sensed, bool]:
+def sample_stuck(sample: S, fault: ActiveFault) -> tuple[S, bool]:
     """Keep positions and velocities as they were when the fault began."""
     first, truth = fault.first(sample), (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)

@@ -118,8 +118,8 @@ def test_a_rack_that_does_not_launch_without_a_reason_falls_short() -> None:
 
 def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
     calm = [
-        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())).finding(),
-        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())).finding(),
+        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())).result(),
+        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())).result(),
     ]
     document = Faultless("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm)).document()
     # One in half an hour: below 4.74 in that time, with 95 %.
@@ -130,9 +130,9 @@ def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
 
 
 def test_what_any_run_breaks_counts_whatever_the_run_is_for() -> None:
-    nominal = Judged.of(trial(strikes=())).finding()
-    swept = Judged.of(replace(trial(SEEN), arm=ArmEnd(violations=2))).finding()
-    results = Results(nominal, trials=[Judged.of(trial(SEEN)).finding()], sizes=[swept])
+    nominal = Judged.of(trial(strikes=())).result()
+    swept = Judged.of(replace(trial(SEEN), arm=ArmEnd(violations=2))).result()
+    results = Results(nominal, trials=[Judged.of(trial(SEEN)).result()], sizes=[swept])
     assert sum(run.violations for run in results.runs) == 2
     assert len(results.faults) == 1
 
@@ -141,5 +141,5 @@ def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_pa
     judged, path = Judged.of(trial(SEEN, found(9000, "gap", "upper", "lower.status"))), tmp_path / "trials" / "1.json"
     assert kept(path) is None
     keep(judged, path)
-    assert kept(path) == judged.finding()
+    assert kept(path) == judged.result()
     assert [file.name for file in path.parent.iterdir()] == ["1.json"]

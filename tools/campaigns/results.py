@@ -87,7 +87,7 @@ class Judged:
             return trial.refused or f"it does not end; {trial.levels}"
         return "; ".join(filter(None, [outcome.cause, *outcome.faults, trial.levels]))
 
-    def finding(self) -> TrialResult:
+    def result(self) -> TrialResult:
         """Return the part of the trial that is kept."""
         trial, outcome = self.trial, self.trial.outcome
         return TrialResult(
@@ -111,7 +111,7 @@ class Judged:
         """Return the trial as plain data, with all that happened in it."""
         trial, outcome = self.trial, self.trial.outcome
         return {
-            "finding": asdict(self.finding()),
+            "finding": asdict(self.result()),
             "outcome": asdict(outcome) if outcome else None,
             "refused": trial.refused,
             "levels": trial.levels,
