@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 
 OWN_NAME = f"readme-{os.getpid()}"
@@ -27,13 +25,6 @@ COMMANDS = [
     for line in block.splitlines()
     if line.startswith("rack ") and not ELSEWHERE.search(line)
 ]
-
-
-@pytest.fixture
-def example(tmp_path: Path) -> Path:
-    for name, text in BLOCK.findall(README.read_text()):
-        (tmp_path / name).write_text(text)
-    return tmp_path
 
 
 def rack(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -57,14 +48,17 @@ def test_readme_shows_the_commands() -> None:
     assert {"run", "check", "list", "clean", "bench", "gantt"} <= {words[0] for words, _ in COMMANDS}
 
 
-def test_the_example_level_runs_as_the_readme_has_it(example: Path) -> None:
-    ended = rack(example, "run", "metered.toml", "--lockstep", "--seconds", "8", "--json")
-    assert ended.returncode == 0, ended.stderr
-    answer = json.loads(ended.stdout)
-    path = Path(example, answer["folder"], "signals.parquet")
-    signals = pq.read_table(path, filters=[("mailbox", "=", "power.status")])
-    assert signals.num_rows == 400
-    assert max(signals["power.status.energy"].to_pylist()) > 0.0
+def test_the_example_level_is_the_one_in_configs() -> None:
+    shown = dict(BLOCK.findall(README.read_text()))
+    assert shown
+    assert shown == {name: (README.parent / "configs" / "examples" / "own-level" / name).read_text() for name in shown}
+
+
+def test_every_file_that_the_pages_link_to_exists() -> None:
+    pages = [*README.parent.glob("*.md"), *(README.parent / "configs").rglob("*.md")]
+    links = [(page, link) for page in pages for link in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())]
+    assert links
+    assert not [f"{page.name}: {link}" for page, link in links if not (page.parent / link).exists()]
 
 
 def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:

@@ -1,0 +1,71 @@
+"""A servo level of one's own: PD control with gravity compensation, in place of computed torque."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from rack.backplane.message import State
+from rack.levels.arm import SimulatedArm
+from rack.levels.cell import build_cell
+from rack.levels.dynamics import Dynamics, Payload
+from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.levels.params import read_params
+from rack.levels.robot import Positive, Table
+from rack.levels.servo.grip import Grip
+
+
+class Gains(Table):
+    """What `[board.servo.params]` may hold."""
+
+    stiffness: Positive = Field(1600.0, description="acceleration for an error of one rad, 1/s2")
+    damping: Positive = Field(80.0, description="acceleration against an error of one rad/s, 1/s")
+
+
+class PdServo(Executor):
+    """Drives every joint towards its newest set point; gains are scaled by the inertia of each joint."""
+
+    inputs = {
+        "command": Input(JOINT_SET_POINT, "above.command"),
+        "plan": Input(SERVO_PLAN, "own.plan"),
+        "before": Input(ARM_STATE, "own.state"),
+    }
+    outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
+    params = Gains
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self.gains = read_params(Gains, context.params)
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self.arm = SimulatedArm(cell, context.scene, context.clock_ns, context.every, context.seed)
+        self.grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
+        self.dynamics = Dynamics(cell)
+        self.rest = np.zeros(len(cell.home))  # (joints,), rad/s
+        self.target, self.target_velocity = cell.home, self.rest  # (joints,), rad and rad/s
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Let the arm's time pass to `tick`, sense, drive, report."""
+        if self.arm.tick == 0 and read.before.is_there:
+            self.arm.restore(read.before.value)  # the board was restarted
+        self.arm.step(tick - self.arm.tick)
+        sensed, command = self.arm.sense(), read.command.value
+        holding = not command.due or tick > command.due + 4 * self.context.every
+        if not holding:
+            ahead_s = (tick - command.due) * self.context.tick_s
+            self.target, self.target_velocity = command.position + ahead_s * command.velocity, command.velocity
+        error, slip = self.target - sensed.position, self.target_velocity - sensed.velocity
+        load = Payload(read.plan.value.payload_mass, read.plan.value.payload_offset)
+        inertia, gravity = self.dynamics.terms(sensed.position, self.rest, load)
+        torque = inertia.diagonal() * (self.gains.stiffness * error + self.gains.damping * slip) + gravity
+        force = 0.0 if self.grip is None else self.grip.force(command, sensed.opening, sensed.opening_velocity)
+        self.arm.drive(torque, force)
+        status = write.status
+        status.echo, status.operator = command.id, command.operator
+        status.state = State.IDLE if holding else State.EXECUTING
+        status.holding = holding  # the level above begins to move when it has seen the arm hold
+        status.position, status.velocity, status.torque = sensed.position, sensed.velocity, self.arm.torque
+        status.target, status.target_velocity = self.target, self.rest if holding else self.target_velocity
+        status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
+        self.arm.save(write.state)
+        self.arm.look(write.scene)

@@ -1,0 +1,43 @@
+"""The examples in configs/examples run as their READMEs say, from a folder anywhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.processes import RACK
+
+EXAMPLES = Path(__file__).parent.parent / "configs" / "examples"
+FOLDERS = sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
+SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
+RACK_NAME = re.compile(r"""^(\W*name ?= ?["'])([\w-]+)""", re.MULTILINE)
+PROGRAMS = {"rack": RACK, "python": (sys.executable,)}
+
+
+def commands(folder: Path) -> list[list[str]]:
+    """Return the commands of an example's README as words."""
+    lines = "".join(SHELL.findall((folder / "README.md").read_text())).splitlines()
+    return [line.partition("#")[0].split() for line in lines]
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_example_runs_as_its_readme_says(name: str, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(EXAMPLES / name, tmp_path / name))
+    for path in (*folder.glob("*.toml"), *folder.glob("*.py")):
+        path.write_text(RACK_NAME.sub(rf"\1\2-{os.getpid()}", path.read_text(), count=1))
+    found = commands(folder)
+    assert found
+    for program, *words in found:
+        command = [*PROGRAMS[program], *words]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=100, check=False)
+        assert done.returncode == 0, f"{program} {' '.join(words)}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
+
+
+def test_the_list_of_examples_is_complete() -> None:
+    assert sorted(set(re.findall(r"\]\(([\w-]+)\)", (EXAMPLES / "README.md").read_text()))) == FOLDERS

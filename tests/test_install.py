@@ -1,0 +1,98 @@
+"""Installed, the project is one import name, `rack`, and a user's folders keep their own names."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCE = ("backplane", "boards", "configs", "levels", "tools", "pyproject.toml", "README.md", "LICENSE")
+LEVEL = """
+from rack.backplane.message import Field, State, status
+from rack.levels.level import Executor
+from tools.numbers import THREE
+
+COUNT = status("count", 1, Field("count", "u4", "1", "cycles so far"))
+
+
+class Counter(Executor):
+    outputs = {"status": COUNT}
+
+    def process(self, read, write, tick):
+        write.status.state = State.EXECUTING
+        write.status.count += THREE
+"""
+CONFIG = """
+name = "NAME"
+python_path = ["."]
+
+[clock]
+period_ms = 2.5
+
+[board.counter]
+slot = 2
+rate_hz = 100
+executor = "levels.counter:Counter"
+"""
+
+
+def run(folder: Path, *command: str | Path) -> str:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the programs of an environment that has the project's wheel, and the libraries of this one."""
+    folder = tmp_path_factory.mktemp("install")
+    (folder / "source").mkdir()
+    for name in SOURCE:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, folder / "source" / name)
+    pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
+    offline = ("--no-deps", "--no-index")
+    run(folder, *pip, "wheel", *offline, "--no-build-isolation", "--wheel-dir", folder, folder / "source")
+    venv.create(folder / "clean")
+    programs = folder / "clean" / "bin"
+    purelib = run(folder, programs / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))")
+    # Only the libraries of this environment are seen there: an editable install is found by a hook, which is not.
+    Path(purelib.strip(), "libraries.pth").write_text(sysconfig.get_path("purelib"))
+    run(folder, *pip, "--python", programs / "python", "install", *offline, next(folder.glob("*.whl")))
+    return programs
+
+
+def test_the_wheel_runs_the_nasrem_rack_from_another_folder(installed: Path, tmp_path: Path) -> None:
+    place = run(tmp_path, installed / "python", "-c", "import rack.boards.config.files as f; print(f.__file__)")
+    assert place.startswith(str(installed.parent))
+    name = f"installed-{os.getpid()}"
+    words = ("run", "nasrem", "--set", f"name={name}", "--lockstep", "--seconds", "1", "--json")
+    report = json.loads(run(tmp_path, installed / "rack", *words))
+    assert (report["worked"], report["simulated_s"]) == (True, 1.0)
+
+
+def test_folders_of_a_user_may_be_called_tools_and_levels(installed: Path, tmp_path: Path) -> None:
+    for package, file, text in (("tools", "numbers.py", "THREE = 3\n"), ("levels", "counter.py", LEVEL)):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
+        (tmp_path / package / file).write_text(text)
+    (tmp_path / "own.toml").write_text(CONFIG.replace("NAME", f"own-{os.getpid()}"))
+    words = ("run", "own.toml", "--lockstep", "--seconds", "0.5", "--json")
+    assert json.loads(run(tmp_path, installed / "rack", *words))["worked"]
+
+
+def test_nothing_but_rack_is_installed(installed: Path) -> None:
+    with ZipFile(next(installed.parents[1].glob("*.whl"))) as wheel:
+        tops = {name.partition("/")[0] for name in wheel.namelist()}
+    assert {name for name in tops if not name.endswith(".dist-info")} == {"rack"}
