@@ -13,7 +13,7 @@ from rack.tools.campaigns.plan import Plan
 from rack.tools.campaigns.results import Faultless, Judged, Results, keep, kept, misses_of
 from rack.tools.campaigns.trial import Trial
 from rack.tools.faults.ending import ArmEnd, Strike
-from tests.tools.campaign_events import LAYOUT, event, found, strike
+from tests.tools.fault_events import LAYOUT, event, found, strike
 
 FAULT = strike("mute", "lower", 100, 150)
 SEEN = found(105, "mute", "upper", "lower.status")

@@ -8,7 +8,7 @@ from typing import Any
 from rack.tools.campaigns.statistics import by_kind, curve, part_of_bound, rate, spread, totals, wilson
 from rack.tools.faults.ending import EXTERNAL
 from rack.tools.faults.judge import Judgement
-from tests.tools.campaign_events import TICK_NS
+from tests.tools.fault_events import TICK_NS
 
 FOUND = Judgement(
     kind="mute",

@@ -1,4 +1,4 @@
-"""Hand-made faults and events, for tests of what a campaign makes of them."""
+"""Hand-made faults and events, for tests of their judgement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The judge of a campaign, on hand-made faults and events."""
+"""The judge of faults, on hand-made faults and events."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from rack.boards.events import Event
 from rack.tools.faults.ending import EXTERNAL, Strike
 from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, judge
-from tests.tools.campaign_events import LAYOUT, TICK_NS, event, found, strike
+from tests.tools.fault_events import LAYOUT, TICK_NS, event, found, strike
 
 END = event(10_000, "end", "")
 
