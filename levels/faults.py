@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,31 +18,12 @@ from rack.levels.level import Fault
 
 Array = NDArray[np.float64]
 Key = tuple[str, int, int, int]
+Sample = Any
+"""A `rack.levels.arm.Sensed`; the arm's room, which loads MuJoCo, is not imported here."""
 
 APART = np.array([[1e-2], [1e-2]])
 """Distance from the truth, rad and rad/s, from which a stuck sensor counts as wrong: while a joint only creeps, that
 need not be noticed before the joint has moved so far."""
-
-
-class Sample(Protocol):
-    """A sample of an arm's sensors: the fields of a `rack.levels.arm.Sensed` that faults spoil."""
-
-    @property
-    def position(self) -> Array:
-        """Joint positions (joints,), rad."""
-
-    @property
-    def velocity(self) -> Array:
-        """Joint velocities (joints,), rad/s."""
-
-    @property
-    def tick(self) -> int:
-        """Tick of the sample."""
-
-    def _replace(self, *args: Any, **changes: Any) -> Self: ...
-
-
-S = TypeVar("S", bound=Sample)
 
 
 @dataclass(frozen=True)
@@ -56,7 +37,7 @@ class ActiveFault:
     fault: Fault
     joints: NDArray[np.bool_]
     every: int
-    kept: dict[Key, Any]
+    kept: dict[Key, Sample]
 
     @cached_property
     def key(self) -> Key:
@@ -71,20 +52,19 @@ class ActiveFault:
         """Return the random numbers of one tick: a restarted board draws the same."""
         return np.random.default_rng((self.fault.seed, tick))
 
-    def first(self, sample: S) -> S:
+    def first(self, sample: Sample) -> Sample:
         """Return the sample with which the fault began."""
         if self.key not in self.kept:
             copy = sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
             self.kept[self.key] = copy
-        first: S = self.kept[self.key]
-        return first
+        return self.kept[self.key]
 
 
 @dataclass(frozen=True)
 class SensorStep:
     """Spoils a sample. `act` returns the spoilt sample, and whether it differs from the truth."""
 
-    act: Callable[[Any, ActiveFault], tuple[Any, bool]]
+    act: Callable[[Sample, ActiveFault], tuple[Sample, bool]]
 
 
 @dataclass(frozen=True)
@@ -101,33 +81,33 @@ class CommandStep:
     act: Callable[[Array, Array, ActiveFault], Array]
 
 
-def _with_position(sample: S, position: Array, fault: ActiveFault) -> tuple[S, bool]:
+def _with_position(sample: Sample, position: Array, fault: ActiveFault) -> tuple[Sample, bool]:
     return sample._replace(position=position), bool(fault.joints.any())
 
 
-def position_nan(sample: S, fault: ActiveFault) -> tuple[S, bool]:
+def position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Make positions NaN."""
     return _with_position(sample, np.where(fault.joints, np.nan, sample.position), fault)
 
 
-def position_biased(sample: S, fault: ActiveFault) -> tuple[S, bool]:
+def position_biased(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Add `size`, rad, to positions."""
     return _with_position(sample, sample.position + fault["size"] * fault.joints, fault)
 
 
-def position_noisy(sample: S, fault: ActiveFault) -> tuple[S, bool]:
+def position_noisy(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Add noise of standard deviation `size`, rad, to positions."""
     noise = fault["size"] * fault.draw(sample.tick).standard_normal(len(fault.joints))
     return _with_position(sample, sample.position + noise * fault.joints, fault)
 
 
-def sample_missing(sample: S, fault: ActiveFault) -> tuple[S, bool]:
+def sample_missing(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Repeat the sample of the cycle before the fault."""
     first = fault.first(sample)
     return first._replace(tick=first.tick - fault.every), True
 
 
-def sample_stuck(sample: S, fault: ActiveFault) -> tuple[S, bool]:
+def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Keep positions and velocities as they were when the fault began."""
     first, truth = fault.first(sample), (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)

@@ -13,7 +13,7 @@ import typer
 from rack.tools.answer import ConfigName, Failure, Json, Settings, print_json
 
 if TYPE_CHECKING:
-    from rack.tools.campaigns.campaign import Campaign, Order
+    from rack.tools.campaigns.campaign import Campaign
     from rack.tools.campaigns.results import Results
 
 INJECTIONS = 3
@@ -83,14 +83,34 @@ def campaign(
     recovered from within its bound; if a limit was violated, anything was left behind, or a task was neither done nor
     safely stopped; or if there was a detection without a fault.
     """
-    from rack.tools.campaigns.campaign import ORDER, Campaign
+    from rack.boards.config import load as load_config
+    from rack.tools.campaigns.campaign import ORDER, Campaign, Order
     from rack.tools.campaigns.workers import INTERRUPT_S
     from rack.tools.folders import folder_of
     from rack.tools.interrupt import INTERRUPT
     from rack.tools.progress import progress_for
 
-    order = _order(
-        config, settings, injections, seed, kinds, kills, lockstep, realtime, faultless, load, sizes, seconds
+    if lockstep and realtime:
+        raise Failure("--lockstep and --realtime: they exclude each other; give one, or neither for both", 2)
+    if kills is not None and kinds is not None:
+        raise Failure(f"--kills {kills} and --kinds {kinds}: kills from outside are a kind of their own; give one", 2)
+    found = load_config(config, settings)
+    if seconds is None and not any(board.ends_run for board in found.board.values()):
+        raise Failure(f"{config}: no board ends the run: give --seconds, the simulated time of a run", 2)
+    # No faultless time in real time where only lockstep, or only kills, were ordered.
+    default_s = 0.0 if lockstep or kills is not None else FAULTLESS_S
+    order = Order(
+        name=config,
+        config=found,
+        injections=0 if kills else injections,
+        seed=seed,
+        modes=(True,) if lockstep else (False,) if realtime else (True, False),
+        kinds=kinds,
+        kills=kills or 0,
+        sizes=(0 if kills or realtime else SIZES) if sizes is None else sizes,
+        faultless_s=default_s if faultless is None else faultless,
+        loads=(True,) if load else (False, True),
+        seconds=seconds,
     )
     goes_on, started = out is not None and (out / ORDER).is_file(), time.monotonic()
     folder = out if out is not None and goes_on else folder_of(out, "campaign")
@@ -101,48 +121,6 @@ def campaign(
         report, text = _write(work, results, time.monotonic() - started)
     print_json(report) if as_json else print(f"{text}\n{folder}/")
     sys.exit(1 if report["shortfalls"] or report["interrupted"] else 0)
-
-
-def _order(
-    name: str,
-    settings: list[str],
-    injections: int,
-    seed: int,
-    kinds: str | None,
-    kills: int | None,
-    lockstep: bool,
-    realtime: bool,
-    faultless: float | None,
-    load: bool,
-    sizes: int | None,
-    seconds: float | None,
-) -> Order:
-    """Return the order. Raises `ConfigError`, and `Failure` for options that exclude each other."""
-    from rack.boards.config import load as load_config
-    from rack.tools.campaigns.campaign import Order
-
-    if lockstep and realtime:
-        raise Failure("--lockstep and --realtime: they exclude each other; give one, or neither for both", 2)
-    if kills is not None and kinds is not None:
-        raise Failure(f"--kills {kills} and --kinds {kinds}: kills from outside are a kind of their own; give one", 2)
-    found = load_config(name, settings)
-    if seconds is None and not any(board.ends_run for board in found.board.values()):
-        raise Failure(f"{name}: no board ends the run: give --seconds, the simulated time of a run", 2)
-    # No faultless time in real time where only lockstep, or only kills, were ordered.
-    alone = lockstep or kills is not None
-    return Order(
-        name=name,
-        config=found,
-        injections=0 if kills else injections,
-        seed=seed,
-        modes=(True,) if lockstep else (False,) if realtime else (True, False),
-        kinds=kinds,
-        kills=kills or 0,
-        sizes=(0 if kills or realtime else SIZES) if sizes is None else sizes,
-        faultless_s=(0.0 if alone else FAULTLESS_S) if faultless is None else faultless,
-        loads=(True,) if load else (False, True),
-        seconds=seconds,
-    )
 
 
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:

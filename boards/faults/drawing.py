@@ -1,6 +1,6 @@
 """Random faults: how long one lasts and how strong it is, drawn so that it can be seen.
 
-A kind's record says what to draw, by the functions here; a campaign draws. The same generator draws the same fault.
+A kind's record names what to draw, by the functions here; a campaign draws. The same generator draws the same fault.
 """
 
 from __future__ import annotations
@@ -52,37 +52,37 @@ def size_from(visible: float) -> Draw:
     return magnitude(visible, BEYOND * visible)
 
 
-def a_joint(d: Drawing) -> int:
+def joint(d: Drawing) -> int:
     """Draw a joint; -1, all of them, now and then."""
     return d.rng.randrange(d.joints) if d.rng.random() < 0.9 else -1
 
 
-def a_joint_or_all(d: Drawing) -> int:
+def joint_or_all(d: Drawing) -> int:
     """Draw a joint, or -1, all of them, as often as not."""
     return d.rng.choice((-1, d.rng.randrange(d.joints)))
 
 
-def for_seconds(least: float, most: float) -> DrawTicks:
+def seconds(least: float, most: float) -> DrawTicks:
     """Draw a length of simulated time, in ticks."""
     return lambda d: max(1, round(d.rng.uniform(least, most) * d.second))
 
 
-def for_cycles(least: int, most: int) -> DrawTicks:
+def cycles(least: int, most: int) -> DrawTicks:
     """Draw a length in cycles of the task, in ticks."""
     return lambda d: d.rng.randint(least, most) * d.cycle
 
 
-def for_messages(least: int, most: int) -> DrawTicks:
+def messages(least: int, most: int) -> DrawTicks:
     """Draw a length in which so many messages are written, and two reads of the fastest reader."""
     return lambda d: max(d.rng.randint(least, most) * d.cycle, 2 * d.reader)
 
 
-def for_longest(*lengths: DrawTicks) -> DrawTicks:
+def longest(*lengths: DrawTicks) -> DrawTicks:
     """Draw several lengths and take the longest."""
     return lambda d: max(draw(d) for draw in lengths)
 
 
-def for_silence(least: float, most: float) -> DrawTicks:
+def silence(least: float, most: float) -> DrawTicks:
     """Draw a multiple of the time in which the fastest reader must notice that a mailbox is silent."""
     return lambda d: round((2 * d.cycle + d.reader) * d.rng.uniform(least, most))
 

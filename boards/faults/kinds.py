@@ -3,37 +3,8 @@
 from __future__ import annotations
 
 from rack.backplane.alarms import Alarm
-from rack.boards.faults import clock_board, messages, tasks
-from rack.boards.faults.bounds import (
-    BY_SIZE,
-    DELIVERY,
-    LOCK_WAIT,
-    NOT_ARMED,
-    READ,
-    RELEASE,
-    SLICE,
-    by_rack_or,
-    clock_ticks,
-    cycles,
-    delayed,
-    missing_writes,
-    skipped,
-    writes,
-)
-from rack.boards.faults.drawing import (
-    Draw,
-    a_joint,
-    a_joint_or_all,
-    for_cycles,
-    for_longest,
-    for_messages,
-    for_seconds,
-    for_silence,
-    magnitude,
-    number,
-    size_from,
-    whole,
-)
+from rack.boards.faults import bounds, clock_board, messages, tasks
+from rack.boards.faults import drawing as draw
 from rack.boards.faults.kind import DIED, KINDS, Consequence, Kind, Parameter
 from rack.levels import faults as arm
 
@@ -55,16 +26,16 @@ BIAS_RAD, NOISE_RAD = 0.02, 0.005
 """Sizes from which a wrong sensor must be found."""
 
 
-def _joint(drawn: Draw = a_joint, default: float = 0) -> Parameter:
+def _joint(drawn: draw.Draw = draw.joint, default: float = 0) -> Parameter:
     return Parameter("joint", "1", "joint concerned, from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn)
 
 
 def _probability(default: float, most: float) -> Parameter:
-    return Parameter("probability", "1", "of each message to be hit", default, 0.001, 1.0, drawn=number(0.5, most))
+    return Parameter("probability", "1", "of each message to be hit", default, 0.001, 1.0, drawn=draw.number(0.5, most))
 
 
 def _size(meaning: str, visible: float, least: float, most: float) -> Parameter:
-    return Parameter("size", "rad", meaning, visible, least, most, drawn=size_from(visible))
+    return Parameter("size", "rad", meaning, visible, least, most, drawn=draw.size_from(visible))
 
 
 KINDS.add(
@@ -75,7 +46,7 @@ KINDS.add(
         step=clock_board.KILL,
         tasks=("executor", "planner", "clock"),
         detected_as=(DIED,),
-        bound=by_rack_or(4),
+        bound=bounds.by_rack_or(4),
         consequence=DEATH,
         once=True,
         within_tick=True,
@@ -87,9 +58,9 @@ KINDS.add(
         step=clock_board.HANG,
         detected_as=(Alarm.HANG,),
         # Four releases without an answer, and the release at which that is seen.
-        bound=cycles(4 + 1),
+        bound=bounds.cycles(4 + 1),
         consequence=DEATH,
-        lasts=for_cycles(7, 10),
+        lasts=draw.cycles(7, 10),
         within_tick=True,
     ),
     Kind(
@@ -99,13 +70,13 @@ KINDS.add(
         step=tasks.overrun,
         tasks=("executor",),
         parameters=(
-            Parameter("by", "cycles", "additional computing time", 1.5, 0.0, 100.0, drawn=number(1.2, 2.5)),
+            Parameter("by", "cycles", "additional computing time", 1.5, 0.0, 100.0, drawn=draw.number(1.2, 2.5)),
             Parameter("random", "1", "1: uniformly between 0 and that", 0, 0, 1, is_whole=True),
         ),
         detected_as=(Alarm.LATE, Alarm.STARVED),
         # The next release comes before the end of the cycle.
-        bound=cycles(1),
-        lasts=for_cycles(1, 4),
+        bound=bounds.cycles(1),
+        lasts=draw.cycles(1, 4),
         realtime=True,
     ),
     Kind(
@@ -114,10 +85,10 @@ KINDS.add(
         means="the planner exceeds its time slice",
         step=tasks.slow_plan,
         tasks=("planner",),
-        parameters=(Parameter("by", "cycles", "time beyond the slice", 2.0, 0.5, 100.0, drawn=number(1.5, 4.0)),),
+        parameters=(Parameter("by", "cycles", "time beyond the slice", 2.0, 0.5, 100.0, drawn=draw.number(1.5, 4.0)),),
         detected_as=(Alarm.PLAN_LATE,),
-        bound=SLICE + RELEASE,
-        lasts=for_longest(for_cycles(3, 6), for_seconds(1.0, 2.0)),
+        bound=bounds.SLICE + bounds.RELEASE,
+        lasts=draw.longest(draw.cycles(3, 6), draw.seconds(1.0, 2.0)),
         realtime=True,
     ),
     Kind(
@@ -126,8 +97,8 @@ KINDS.add(
         means="a process of higher priority takes the board's core",
         step=tasks.take_core,
         detected_as=(Alarm.STARVED,),
-        bound=cycles(4 + 1),
-        lasts=for_longest(for_cycles(7, 9), for_seconds(0.1, 0.3)),
+        bound=bounds.cycles(4 + 1),
+        lasts=draw.longest(draw.cycles(7, 9), draw.seconds(0.1, 0.3)),
         realtime=True,
     ),
     Kind(
@@ -137,8 +108,8 @@ KINDS.add(
         step=messages.Mute,
         detected_as=(Alarm.MUTE,),
         # Age alone would show after two periods, but proves nothing: the writer must have finished a release since.
-        bound=missing_writes(2) + READ,
-        lasts=for_silence(1.2, 2.0),
+        bound=bounds.missing_writes(2) + bounds.READ,
+        lasts=draw.silence(1.2, 2.0),
     ),
     Kind(
         name="drop",
@@ -148,9 +119,9 @@ KINDS.add(
         parameters=(_probability(0.3, 0.9),),
         detected_as=(Alarm.GAP,),
         # The next message shows that one is missing.
-        bound=writes(1) + DELIVERY,
+        bound=bounds.writes(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
-        lasts=for_messages(4, 8),
+        lasts=draw.messages(4, 8),
     ),
     Kind(
         name="delay",
@@ -158,14 +129,14 @@ KINDS.add(
         means="messages are held back",
         step=messages.Delay,
         parameters=(
-            Parameter("by", "cycles", "the writer's cycles of delay", 2, 1, 50, is_whole=True, drawn=whole(1, 5)),
+            Parameter("by", "cycles", "the writer's cycles of delay", 2, 1, 50, is_whole=True, drawn=draw.whole(1, 5)),
         ),
         # Until the first message comes there is none.
         detected_as=(Alarm.HELD_BACK, Alarm.MUTE),
-        bound=delayed("by") + DELIVERY,
+        bound=bounds.delayed("by") + bounds.DELIVERY,
         # The first messages on time overtake the last ones held back.
         consequence=Consequence(own=(Alarm.DISORDER,)),
-        lasts=for_messages(9, 13),
+        lasts=draw.messages(9, 13),
     ),
     Kind(
         name="reorder",
@@ -175,9 +146,9 @@ KINDS.add(
         parameters=(_probability(0.3, 0.9),),
         # The last message held back may find none to change places with.
         detected_as=(Alarm.DISORDER, Alarm.HELD_BACK),
-        bound=writes(1) + DELIVERY,
+        bound=bounds.writes(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
-        lasts=for_messages(4, 8),
+        lasts=draw.messages(4, 8),
     ),
     Kind(
         name="corrupt",
@@ -186,23 +157,23 @@ KINDS.add(
         step=messages.Corrupt,
         parameters=(
             _probability(1.0, 1.0),
-            Parameter("bits", "1", "bits flipped", 3, 1, 64, is_whole=True, drawn=whole(1, 16)),
+            Parameter("bits", "1", "bits flipped", 3, 1, 64, is_whole=True, drawn=draw.whole(1, 16)),
         ),
         detected_as=(Alarm.DAMAGED,),
-        bound=DELIVERY,
+        bound=bounds.DELIVERY,
         consequence=DAMAGE,
-        lasts=for_messages(4, 8),
+        lasts=draw.messages(4, 8),
     ),
     Kind(
         name="babble",
         where="writer",
         means="messages are written without pause",
         step=messages.Babble,
-        parameters=(Parameter("writes", "1", "messages in one cycle", 32, 3, 1000, is_whole=True, drawn=whole(8, 64)),),
+        parameters=(Parameter("writes", "1", "messages a cycle", 32, 3, 1000, is_whole=True, drawn=draw.whole(8, 64)),),
         detected_as=(Alarm.BABBLE,),
-        bound=DELIVERY,
+        bound=bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP)),
-        lasts=for_cycles(3, 6),
+        lasts=draw.cycles(3, 6),
     ),
     Kind(
         name="masquerade",
@@ -210,7 +181,7 @@ KINDS.add(
         means="a second writer forges a message",
         step=clock_board.MASQUERADE,
         detected_as=(Alarm.MASQUERADE,),
-        bound=DELIVERY,
+        bound=bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP, Alarm.DAMAGED)),
         once=True,
         within_tick=True,
@@ -220,9 +191,9 @@ KINDS.add(
         where="lock",
         means="the holder of a lock is stopped or killed",
         step=messages.HoldLock,
-        parameters=(Parameter("killed", "1", "1: killed; 0: stopped", 0, 0, 1, is_whole=True, drawn=whole(0, 1)),),
+        parameters=(Parameter("killed", "1", "1: killed; 0: stopped", 0, 0, 1, is_whole=True, drawn=draw.whole(0, 1)),),
         detected_as=(Alarm.LOCKED, DIED),
-        bound=LOCK_WAIT + READ,
+        bound=bounds.LOCK_WAIT + bounds.READ,
         consequence=Consequence(own=(Alarm.STALE, Alarm.MUTE, Alarm.HANG), ends_process=True),
         realtime=True,
         once=True,
@@ -234,9 +205,9 @@ KINDS.add(
         step=clock_board.CLOCK_STOP,
         tasks=("clock",),
         detected_as=(Alarm.CLOCK_STOPPED,),
-        bound=clock_ticks(3),
+        bound=bounds.clock_ticks(3),
         consequence=Consequence(reactions=("restart",), ends_process=True),
-        lasts=for_seconds(0.05, 0.3),
+        lasts=draw.seconds(0.05, 0.3),
         realtime=True,
         once=True,
         within_tick=True,
@@ -247,9 +218,9 @@ KINDS.add(
         means="ticks are skipped",
         step=clock_board.CLOCK_SKIP,
         tasks=("clock",),
-        parameters=(Parameter("ticks", "ticks", "how many in a row", 1, 1, 20, is_whole=True, drawn=whole(1, 20)),),
+        parameters=(Parameter("ticks", "ticks", "how many", 1, 1, 20, is_whole=True, drawn=draw.whole(1, 20)),),
         detected_as=(Alarm.CLOCK_SKIPPED,),
-        bound=skipped("ticks"),
+        bound=bounds.skipped("ticks"),
         once=True,
     ),
     Kind(
@@ -259,11 +230,13 @@ KINDS.add(
         step=clock_board.CLOCK_JITTER,
         tasks=("clock",),
         parameters=(
-            Parameter("late", "ticks", "largest lateness; the least is 0.6", 0.9, 0.65, 0.95, drawn=number(0.75, 0.95)),
+            Parameter(
+                "late", "ticks", "largest lateness; at least 0.6", 0.9, 0.65, 0.95, drawn=draw.number(0.75, 0.95)
+            ),
         ),
         detected_as=(Alarm.CLOCK_LATE,),
-        bound=clock_ticks(2),
-        lasts=for_seconds(0.2, 0.6),
+        bound=bounds.clock_ticks(2),
+        lasts=draw.seconds(0.2, 0.6),
         realtime=True,
     ),
     Kind(
@@ -273,9 +246,9 @@ KINDS.add(
         step=arm.SensorStep(arm.position_nan),
         parameters=(_joint(),),
         detected_as=(Alarm.SENSOR_RANGE,),
-        bound=cycles(1),
+        bound=bounds.cycles(1),
         consequence=SENSOR,
-        lasts=for_seconds(0.02, 0.3),
+        lasts=draw.seconds(0.02, 0.3),
     ),
     Kind(
         name="sensor-stuck",
@@ -283,12 +256,12 @@ KINDS.add(
         means="position and velocity do not change",
         step=arm.SensorStep(arm.sample_stuck),
         # A joint at rest does not show that its sensor is stuck: in some faults all are stuck, for long enough.
-        parameters=(_joint(a_joint_or_all),),
+        parameters=(_joint(draw.joint_or_all),),
         # Torques that move a joint whose velocity does not change look like a motor that gives nothing.
         detected_as=(Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL, Alarm.ACTUATOR),
-        bound=cycles(20),
+        bound=bounds.cycles(20),
         consequence=SENSOR,
-        lasts=for_seconds(0.5, 1.5),
+        lasts=draw.seconds(0.5, 1.5),
     ),
     Kind(
         name="sensor-dropout",
@@ -296,9 +269,9 @@ KINDS.add(
         means="no new sample comes",
         step=arm.SensorStep(arm.sample_missing),
         detected_as=(Alarm.SENSOR_SILENT,),
-        bound=cycles(2),
+        bound=bounds.cycles(2),
         consequence=SENSOR,
-        lasts=for_seconds(0.02, 0.3),
+        lasts=draw.seconds(0.02, 0.3),
     ),
     Kind(
         name="sensor-bias",
@@ -307,9 +280,9 @@ KINDS.add(
         step=arm.SensorStep(arm.position_biased),
         parameters=(_joint(), _size("the offset", BIAS_RAD, 1e-5, 3.0)),
         detected_as=(Alarm.SENSOR_MODEL,),
-        bound=BY_SIZE,
+        bound=bounds.BY_SIZE,
         consequence=SENSOR,
-        lasts=for_seconds(0.1, 0.5),
+        lasts=draw.seconds(0.1, 0.5),
         visible_from=BIAS_RAD,
     ),
     Kind(
@@ -319,9 +292,9 @@ KINDS.add(
         step=arm.SensorStep(arm.position_noisy),
         parameters=(_joint(), _size("standard deviation", NOISE_RAD, 1e-6, 1.0)),
         detected_as=(Alarm.SENSOR_MODEL,),
-        bound=BY_SIZE,
+        bound=bounds.BY_SIZE,
         consequence=SENSOR,
-        lasts=for_seconds(0.1, 0.5),
+        lasts=draw.seconds(0.1, 0.5),
         visible_from=NOISE_RAD,
     ),
     Kind(
@@ -331,9 +304,9 @@ KINDS.add(
         step=arm.MotorStep(lambda fault: 0.0),
         parameters=(_joint(default=1),),
         detected_as=(Alarm.ACTUATOR,),
-        bound=cycles(5),
+        bound=bounds.cycles(5),
         consequence=MOTOR,
-        lasts=for_seconds(0.05, 0.4),
+        lasts=draw.seconds(0.05, 0.4),
     ),
     Kind(
         name="actuator-saturated",
@@ -342,16 +315,16 @@ KINDS.add(
         step=arm.MotorStep(lambda fault: fault["part"]),
         parameters=(
             _joint(default=1),
-            Parameter("part", "1", "of its largest torque", 0.1, 0.0, 0.9, drawn=number(0.0, 0.05)),
+            Parameter("part", "1", "of its largest torque", 0.1, 0.0, 0.9, drawn=draw.number(0.0, 0.05)),
         ),
         detected_as=(Alarm.ACTUATOR,),
         # The motor acts like a load that pulls, until more torque is asked for and no more comes. The joint loop asks
         # for more by 0.3 of the missing torque in a cycle (twice its bandwidth, 60 rad/s, times the cycle), and a sound
         # motor gives at least 0.3 of that. Dry friction that reverses may replace all that is missing when the fault
         # strikes: 1 / (0.3 * 0.3) cycles.
-        bound=cycles(12),
+        bound=bounds.cycles(12),
         consequence=MOTOR,
-        lasts=for_seconds(0.05, 0.4),
+        lasts=draw.seconds(0.05, 0.4),
     ),
     Kind(
         name="command-nan",
@@ -361,9 +334,9 @@ KINDS.add(
         parameters=(_joint(),),
         detected_as=(Alarm.COMMAND_INVALID,),
         # At the limit gate, in the same cycle: the torque never reaches the arm.
-        bound=cycles(0),
+        bound=bounds.cycles(0),
         consequence=COMMAND,
-        lasts=for_seconds(0.01, 0.2),
+        lasts=draw.seconds(0.01, 0.2),
     ),
     Kind(
         name="command-limit",
@@ -372,19 +345,19 @@ KINDS.add(
         step=arm.CommandStep(arm.torque_excessive),
         parameters=(
             _joint(),
-            Parameter("factor", "1", "times the limit", 5.0, 1.1, 1e6, drawn=magnitude(3.0, 1000.0)),
+            Parameter("factor", "1", "times the limit", 5.0, 1.1, 1e6, drawn=draw.magnitude(3.0, 1000.0)),
         ),
         detected_as=(Alarm.COMMAND_LIMIT,),
-        bound=cycles(0),
+        bound=bounds.cycles(0),
         consequence=COMMAND,
-        lasts=for_seconds(0.01, 0.2),
+        lasts=draw.seconds(0.01, 0.2),
     ),
     Kind(
         name="self-test",
         where="start",
         means="the start-up test fails",
         detected_as=(),
-        bound=NOT_ARMED,
+        bound=bounds.NOT_ARMED,
         once=True,
     ),
 )

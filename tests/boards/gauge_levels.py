@@ -9,8 +9,8 @@ from wave_levels import Watch
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import Field, State, status
 from rack.boards.faults import KINDS, Kind, Parameter
+from rack.boards.faults import drawing as draw
 from rack.boards.faults.bounds import DELIVERY, writes
-from rack.boards.faults.drawing import for_messages, whole
 from rack.boards.faults.messages import MessageStep, Outgoing
 from rack.levels.level import Executor, Ports
 
@@ -42,10 +42,10 @@ KINDS.add(
         where="writer",
         means="every n-th message is lost",
         step=LoseEvery,
-        parameters=(Parameter("n", "messages", "the n", 4, 2, 8, is_whole=True, drawn=whole(2, 4)),),
+        parameters=(Parameter("n", "messages", "the n", 4, 2, 8, is_whole=True, drawn=draw.whole(2, 4)),),
         detected_as=(Alarm.GAP,),
         bound=writes(1) + DELIVERY,
-        lasts=for_messages(8, 12),
+        lasts=draw.messages(8, 12),
     )
 )
 
