@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import pytest
 
 from rack.backplane.address_map import FAULT_ENTRIES
-from rack.boards.config import load, wire
-from rack.boards.config.faults import injections
+from rack.backplane.layout import Layout
+from rack.boards.config import load, loads, wire
+from rack.boards.config.faults import fault_mistakes, injection
+from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind, Parameter
 from tests.boards.conftest import MakeConfig
-from tests.boards.fault_racks import LOCKED, TARGETS, inline, rack
+from tests.boards.fault_racks import DRIVEN, LOCKED, TARGETS, inline, rack
 
 Fault = dict[str, Any]
 TASKS = "wave, wave.planner, watch, driven, clock"
@@ -105,8 +109,20 @@ def fault_of(kind: Kind, **keys: Any) -> Fault:
     return {"kind": kind.name, "board": board, **keys}
 
 
-def settings_for(kind: Kind) -> tuple[str, ...]:
-    return (LOCKED,) if kind.where == "lock" else ()
+@cache
+def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Layout]:
+    """Return the rack that can have every kind, but for those that need locks, or real time."""
+    mode = "lockstep" if lockstep else "realtime"
+    text = DRIVEN.replace('mode = "lockstep"', f'mode = "{mode}"')
+    found = loads(text + ('[protocol]\ndefault = "lock"\n' if locked else ""))
+    return found, wire(found)
+
+
+def told_of(kind: Kind, lockstep: bool = False, **keys: Any) -> str:
+    """Return the one mistake that a fault of that kind has, as its line."""
+    fault = FaultConfig.model_validate(fault_of(kind, **keys))
+    (mistake,) = fault_mistakes([("fault[0]", fault)], *rack_for(kind.where == "lock", lockstep))
+    return str(mistake)
 
 
 def mistakes(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> list[Mistake]:
@@ -130,24 +146,24 @@ def test_a_mistake_is_told_with_what_is_valid(config: MakeConfig, fault: Fault, 
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_every_kind_can_be_asked_for_by_its_name_and_target_alone(config: MakeConfig, kind: Kind) -> None:
-    found = rack(config, fault_of(kind), settings=settings_for(kind))
-    (injection,) = injections(found, wire(found))
-    assert KINDS[injection.kind] is kind
-    assert injection.parameters == tuple(parameter.default for parameter in kind.parameters)
+def test_every_kind_can_be_asked_for_by_its_name_and_target_alone(kind: Kind) -> None:
+    fault = FaultConfig.model_validate(fault_of(kind))
+    entry = injection(fault, *rack_for(kind.where == "lock", lockstep=False))
+    assert KINDS[entry.kind] is kind
+    assert entry.parameters == tuple(parameter.default for parameter in kind.parameters)
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_a_parameter_that_a_kind_lacks_lists_those_it_has(config: MakeConfig, kind: Kind) -> None:
+def test_a_parameter_that_a_kind_lacks_lists_those_it_has(kind: Kind) -> None:
     names = ", ".join(parameter.name for parameter in kind.parameters) or "none"
-    line = told(config, fault_of(kind, strength=2), settings=settings_for(kind))
+    line = told_of(kind, strength=2)
     assert line == f"fault[0].strength = 2: {kind.name} has no such parameter; parameters: {names}"
 
 
 @pytest.mark.parametrize(("kind", "parameter"), PARAMETERS, ids=lambda given: given.name)
-def test_a_parameter_out_of_range_is_told_with_its_range(config: MakeConfig, kind: Kind, parameter: Parameter) -> None:
+def test_a_parameter_out_of_range_is_told_with_its_range(kind: Kind, parameter: Parameter) -> None:
     for value in (parameter.least - 0.25, parameter.most + 0.25):
-        line = told(config, fault_of(kind, **{parameter.name: value}), settings=settings_for(kind))
+        line = told_of(kind, **{parameter.name: value})
         assert line.startswith(f"fault[0].{parameter.name} = {value!r}: out of range")
         assert f"{parameter.least:g} to {parameter.most:g}; {parameter.meaning}, {parameter.unit}" in line
 
@@ -155,14 +171,13 @@ def test_a_parameter_out_of_range_is_told_with_its_range(config: MakeConfig, kin
 @pytest.mark.parametrize(
     ("kind", "parameter"), [(k, p) for k, p in PARAMETERS if p.is_whole], ids=lambda given: given.name
 )
-def test_half_of_something_that_is_counted_is_refused(config: MakeConfig, kind: Kind, parameter: Parameter) -> None:
-    fault = fault_of(kind, **{parameter.name: parameter.least + 0.5})
-    assert "permitted: whole numbers" in told(config, fault, settings=settings_for(kind))
+def test_half_of_something_that_is_counted_is_refused(kind: Kind, parameter: Parameter) -> None:
+    assert "permitted: whole numbers" in told_of(kind, **{parameter.name: parameter.least + 0.5})
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.realtime], ids=lambda kind: kind.name)
-def test_a_kind_that_needs_real_time_says_so_in_lockstep(config: MakeConfig, kind: Kind) -> None:
-    line = told(config, fault_of(kind), settings=("clock.mode=lockstep", *settings_for(kind)))
+def test_a_kind_that_needs_real_time_says_so_in_lockstep(kind: Kind) -> None:
+    line = told_of(kind, lockstep=True)
     assert line == (
         f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for every task; '
         "run without --lockstep"
@@ -170,8 +185,8 @@ def test_a_kind_that_needs_real_time_says_so_in_lockstep(config: MakeConfig, kin
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if not k.within_tick], ids=lambda kind: kind.name)
-def test_a_kind_that_begins_with_a_cycle_has_no_phase(config: MakeConfig, kind: Kind) -> None:
-    line = told(config, fault_of(kind, phase=0.5), settings=settings_for(kind))
+def test_a_kind_that_begins_with_a_cycle_has_no_phase(kind: Kind) -> None:
+    line = told_of(kind, phase=0.5)
     assert line == (
         f"fault[0].phase = 0.5: {kind.name} begins with a cycle; kinds that strike within a tick: "
         "kill, hang, masquerade, clock-stop"
@@ -180,22 +195,22 @@ def test_a_kind_that_begins_with_a_cycle_has_no_phase(config: MakeConfig, kind: 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.once], ids=lambda kind: kind.name)
 @pytest.mark.parametrize("key", ["for", "cycles"])
-def test_a_kind_that_strikes_once_does_not_last(config: MakeConfig, kind: Kind, key: str) -> None:
-    line = told(config, fault_of(kind, **{key: 1}), settings=settings_for(kind))
+def test_a_kind_that_strikes_once_does_not_last(kind: Kind, key: str) -> None:
+    line = told_of(kind, **{key: 1})
     assert f"fault[0].{key} = 1" in line
     assert f"{kind.name} strikes once and has no duration; leave it out" in line
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_mailbox], ids=lambda kind: kind.name)
-def test_a_kind_that_is_of_no_mailbox_lists_those_that_are(config: MakeConfig, kind: Kind) -> None:
+def test_a_kind_that_is_of_no_mailbox_lists_those_that_are(kind: Kind) -> None:
     takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
-    line = told(config, fault_of(kind, mailbox="wave.status"))
+    line = told_of(kind, mailbox="wave.status")
     assert line == f'fault[0].mailbox = "wave.status": {kind.name} does not strike mailboxes; kinds that do: {takers}'
 
 
 @pytest.mark.parametrize("begin", [{"tick": 4}, {"at": 1.0}, {"when": "wave.status.state == executing"}])
-def test_a_self_test_fails_at_the_start_and_at_no_other_time(config: MakeConfig, begin: Fault) -> None:
-    line = told(config, fault_of(KINDS["self-test"], **begin))
+def test_a_self_test_fails_at_the_start_and_at_no_other_time(begin: Fault) -> None:
+    line = told_of(KINDS["self-test"], **begin)
     assert "self-test strikes as the board starts; leave it out" in line
 
 

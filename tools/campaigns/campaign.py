@@ -13,9 +13,7 @@ from typing import Any
 
 from rack.backplane.layout import Layout
 from rack.boards.config import wire
-from rack.boards.config.faults import fault_mistakes, places
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import ConfigError
 from rack.tools.answer import Failure
 from rack.tools.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
 from rack.tools.campaigns.environment import examine, load
@@ -139,10 +137,6 @@ class Campaign:
 
     def _made(self, plans: Sequence[Plan]) -> list[TrialResult]:
         """Return the results of these plans, in their order: made now, or kept from before."""
-        for plan in plans:
-            config = plan.config(self._config, "campaign")
-            if mistakes := fault_mistakes(places(config), config, self.layout):
-                raise ConfigError(mistakes)
         self._number = max([self._number, *(plan.number for plan in plans)])
         if plans:
             self._progress.total(self._guess_s(plans))

@@ -87,15 +87,14 @@ class LiveRack:
 
     def text(self, width: int | None = None) -> Iterator[str]:
         """Yield the faults injected so far, as a table that fits into `width`."""
+        numbers = ("begins", "struck_tick", "until", "acted")
         rows = [
             [
-                str(f["fault"]),
-                f["text"],
-                f["stage"],
-                *("-" if n is None or n < 0 else str(n) for n in _numbers(f)),
-                f["waits_for"],
+                *(str(fault["fault"]), fault["text"], fault["stage"]),
+                *("-" if fault[key] is None or fault[key] < 0 else str(fault[key]) for key in numbers),
+                fault["waits_for"],
             ]
-            for f in self.faults()
+            for fault in self.faults()
         ]
         yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"], rows, width)
 
@@ -176,7 +175,3 @@ class LiveRack:
     @property
     def _is_over(self) -> bool:
         return self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
-
-
-def _numbers(fault: Mapping[str, Any]) -> list[int | None]:
-    return [fault["begins"], fault["struck_tick"], fault["until"], fault["acted"]]
