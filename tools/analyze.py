@@ -52,7 +52,7 @@ def analyze(
     from rack.tools.recording import Recording
 
     if response:
-        from rack.tools.responding.shown import show
+        from rack.tools.timing.operator_response import show
 
         sys.exit(0 if show(Recording(run), run if out is None else out, as_json) else 1)
     with part_for(silent=as_json) as told:

@@ -1,27 +1,38 @@
-"""`rack check`: validate a config, show what it makes, and predict whether its levels meet their cycles."""
+"""`rack check`: validate a config, show its inventory, and predict whether its levels meet their cycles."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
+from rack.backplane.address_map import AddressMap
+from rack.backplane.layout import Layout
+from rack.boards.config import load, shared_out
+from rack.boards.config.schema import CLOCK_SLOT, RackConfig
+from rack.boards.config.timing import with_budgets
+from rack.levels.timing.forecast import Forecast
 from rack.tools.answer import ConfigName, Failure, Faults, Json, Settings, print_json
-
-if TYPE_CHECKING:
-    from rack.boards.config import RackConfig
-    from rack.tools.timing.repair import Repair
+from rack.tools.live_table import print_wrapped, terminal_width
+from rack.tools.text_table import table
+from rack.tools.timing.judged_config import JudgedConfig
+from rack.tools.timing.repair import Repair, repair
+from rack.tools.timing.tables import forecast_lines
 
 From = Annotated[
     Path | None,
-    typer.Option("--from", metavar="RUN", help="budgets as this run of the rack has measured them, not the config's"),
+    typer.Option("--from", metavar="RUN", help="budgets measured in this run of the rack, instead of the config's"),
 ]
 Percentile = Annotated[
     float,
     typer.Option(
-        metavar="P", min=0.0, max=100.0, help="with --from: the worst of P in 100 cycles, as a host may stall some"
+        metavar="P",
+        min=0.0,
+        max=100.0,
+        help="with --from: the worst of P in 100 cycles, without those that the host stalled",
     ),
 ]
 Fix = Annotated[
@@ -38,59 +49,54 @@ def check(
     fix: Fix = False,
     as_json: Json = False,
 ) -> None:
-    """Validate a config, show what it makes, and predict its timing.
+    """Validate a config, show its inventory, and predict its timing.
 
-    Slots, cores, rates, mailboxes with their bus addresses; or every mistake, one a line.
+    Prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per line.
     On a terminal the tables show as many columns as fit; --json has all.
 
-    The timing comes from budgets, the longest that each part of a level's cycle may take, as processor time:
-    [board.<name>.budget] in the config, with read_ms (R), process_ms (X), write_ms (W), exchange_ms (C, reading the
-    plan), plan_ms (P), update_ms (U), and plan_within_ms, how soon a new plan is wanted; or measured, with --from RUN.
-    [timing] holds t_cs (context_switch_ms), the clock's time (clock_ms), what is small in eq. 3.10 (small_share), and a
-    goal for the system's response (response_ms).
+    The timing rests on budgets, the longest processor time of each part of a level's cycle: [board.<name>.budget] in
+    the config, with read_ms (R), process_ms (X), write_ms (W), exchange_ms (C, reading the plan), plan_ms (P),
+    update_ms (U), and plan_within_ms, a limit on the time to a new plan; or measured, with --from RUN. [timing] holds
+    t_cs (context_switch_ms), the clock's time (clock_ms), the limit of eq. 3.10 (small_share), and a goal for the
+    system's response (response_ms).
 
-    Every equation of the paper, 3.1 to 3.10, is put to every level that has a budget: both sides, the margin, ok or
-    FAILS. Beyond the paper: the worst-case response time of every task among those on its core, and the core's load.
+    Every equation of the paper, 3.1 to 3.10, is applied to every level that has a budget: both sides, the margin, ok or
+    FAILS. Beyond the paper: every task's worst-case response time on its core, and the load of every core.
 
-    Where something fails it says what would do, each change tried on the whole rack, the cheapest first: another
-    priority or core, a planner on a board of its own, older plans, a longer cycle, of that board or of one that shares
-    its core; last what needs a core that this machine lacks. --fix prints the config with the first.
+    If something fails, it lists changes that help, cheapest first, each tried on the whole rack: another priority or
+    core, a board for the planner, older plans, a longer cycle, of that board or of one that shares its core; last,
+    changes that need a core that this machine lacks. --fix prints the config with the first of them.
 
-    Exit status: 0 all holds, or there is nothing to judge; 1 an equation fails, or nothing helps; 2 a bad config.
+    Exit status: 0 everything holds, or nothing can be judged; 1 an equation fails, or no change helps; 2 a bad config.
 
     Examples: rack check fig3; rack check fig3 --fix > fits.toml; rack check nasrem --from runs/nasrem-20250101-120000
     """
-    from rack.boards.config import budgets, load, shared_out
-    from rack.tools.inventory import Inventory
-    from rack.tools.live_table import print_wrapped, terminal_width
-    from rack.tools.timing.forecast import Forecast
-    from rack.tools.timing.repair import repair
-    from rack.tools.timing.trial import Trial
-
     found = load(config, settings, faults)
     if run is not None:
         found = _measured(found, run, percentile)
-    trial = Trial.of(found, budgets(found))
-    if trial.failing and sys.stderr.isatty():
-        print("something fails; looking for what would do", file=sys.stderr)
-    fitting = repair(trial)
+    judged = JudgedConfig.of(found)
+    if judged.failing and sys.stderr.isatty():
+        print("the timing does not fit; looking for changes that help", file=sys.stderr)
+    fitting = repair(judged)
     if fix:
         _print_fixed(fitting, as_json)
         sys.exit(1 if fitting.left else 0)
-    inventory, forecast = Inventory.of(found, trial.layout, shared_out(found)), Forecast.of(trial)
+    lacking = shared_out(found)
+    stock, forecast = inventory(found, judged.layout, lacking), Forecast.of(judged.timing, not lacking)
     if as_json:
-        print_json(inventory.document() | {"timing": forecast.document() | {"repair": fitting.document()}})
+        print_json(stock | {"timing": forecast.document() | {"repair": fitting.document()}})
     else:
         width = terminal_width()
-        print_wrapped("\n".join([*inventory.lines(width), *forecast.lines(width), "", *fitting.lines()]))
+        lines = [*inventory_lines(stock, width), *forecast_lines(forecast, width), "", *fitting.lines()]
+        print_wrapped("\n".join(lines))
     sys.exit(0 if forecast.holds else 1)
 
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
-    """Return a config with the budgets that a run has measured. Raises `Failure` for a run of another rack."""
-    from rack.boards.config.timing import with_budgets
+    """Return a config with the budgets measured in a run. Raises `Failure` for a run of another rack."""
+    # Only --from needs them, and they take long to load.
+    from rack.tools.analysis.measured_budgets import measured_budgets
     from rack.tools.recording import Recording
-    from rack.tools.timing.measured import measured_budgets
 
     recording = Recording(run)
     ran, asked = sorted({task.board for task in recording.layout.tasks}), sorted(config.board)
@@ -100,7 +106,7 @@ def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
-    """Print the config that fits on stdout, what was changed on stderr."""
+    """Print the config that fits on stdout, its changes on stderr."""
     document = fitting.document()
     if as_json:
         print_json(document | {"config": None if fitting.left else fitting.end.config.text()})
@@ -108,3 +114,91 @@ def _print_fixed(fitting: Repair, as_json: bool) -> None:
     print(*(fitting.lines() or ["nothing to change"]), sep="\n", file=sys.stderr)
     if not fitting.left:
         print(fitting.end.config.text(), end="")
+
+
+def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str, Any]:
+    """Return the inventory of a config as plain data; addresses and sizes in bytes.
+
+    Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox `delay_ms` the same;
+    `depth` is the number of a mailbox's slots, `size` the bytes of one message.
+    """
+    places, tick_ms = AddressMap(layout), layout.clock_ns * 1e-6
+    tasks = [
+        {
+            "slot": task.slot,
+            "task": task.name,
+            "core": task.core,
+            "priority": task.priority,
+            "rate_hz": 1e9 / (task.every * layout.clock_ns),
+            "every_ticks": task.every,
+            "slice_ms": task.every * task.within_cycles * tick_ms,
+            "trace_address": places.traces[task.name],
+        }
+        for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
+    ]
+    mailboxes = [
+        {
+            "address": places.mailboxes[mailbox.name],
+            "mailbox": mailbox.name,
+            "message": f"{mailbox.message} {mailbox.version}",
+            "size": mailbox.size,
+            "depth": mailbox.depth,
+            "protocol": mailbox.protocol,
+            "writer": mailbox.writer,
+            "readers": mailbox.readers,
+            "delay_ms": mailbox.delay * tick_ms,
+        }
+        for mailbox in layout.mailboxes
+    ]
+    return {
+        "rack": config.name,
+        "mode": config.clock.mode,
+        "clock_ms": tick_ms,
+        "clock_core": config.clock.core,
+        "clock_priority": config.clock.priority,
+        "segment_bytes": places.size,
+        "windows": {window.board: window.address for window in places.windows},
+        "tasks": tasks,
+        "mailboxes": mailboxes,
+        "notes": notes,
+    }
+
+
+def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator[str]:
+    """Yield an inventory as text for people, the tables fitted to `width`."""
+    boards = len({task["slot"] for task in found["tasks"]})
+    crate = f"{boards} board{'s' * (boards > 1)} and the clock"
+    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
+    yield from found["notes"]
+    clock = [CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-", "", "", "", ""]
+    rows = [
+        [
+            *(t["slot"], t["task"], t["core"], t["priority"] or "-"),
+            *(f"{t['rate_hz']:g}", t["every_ticks"], f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+        ]
+        for t in found["tasks"]
+    ]
+    head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", "slice, ms", "trace at"]
+    yield ""
+    yield from _table(head, [clock, *rows], width, ("trace at", "slice, ms"))
+    rows = [
+        [
+            *(_hex(m["address"]), m["mailbox"], m["message"], m["size"], m["depth"], m["protocol"]),
+            *(f"{m['delay_ms']:g}", f"{m['writer']} > {', '.join(m['readers']) or '(nobody)'}"),
+        ]
+        for m in found["mailboxes"]
+    ]
+    head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
+    yield ""
+    yield from _table(head, rows, width, ("slots", "bytes", "message", "protocol"))
+    yield ""
+    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
+    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+
+
+def _table(head: list[str], rows: list[list[Any]], width: int | None, dropped: tuple[str, ...]) -> Iterator[str]:
+    yield from table(head, [[str(cell) for cell in row] for row in rows], width, dropped)
+
+
+def _hex(address: int) -> str:
+    return f"0x{address:06x}"

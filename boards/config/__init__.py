@@ -6,7 +6,7 @@ from rack.boards.config.files import CONFIGS, FAULTS, names
 from rack.boards.config.loading import load, loads
 from rack.boards.config.ports import TaskPorts, task_ports
 from rack.boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
-from rack.boards.config.timing import budgets, timed_tasks
+from rack.boards.config.timing import budgets, rack_timing
 from rack.boards.config.wiring import wire
 
 __all__ = [
@@ -22,8 +22,8 @@ __all__ = [
     "load",
     "loads",
     "names",
+    "rack_timing",
     "shared_out",
     "task_ports",
-    "timed_tasks",
     "wire",
 ]

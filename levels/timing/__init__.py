@@ -1,1 +1,1 @@
-"""The paper's timing model: its equations, and beyond them what tasks that share a core do to each other."""
+"""The paper's timing model and its extension to tasks that share a core, as pure functions on plain data."""

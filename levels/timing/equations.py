@@ -1,37 +1,58 @@
 """The paper's timing model, equations 3.1 to 3.10, as plain functions (NISTIR 90-4251, section 3).
 
-All times are in ns. An equation that a level can fail gives both of its sides, a `Relation`, which is true where it
-holds; one that defines a time gives that time. The paper's names: R_i is a level's response time, which is its cycle;
-R_max the longest cycle of all levels; t_exec what the executor computes in a cycle; t_comm what it spends on reading
-and writing, waiting included; t_residual what is left; t_plan what one plan takes, its update included; d the cycles
-that a plan may take; t_cs one context switch.
+All times are in ns. An equation that a level can fail returns both of its sides as a `Relation`; one that defines a
+time returns that time. The paper's symbols: R_i is a level's response time, which is its cycle; R_max the longest cycle
+of all levels; t_exec the executor's processing in a cycle; t_comm its reading and writing, waiting included; t_residual
+the rest of the cycle; t_plan one plan with its update; d the cycles that a plan may take; t_cs one context switch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import floor
+import operator
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from math import floor, gcd
 from statistics import pstdev
-
-from rack.levels.timing.relation import Relation
+from typing import Literal, NamedTuple
 
 SMALL_SHARE = 0.1
-"""Part of a cycle that counts as much smaller than the cycle (eq. 3.10)."""
+"""Share of a cycle that counts as much smaller than the cycle (eq. 3.10)."""
+
+Sign = Literal["<", "<=", "="]
+
+_HOLDS: dict[str, Callable[[float, float], bool]] = {"<": operator.lt, "<=": operator.le, "=": operator.eq}
+
+
+class Relation(NamedTuple):
+    """Two sides, in one unit, and the sign between them; true if it holds."""
+
+    left: float
+    sign: Sign
+    right: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the numbers satisfy the relation."""
+        return _HOLDS[self.sign](self.left, self.right)
+
+    @property
+    def margin(self) -> float:
+        """Right side minus left side; negative if the relation fails."""
+        return self.right - self.left
+
+    def __bool__(self) -> bool:
+        """Return whether it holds: a tuple of three would always be true."""
+        return self.holds
 
 
 def fits_cycle(processing_ns: float, communication_ns: float, cycle_ns: float) -> Relation:
-    """Hold a level's processing and communicating against its cycle: t_proc + t_c <= R_i (eq. 3.1)."""
+    """Compare a level's processing and communication with its cycle: t_proc + t_c <= R_i (eq. 3.1)."""
     return Relation(processing_ns + communication_ns, "<=", cycle_ns)
 
 
 def system_response_bound_ns(cycles_ns: Sequence[float]) -> float:
-    """Return the bound on the system's response time: as many longest cycles as levels, n R_max (eq. 3.2)."""
+    """Return the bound on the system's response time, n R_max for n levels (eq. 3.2)."""
     return len(cycles_ns) * max(cycles_ns)
-
-
-def system_responds(response_ns: float, cycles_ns: Sequence[float]) -> Relation:
-    """Hold the system's response time against its bound: R_s <= n R_max (eq. 3.2)."""
-    return Relation(response_ns, "<=", system_response_bound_ns(cycles_ns))
 
 
 def system_response_ns(machine_cycles_ns: Sequence[float], goal_cycles_ns: Sequence[float]) -> float:
@@ -42,8 +63,17 @@ def system_response_ns(machine_cycles_ns: Sequence[float], goal_cycles_ns: Seque
     return sum(machine_cycles_ns) + sum(goal_cycles_ns)
 
 
+def response_ticks(cycles: Sequence[int]) -> int:
+    """Return the longest time from the first level's release to the end of the last level's cycle that acts on it.
+
+    `cycles` are in ticks, in the order in which the information passes. Each level takes its cycle (eq. 3.3); if one
+    cycle does not divide the next, a message also waits for the reader's next release on the common grid (eq. 3.7).
+    """
+    return sum(cycles) + sum(later - gcd(earlier, later) for earlier, later in pairwise(cycles))
+
+
 def executes_in_time(execution_ns: float, longest_cycle_ns: float) -> Relation:
-    """Hold an executor against the longest cycle that a level may have: t_exec < R_max (eq. 3.4)."""
+    """Compare an executor with the longest permitted cycle: t_exec < R_max (eq. 3.4)."""
     return Relation(execution_ns, "<", longest_cycle_ns)
 
 
@@ -53,35 +83,30 @@ def response_time_ns(execution_ns: float, communication_ns: float, residual_ns: 
 
 
 def residual_ns(cycle_ns: float, execution_ns: float, communication_ns: float) -> float:
-    """Return what a cycle leaves, t_residual = R_i - t_exec - t_comm (eq. 3.5); negative: what it lacks."""
+    """Return the rest of a cycle, t_residual = R_i - t_exec - t_comm (eq. 3.5); negative if the cycle is too short."""
     return cycle_ns - execution_ns - communication_ns
 
 
 def parts_make_cycle(execution_ns: float, communication_ns: float, cycle_ns: float) -> Relation:
-    """Hold the parts of a cycle against it: t_exec + t_comm + t_residual = R_i (eq. 3.5).
+    """Compare the parts of a cycle with the cycle: t_exec + t_comm + t_residual = R_i (eq. 3.5).
 
-    No time is left in a cycle that is too short for the first two: then the parts make more than the cycle.
+    A cycle too short for the first two has a residual of 0: its parts then exceed it.
     """
     left_ns = max(residual_ns(cycle_ns, execution_ns, communication_ns), 0)
     return Relation(response_time_ns(execution_ns, communication_ns, left_ns), "=", cycle_ns)
 
 
 def residual_bound_ns(cycle_ns: float, executions_ns: Sequence[float], communications_ns: Sequence[float]) -> float:
-    """Return alpha, the residual that is sure to be left in the worst cycle (eq. 3.6); negative when there is none.
+    """Return alpha, the residual guaranteed in the worst cycle (eq. 3.6); negative if there is none.
 
-    The longest execution and the longest communication count, whether or not they fell into one cycle.
+    The longest execution and the longest communication count, even if they fell into different cycles.
     """
     return residual_ns(cycle_ns, max(executions_ns), max(communications_ns))
 
 
 def residual_is_left(residual_ns: float) -> Relation:
-    """Hold a residual against nothing: 0 < t_residual (eq. 3.6, its lower half)."""
+    """Require a residual: 0 < t_residual (eq. 3.6, its lower half)."""
     return Relation(0, "<", residual_ns)
-
-
-def residual_is_sure(residual_ns: float, bound_ns: float) -> Relation:
-    """Hold background work of a cycle against what is sure to be left: t_residual <= alpha (eq. 3.6, upper half)."""
-    return Relation(residual_ns, "<=", bound_ns)
 
 
 def residual_deviation_ns(executions_ns: Sequence[float], communications_ns: Sequence[float]) -> float:
@@ -95,12 +120,12 @@ def cycle_start_ns(first_ns: int, period_ns: int, cycle: int) -> int:
 
 
 def cycle_is_on_grid(cycle_ns: float, clock_ns: int) -> Relation:
-    """Hold a cycle against the nearest whole number of clock periods: R_i = k c (what eq. 3.7 asks of a cycle)."""
+    """Compare a cycle with the nearest whole number of clock periods: R_i = k c (required by eq. 3.7)."""
     return Relation(cycle_ns, "=", cycle_start_ns(0, clock_ns, max(round(cycle_ns / clock_ns), 1)))
 
 
 def plan_fits_tight(plan_ns: float, cycles: int, residual_ns: float, context_switch_ns: float) -> Relation:
-    """Hold a planner on its executor's processor against what is left: t_plan / d < t_residual - 2 t_cs (eq. 3.8).
+    """Compare a planner on its executor's processor with the residual: t_plan / d < t_residual - 2 t_cs (eq. 3.8).
 
     `plan_ns` includes the update of the plan.
     """
@@ -108,18 +133,18 @@ def plan_fits_tight(plan_ns: float, cycles: int, residual_ns: float, context_swi
 
 
 def plan_cycles_tight(plan_ns: float, residual_ns: float, context_switch_ns: float) -> int | None:
-    """Return the fewest cycles within which such a planner finishes (eq. 3.8); None: never."""
+    """Return the fewest cycles in which such a planner finishes (eq. 3.8); None: it never does."""
     left_ns = residual_ns - 2 * context_switch_ns
     return floor(plan_ns / left_ns) + 1 if left_ns > 0 else None
 
 
 def plan_fits_loose(plan_ns: float, cycles: int, cycle_ns: float) -> Relation:
-    """Hold a planner on a processor of its own against its slice: t_plan <= d R_i (section 3.4, fig. 4)."""
+    """Compare a planner on its own processor with its time slice: t_plan <= d R_i (section 3.4, fig. 4)."""
     return Relation(plan_ns, "<=", cycles * cycle_ns)
 
 
 def communication_ns(interlevel_ns: float, executor_planner_ns: float) -> float:
-    """Return what a level communicates in a cycle: t_comm = t_interlevel + t_executor-planner (eq. 3.9)."""
+    """Return a level's communication in a cycle: t_comm = t_interlevel + t_executor-planner (eq. 3.9)."""
     return interlevel_ns + executor_planner_ns
 
 
@@ -136,7 +161,7 @@ def response_time_tight_ns(
 def leaves_time_to_plan(
     execution_ns: float, communication_ns: float, context_switch_ns: float, cycle_ns: float
 ) -> Relation:
-    """Hold all of a cycle but planning against it: t_exec + t_comm + 2 t_cs < R_i (eq. 3.9).
+    """Compare a cycle without its planning with the whole: t_exec + t_comm + 2 t_cs < R_i (eq. 3.9).
 
     The margin is t_(plan+residual). `communication_ns` is of the worst cycle, in which the plan is updated.
     """
@@ -144,13 +169,13 @@ def leaves_time_to_plan(
 
 
 def plan_update_share(executor_planner_ns: float, cycle_ns: float) -> float:
-    """Return the part of a cycle that updating the plan takes (eq. 3.10)."""
+    """Return the share of a cycle spent on updating the plan (eq. 3.10)."""
     return executor_planner_ns / cycle_ns
 
 
 def coupling_may_be_tight(executor_planner_ns: float, cycle_ns: float, small: float = SMALL_SHARE) -> Relation:
-    """Hold the plan's update against a small part of the cycle: t_executor-planner << R_i (eq. 3.10).
+    """Compare the plan's update with a small share of the cycle: t_executor-planner << R_i (eq. 3.10).
 
-    Both sides are parts of the cycle. Where it fails, planner and executor are to be split.
+    Both sides are shares of the cycle. If it fails, planner and executor should be split.
     """
     return Relation(plan_update_share(executor_planner_ns, cycle_ns), "<=", small)

@@ -1,4 +1,4 @@
-"""Worst-case response times of tasks that share a core by fixed priorities: exact analysis, beyond the paper.
+"""Worst-case response times of tasks that share a core under fixed priorities: exact analysis, beyond the paper.
 
 The recurrence is M. Joseph and P. Pandya's, *Finding Response Times in a Real-Time System*, The Computer Journal 29
 (1986); with blocking and release jitter it is N. Audsley et al.'s, *Applying New Scheduling Theory to Static Priority
@@ -6,27 +6,30 @@ Pre-emptive Scheduling*, Software Engineering Journal 8 (1993):
 
     R = w + J,  w = B + C + sum over all tasks above of ceil((w + J_j) / T_j) C_j.
 
-It is the response of a job that is released together with all those above: tasks that a rack releases together at 0
-do meet it. Times are integers in one unit, ns in a rack.
+This is the response of a job released together with all tasks above it. A rack releases all tasks together at tick 0,
+so the bound is attained. Times are integers in one unit; a rack uses ns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from fractions import Fraction
+from functools import partial
 from math import lcm
+from typing import Any
 
 from rack.levels.timing.tasks import TimedTask
 
 Load = tuple[int, int, int]
-"""What a task asks of its core: cost C of a job, period T, release jitter J."""
+"""Demand of a task on its core: cost C of a job, period T, release jitter J."""
 
 TURN_NS = 4_000_000
-"""Longest turn of an ordinary task while another one waits: a tick of a kernel of 250 Hz, Linux's own slice is 3 ms."""
-MISSED_OVER = 10
-"""Deadlines behind which a response time is no longer searched for: near full load the search would creep on."""
-MOST_STEPS = 10_000
-"""Steps of one search: with a tick of 10 us below a plan of hours it would creep on before any deadline."""
+"""Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own slice is 3 ms)."""
+HORIZON_DEADLINES = 10
+"""The search for a response time ends after this many deadlines: near full load it converges too slowly."""
+MAX_STEPS = 10_000
+"""Limit on the steps of one search: a 10 us tick against a plan of hours takes too many before any deadline."""
 
 
 def response_time(
@@ -40,54 +43,54 @@ def response_time(
     turn: int = TURN_NS,
     horizon: int | None = None,
 ) -> int | None:
-    """Return the longest time from a job's release to its end; None: there is no bound, or none within the `horizon`.
+    """Return the longest time from a job's release to its end; None: no bound, or none within the `horizon`.
 
-    `above` are the tasks of higher or equal priority on the core, each delaying the job by whole jobs of its own;
-    `blocking` is the longest stretch for which a task below keeps it out.
+    `above` are the tasks of higher or equal priority on the core: each delays the job by whole jobs of its own.
+    `blocking` is the longest part of a lower task that cannot be preempted.
 
-    Without its `period` it is the response of a job that finds its task free; one longer than the period is a miss in
-    a rack, where who is late takes up the newest release and skips those before. Give the `period` where releases
-    queue up instead: then it is the longest of all jobs of the busy time (Lehoczky 1990), whatever the deadline.
+    Without a `period`, releases do not queue, as in a rack: a late task takes up the newest release and skips the
+    others, so the job finds its task free, and a response longer than the period is a miss. With a `period`, releases
+    queue, and the result is the longest of all jobs in the busy time (Lehoczky 1990), whatever the deadline.
 
-    `sharing` are tasks that take turns with this one, as ordinary scheduling has it: while it waits, none of them
-    computes more than it does, but for one `turn`. That is a bound for fair turns; Linux promises none. The default
-    `horizon` is 100 times the longest of all times given.
+    `sharing` are tasks under ordinary scheduling that take turns with this one: while it waits, none of them computes
+    more than it does, plus one `turn`. That bound assumes fair turns, which Linux does not guarantee. The default
+    `horizon` is 100 times the longest time given.
     """
-    # Below full load there is a bound; near it, the search for it may creep on.
+    # Below full load a bound exists; near full load the search for it may take too long.
     own = Fraction(cost, period) if period else Fraction(0)
     demand = sum((Fraction(c, t) for c, t, _ in above), own)
     if cost and (demand > 1 or (demand == 1 and not period)):
         return None
     longest = max([cost, period or 0, blocking, jitter, *(t for _, t, _ in above), *(t for _, t, _ in sharing)])
     horizon = 100 * longest if horizon is None else horizon
+
+    def work(until: int, jobs: int) -> int:
+        turns = sum(min(_released(until, load), jobs * cost + turn) for load in sharing)
+        return blocking + jobs * cost + turns + sum(_released(until, load) for load in above)
+
     worst, job, end = 0, 0, 0
     while True:
-        work = blocking + (job + 1) * cost
-        most = (job + 1) * cost + turn
-        found = _end_of_busy_time(work, max(end, work), above, sharing, most, horizon + job * (period or 0))
+        start = max(end, blocking + (job + 1) * cost)
+        found = _fixed_point(partial(work, jobs=job + 1), start, horizon + job * (period or 0))
         if found is None:
             return None
         end, worst = found, max(worst, found + jitter - job * (period or 0))
         job += 1
         if period is None or end + jitter <= job * period:
             return worst
-        # At full load the busy time may not end; what follows repeats itself.
+        # At full load the busy time may not end; from here on it repeats.
         if job * period > lcm(period, *(t for _, t, _ in above)):
             return worst
 
 
-def _end_of_busy_time(
-    work: int, guess: int, above: Sequence[Load], sharing: Sequence[Load], most: int, horizon: int
-) -> int | None:
-    """Return the smallest w not below `guess` for which `work` and all that is released until w is done at w."""
-    for _ in range(MOST_STEPS):
+def _fixed_point(work: Callable[[int], int], guess: int, horizon: int) -> int | None:
+    """Return the smallest w >= `guess` at which all work released before w is done; None if there is none."""
+    for _ in range(MAX_STEPS):
         if guess > horizon:
             break
-        demand = work + sum(_released(guess, load) for load in above)
-        demand += sum(min(_released(guess, load), most) for load in sharing)
-        if demand <= guess:
+        if (needed := work(guess)) <= guess:
             return guess
-        guess = demand
+        guess = needed
     return None
 
 
@@ -97,12 +100,12 @@ def _released(until: int, load: Load) -> int:
 
 
 def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[str, int | None]:
-    """Return the worst-case response time of every task that computes at all, ns, by name; core by core.
+    """Return the worst-case response time of every task with a cost, ns, by name.
 
-    A job takes two context switches, into it and out of it (eq. 3.9): its response includes both, as nothing else
-    computes before. None: no bound, or none within `MISSED_OVER` deadlines. Tasks of equal priority delay each other
-    by whole jobs; those of ordinary scheduling (priority 0) share time by turns. A bound is attained by tasks of
-    different priorities without blocking; a part of a job that others cannot preempt is not counted in its own favour.
+    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both. None: no bound, or
+    none within `HORIZON_DEADLINES` deadlines. Tasks of equal priority delay each other by whole jobs; tasks under
+    ordinary scheduling (priority 0) take turns. The bound is exact for tasks of different priorities without blocking;
+    it does not credit a job for its own parts that cannot be preempted.
     """
     busy = [task for task in tasks if task.cost_ns]
     found = {}
@@ -116,9 +119,53 @@ def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> di
             blocking_ns(task, others),
             task.jitter_ns,
             sharing=[_load(other, context_switch_ns) for other in shares],
-            horizon=MISSED_OVER * task.period_ns,
+            horizon=HORIZON_DEADLINES * task.period_ns,
         )
     return found
+
+
+@dataclass(frozen=True)
+class TaskResponse:
+    """One task in the worst case, ns.
+
+    `job_ns` is its own processor time with two context switches, `blocking_ns` the longest wait for a task of lower
+    priority, `response_ns` the time from its release to its end, None without a bound.
+    """
+
+    task: str
+    core: int
+    priority: int
+    job_ns: int
+    blocking_ns: int
+    response_ns: int | None
+    deadline_ns: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether it always meets its deadline."""
+        return self.response_ns is not None and self.response_ns <= self.deadline_ns
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return asdict(self) | {"holds": self.holds}
+
+
+def task_responses(tasks: Sequence[TimedTask], context_switch_ns: int) -> tuple[TaskResponse, ...]:
+    """Return the worst case of every task with a cost."""
+    found = response_times(tasks, context_switch_ns)
+    return tuple(
+        TaskResponse(
+            task=task.name,
+            core=task.core,
+            priority=task.priority,
+            job_ns=job_ns(task, context_switch_ns),
+            blocking_ns=blocking_ns(task, tasks),
+            response_ns=found[task.name],
+            deadline_ns=task.period_ns,
+        )
+        for task in tasks
+        if task.name in found
+    )
 
 
 def job_ns(task: TimedTask, context_switch_ns: int) -> int:
@@ -127,16 +174,16 @@ def job_ns(task: TimedTask, context_switch_ns: int) -> int:
 
 
 def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
-    """Return how long a task of lower priority on the core may keep this one out, ns: one such part at most.
+    """Return the longest wait for a task of lower priority on the core, ns: one part that cannot be preempted.
 
-    That is a plan update whose ceiling is at least this task's priority (eq. 3.10); it had begun before the release.
+    That is a plan update that began before the release and whose ceiling is at least this task's priority (eq. 3.10).
     """
     below = (t for t in tasks if t.core == task.core and t.priority < task.priority <= t.ceiling)
     return max((other.locked_ns for other in below), default=0)
 
 
 def load_of(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[int, float]:
-    """Return the part of its time that each core computes, context switches included, by core; above 1: overloaded."""
+    """Return the load of each core, by core, context switches included; above 1 it is overloaded."""
     loads: dict[int, float] = {}
     for task in tasks:
         if task.cost_ns:

@@ -1,29 +1,84 @@
-"""A schedule: what tasks do to each other on their cores, by fixed priorities, worked out instead of run.
+"""Gantt charts as data, and the schedule of tasks under fixed priorities, computed instead of run.
 
-It follows the rack's own rules (backplane/wake.py, boards/planner_task.py): who is late takes up the newest release,
-never two; a planner's release lasts as long as the slice of its plan, and the next one lies behind that slice.
+The schedule follows the rack's own rules (backplane/wake.py, boards/planner_task.py): a late task takes up the newest
+release and skips the others; a planner's release lasts as long as the time slice of its plan, and the next release
+comes after that slice.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from rack.levels.timing.chart import Chart, Job, Span
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
-"""Parts of a task that are not the same in every cycle, by task: those of its cycles in turn."""
+"""Parts of tasks that differ from cycle to cycle, by task: one sequence per cycle, in turn."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """An uninterrupted stretch in which a task computed one unit function, ns; `release_ns` is its job's."""
+
+    task: str
+    core: int
+    unit: Unit
+    start_ns: int
+    end_ns: int
+    release_ns: int
+
+
+@dataclass(frozen=True)
+class Job:
+    """The work of one release, times in ns. `end_ns` is None while the job is unfinished.
+
+    A release that an executor skipped, because it was late, is a job that never ends.
+    """
+
+    task: str
+    release_ns: int
+    deadline_ns: int
+    end_ns: int | None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Spans and jobs between `start_ns` and `end_ns`, each in order of time."""
+
+    start_ns: int
+    end_ns: int
+    spans: tuple[Span, ...]
+    jobs: tuple[Job, ...]
+
+    def late(self, task: str) -> list[Job]:
+        """Return the jobs of a task that missed their deadline, unfinished ones included."""
+        return [job for job in self.jobs if job.task == task and self._is_late(job)]
+
+    def _is_late(self, job: Job) -> bool:
+        return job.deadline_ns <= self.end_ns if job.end_ns is None else job.deadline_ns < job.end_ns
+
+    def window(self, start_ns: int, end_ns: int) -> Chart:
+        """Return the chart from `start_ns` to `end_ns`: spans are cut there, jobs kept whole.
+
+        A job is in the window if it was released in it, or was unfinished or not yet due at its start.
+        """
+        spans = tuple(
+            replace(span, start_ns=max(span.start_ns, start_ns), end_ns=min(span.end_ns, end_ns))
+            for span in self.spans
+            if span.start_ns < end_ns and span.end_ns > start_ns
+        )
+        jobs = tuple(j for j in self.jobs if j.release_ns < end_ns and max(j.deadline_ns, j.end_ns or 0) > start_ns)
+        return Chart(start_ns, end_ns, spans, jobs)
 
 
 def simulate(
     tasks: Sequence[TimedTask], until_ns: int, context_switch_ns: int = 0, variants: Variants | None = None
 ) -> Chart:
-    """Return what `tasks` compute from their common release at 0 until `until_ns`, exactly.
+    """Return the exact schedule of `tasks` from their common release at 0 until `until_ns`.
 
-    A job takes two context switches, one before its parts and one behind them; they show as time in which nobody
-    computes. Ordinary scheduling, priority 0, is simulated as first come, first served.
+    A job takes two context switches, one before its parts and one after; they show as idle time. Ordinary scheduling,
+    priority 0, is simulated as first come, first served.
     """
     runners = [_Runner(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,))) for task in tasks]
     for core in {task.core for task in tasks}:
@@ -34,7 +89,7 @@ def simulate(
 
 
 def _run(runners: list[_Runner], until_ns: int) -> None:
-    """Run the tasks of one core, from one moment at which another may have to compute to the next."""
+    """Run the tasks of one core, from one possible preemption to the next."""
     now = 0
     while now < until_ns:
         ready = [runner for runner in runners if runner.ready_at <= now]
@@ -55,7 +110,7 @@ class _Step(NamedTuple):
 
 
 class _Runner:
-    """One task, job by job. `ready_at` is when its job, or the next one, can begin, ns."""
+    """One task, job by job. `ready_at` is the time at which its job, or the next one, can begin, ns."""
 
     def __init__(self, task: TimedTask, context_switch_ns: int, variants: Sequence[Sequence[Part]]) -> None:
         self.task = task
@@ -63,22 +118,22 @@ class _Runner:
         self.ready_at = task.jitter_ns
         self._switch = [_Step(None, context_switch_ns)] if context_switch_ns else []
         self._variants = variants
-        self._steps: list[_Step] = []  # those left of the job
-        self._spent_ns = 0  # on the first of them
+        self._steps: list[_Step] = []  # remaining steps of the job
+        self._spent_ns = 0  # on the first remaining step
         self._release = -1
-        # Before its first plan a planner takes nothing late.
+        # A planner cannot be late for its first plan.
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
     def order(self) -> tuple[int, bool, int, str]:
-        """Return its place among those that could compute: the lowest does."""
+        """Return its rank among the ready tasks: the lowest computes."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority
-        # What its ceiling protects goes on before all that has come to that priority meanwhile.
+        # A protected part continues before tasks of that priority that were released meanwhile.
         return -priority, not is_locked, self.ready_at, self.task.name
 
     def compute(self, now_ns: int, until_ns: int) -> int:
-        """Compute from `now_ns` until one part is done, `until_ns` at most; return when that was."""
+        """Compute from `now_ns` until a part ends, at most until `until_ns`; return that time."""
         if not self._steps:
             self._take(now_ns)
         if not self._steps:
@@ -99,7 +154,7 @@ class _Runner:
         return end
 
     def _take(self, now_ns: int) -> None:
-        """Take up the oldest release that has not passed."""
+        """Take up the oldest release that has not expired."""
         every, expected = self.task.every_ns, self.ready_at - self.task.jitter_ns
         newest = (now_ns - self.task.jitter_ns) // every * every
         self._release = max(expected, newest - self._slack_ns)
@@ -122,7 +177,7 @@ class _Runner:
             self.spans.append(Span(self.task.name, self.task.core, unit, start_ns, end_ns, self._release))
 
     def jobs(self, until_ns: int) -> Iterator[Job]:
-        """Yield the jobs released before `until_ns`; to be called when the schedule is over."""
+        """Yield the jobs released before `until_ns`; call it once the schedule is complete."""
         if not self._steps and self.ready_at < until_ns:
             self._take(until_ns - 1)
         if self._release not in self._ends and self._release >= 0:

@@ -1,10 +1,26 @@
-"""Tasks as the timing model sees them: unit functions of known length, released on a grid, by priority on a core."""
+"""Budgets of levels, and tasks as the timing model sees them: unit functions of known length, released on a grid."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Worst-case processor times of one level, ns; 0 if a level has no such part.
+
+    `read_ns` (R), `process_ns` (X, t_exec), `write_ns` (W) and `exchange_ns` (C, reading the plan) are of one cycle of
+    the executor. `plan_ns` (P) and `update_ns` (U) are of one plan; the paper's t_plan is their sum.
+    """
+
+    read_ns: int = 0
+    process_ns: int = 0
+    write_ns: int = 0
+    exchange_ns: int = 0
+    plan_ns: int = 0
+    update_ns: int = 0
 
 
 class Unit(StrEnum):
@@ -20,7 +36,7 @@ class Unit(StrEnum):
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of one unit function. One that is not preemptible runs at its task's `ceiling`."""
+    """A stretch of one unit function. A part that is not preemptible runs at its task's `ceiling`."""
 
     unit: Unit
     time_ns: int
@@ -29,13 +45,13 @@ class Part:
 
 @dataclass(frozen=True)
 class TimedTask:
-    """One task. Times are ns; a job is what one release, or one plan, makes it compute.
+    """One task; all times in ns. A job is the work of one release, or of one plan.
 
-    It is released every `every_ns`, all tasks together at 0, and one job may take `within_cycles` of its cycles; the
-    next job is released behind that. `priority` is SCHED_FIFO's: a higher one preempts, tasks of equal priority run
-    in the order of their releases, then of `name`. Ordinary scheduling is 0, below all. `parts` are computed in order.
-    `ceiling` is the priority that parts run at which are not preemptible: the plan update keeps its own executor out,
-    and whoever is not above that (eq. 3.10). `jitter_ns` is how much later than its release a job may be known.
+    The task is released every `every_ns`, all tasks together at 0. A job may take `within_cycles` cycles; the next
+    job is released after those. `parts` are computed in order. `priority` is SCHED_FIFO's: a higher one preempts; tasks
+    of equal priority run in the order of their releases, then of `name`. Ordinary scheduling is 0, below all. `ceiling`
+    is the priority of parts that are not preemptible: a plan update blocks its own executor and every task that is not
+    above the executor (eq. 3.10). `jitter_ns` bounds the delay from a release until the task knows of it.
     """
 
     name: str
@@ -51,19 +67,15 @@ class TimedTask:
 
     @property
     def period_ns(self) -> int:
-        """The shortest time from one job's release to the next one's; also its deadline."""
+        """The shortest time between the releases of two jobs; also a job's deadline."""
         return self.every_ns * self.within_cycles
 
     @property
     def cost_ns(self) -> int:
-        """Processor time of one job, context switches not counted."""
+        """Processor time of one job, without context switches."""
         return sum(part.time_ns for part in self.parts)
 
     @property
     def locked_ns(self) -> int:
-        """The longest stretch of a job that is not preemptible."""
+        """The longest part of a job that is not preemptible."""
         return max((part.time_ns for part in self.parts if not part.preemptible), default=0)
-
-    def time_of(self, unit: Unit) -> int:
-        """Return the time that a job spends on one unit function."""
-        return sum(part.time_ns for part in self.parts if part.unit is unit)

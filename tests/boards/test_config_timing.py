@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import budgets, load, loads, timed_tasks, wire
+from rack.boards.config import budgets, load, loads, rack_timing, wire
 from rack.boards.config.timing import with_budgets
 from rack.boards.errors import ConfigError
-from rack.levels.timing.budget import Budget
-from rack.levels.timing.tasks import Unit
+from rack.levels.timing.tasks import Budget, Part, Unit
 
 MEASURED = Budget(read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11)
 WITHIN = "board.lower.budget={ process_ms = 1.5, plan_ms = 3, plan_within_ms = 20 }"
@@ -46,7 +45,7 @@ def test_what_a_planner_would_take_is_a_mistake_without_one(small: Path, table: 
 def test_tasks_are_on_the_cores_that_the_config_asks_for(small: Path) -> None:
     settings = ["core=7", "coupling=loose", "planner_slot=9", "planner_core=11", "budget.process_ms=1"]
     config = load(small, [*(f"board.lower.{setting}" for setting in settings), "board.lower.budget.plan_ms=2"])
-    tasks = {task.name: task for task in timed_tasks(config, wire(config), budgets(config))}
+    tasks = {task.name: task for task in rack_timing(config, wire(config)).tasks}
     assert {name: task.core for name, task in tasks.items()} == {"lower": 7, "lower.planner": 11}
-    assert tasks["lower.planner"].time_of(Unit.PLAN) == 2_000_000
+    assert tasks["lower.planner"].parts == (Part(Unit.PLAN, 2_000_000),)
     assert (tasks["lower"].period_ns, tasks["lower.planner"].period_ns) == (2_500_000, 10_000_000)

@@ -9,8 +9,7 @@ import pytest
 from rack.boards.config import load, loads
 from rack.boards.errors import ConfigError
 from rack.tools.answer import Failure
-from rack.tools.bench.partition import compare, lines_of
-from rack.tools.bench.partitions import PARTITIONS, Partition
+from rack.tools.bench.partition import PARTITIONS, Partition, compare, lines_of
 from rack.tools.progress import Silent
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores
@@ -62,7 +61,7 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
         assert wave.planner is not None
         assert wave.planner.slice_ms == 10.0
         assert wave.plan_age_ms is not None
-        # A plan is read from the end of its slice on, four cycles behind its release.
+        # A plan is read from the end of its slice on, four cycles after its release.
         assert wave.plan_age_ms["min"] >= 10.0
         assert watch.planner is None
         assert wave.executor.fits is None
@@ -75,7 +74,7 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
 @needs_fifo
 @needs_two_cores
 @pytest.mark.alone
-def test_what_budgets_predict_stands_beside_what_was_measured() -> None:
+def test_predictions_from_budgets_agree_with_measurements() -> None:
     measured = compare("fig3", 0.6, 1, Silent())
     found = {one.partition: one.levels[0] for one in measured}
     tight, loose = found["tight, 2 cores"].planner, found["loose, 2 cores"].planner

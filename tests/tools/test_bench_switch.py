@@ -1,4 +1,4 @@
-"""What a context switch costs: the gap in a planner's time, less the executor's time in it."""
+"""The cost of a context switch: the gap in a planner's time, less the executor's time in it."""
 
 from __future__ import annotations
 
@@ -36,5 +36,5 @@ def test_a_switch_is_measured_with_real_processes_and_nothing_is_left() -> None:
     cost = measure()
     assert 0 < cost.wakes <= WAKES
     assert 0 < cost.switch_us["min"] <= cost.switch_us["p50"] <= cost.switch_us["max"]
-    assert f"{PAPER_US:g}" in cost.text()
+    assert f"{PAPER_US:g}" in "\n".join(cost.lines())
     assert not [name for name in {path.name for path in SHM_FOLDER.iterdir()} - before if "posix_ipc" in name]

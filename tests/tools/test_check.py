@@ -1,21 +1,26 @@
-"""`rack check` as a user runs it: what it shows, what it says would do, and how it ends."""
+"""`rack check` as a user runs it: its tables, the changes that it proposes, and its exit status."""
 
 from __future__ import annotations
 
 import json
 import os
 import subprocess
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from rack.boards.config import budgets, load
-from rack.tools.inventory import Inventory
-from rack.tools.timing.forecast import Forecast
-from rack.tools.timing.trial import Trial
+from rack.levels.timing.forecast import Forecast
+from rack.tools.check import inventory, inventory_lines
+from rack.tools.cli import run_commands
+from rack.tools.timing.judged_config import JudgedConfig
+from rack.tools.timing.tables import forecast_lines
+from tests.conftest import SMALL
 from tests.tools.test_commands import rack
 
+Check = Callable[..., subprocess.CompletedProcess[str]]
 FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
 FAILS = ("--set", "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }")
 ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
@@ -23,59 +28,76 @@ ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
 
 @pytest.fixture(autouse=True)
 def two_cores() -> Iterator[None]:
-    """What is cheapest depends on the cores that there are: let every machine have two."""
+    """Let every machine have two cores: the cheapest change depends on them."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(before)[:2])
     yield
     os.sched_setaffinity(0, before)
 
 
-@pytest.fixture
-def recorded(small: Path, rack_name: str, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run of the small rack."""
-    folder = tmp_path / "run"
-    done = rack("run", small, "--seconds", 1, "--set", f"name={rack_name}", "--out", folder, "--json")
+    folder = tmp_path_factory.mktemp("recorded")
+    (folder / "small.toml").write_text(SMALL)
+    name = f"name=test-check-{os.getpid()}"
+    done = rack("run", folder / "small.toml", "--seconds", 1, "--set", name, "--out", folder / "run", "--json")
     assert done.returncode == 0, done.stderr
-    return folder
+    return folder / "run"
 
 
-def told(done: subprocess.CompletedProcess[str]) -> list[str]:
+@pytest.fixture
+def check(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Check:
+    """Run `rack check` in this process."""
+
+    def ended(*words: object) -> subprocess.CompletedProcess[str]:
+        monkeypatch.setattr(sys, "argv", ["rack", "check", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            run_commands()
+        out, err = capsys.readouterr()
+        return subprocess.CompletedProcess(words, int(end.value.code or 0), out, err)
+
+    return ended
+
+
+def failures(done: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in done.stdout.splitlines() if "FAILS" in line]
 
 
-def test_a_rack_that_fits_ends_with_status_0(small: Path) -> None:
-    done = rack("check", small, *FITS, *ALONE)
-    assert (done.returncode, told(done)) == (0, [])
-    assert "what would do" not in done.stdout
-    assert "for want of a budget (in the config, or --from a run): upper" in done.stdout
+def test_a_rack_that_fits_ends_with_status_0(check: Check, small: Path) -> None:
+    done = check(small, *FITS, *ALONE)
+    assert (done.returncode, failures(done)) == (0, [])
+    assert "to make it fit" not in done.stdout
+    assert "not counted (set one in the config, or use --from RUN): upper" in done.stdout
 
 
-def test_a_rack_that_fails_says_where_and_what_would_do(small: Path) -> None:
-    done = rack("check", small, *FAILS, *ALONE)
+def test_a_rack_that_fails_shows_where_and_which_changes_help(check: Check, small: Path) -> None:
+    done = check(small, *FAILS, *ALONE)
     assert done.returncode == 1
-    assert {line.split()[0] for line in told(done)} == {"3.8", "1", "load:"}
+    assert {line.split()[0] for line in failures(done)} == {"3.8", "1", "load:"}
     assert "  board 'lower': within_cycles 4 -> 7 (a plan every 17.5 ms)" in done.stdout
 
 
-def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
-    done = rack("check", small)
+def test_a_rack_without_budgets_has_nothing_to_fail(check: Check, small: Path) -> None:
+    done = check(small)
     assert done.returncode == 0
-    assert "for want of a budget (in the config, or --from a run): upper, lower" in done.stdout
+    assert "not counted (set one in the config, or use --from RUN): upper, lower" in done.stdout
 
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
     found = load("nasrem")
-    trial = Trial.of(found, budgets(found))
-    lines = [*Inventory.of(found, trial.layout, []).lines(width), *Forecast.of(trial).lines(width)]
-    # Text that is no table is wrapped as it is printed.
+    judged = JudgedConfig.of(found)
+    lines = [*inventory_lines(inventory(found, judged.layout, []), width)]
+    lines += forecast_lines(Forecast.of(judged.timing), width)
+    # Other text is wrapped when it is printed.
     rows = [line for line in lines if "  " in line.strip()]
     assert len(rows) > 50
     assert max(map(len, rows)) <= width
 
 
-def test_json_holds_everything_with_both_sides(small: Path) -> None:
-    done = rack("check", small, *FAILS, *ALONE, "--json")
+def test_json_holds_everything_with_both_sides(check: Check, small: Path) -> None:
+    done = check(small, *FAILS, *ALONE, "--json")
     timing = json.loads(done.stdout)["timing"]
     assert done.returncode == 1
     assert not timing["holds"]
@@ -98,38 +120,38 @@ def test_json_holds_everything_with_both_sides(small: Path) -> None:
     assert timing["repair"]["steps"][0][0]["settings"] == {"within_cycles": 7}
 
 
-def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
-    done = rack("check", small, *FAILS, *ALONE, "--fix")
+def test_a_fixed_config_loads_and_holds(check: Check, small: Path, tmp_path: Path) -> None:
+    done = check(small, *FAILS, *ALONE, "--fix")
     assert done.returncode == 0
     assert "within_cycles 4 -> 7" in done.stderr
     fixed = tmp_path / "fixed.toml"
     fixed.write_text(done.stdout)
     config = load(fixed)
     assert config.board["lower"].within_cycles == 7
-    assert Trial.of(config, budgets(config)).failing == ()
-    assert rack("check", fixed).returncode == 0
+    assert JudgedConfig.of(config).failing == ()
+    assert check(fixed).returncode == 0
 
 
-def test_a_fix_is_json_too(small: Path) -> None:
-    document = json.loads(rack("check", small, *FAILS, *ALONE, "--fix", "--json").stdout)
+def test_a_fix_is_json_too(check: Check, small: Path) -> None:
+    document = json.loads(check(small, *FAILS, *ALONE, "--fix", "--json").stdout)
     assert document["fits"]
     assert "within_cycles = 7" in document["config"]
 
 
-def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
-    done = rack("check", small, "--set", "board.lower.budget.process_ms=100", "--fix")
+def test_where_nothing_helps_no_config_is_printed(check: Check, small: Path) -> None:
+    done = check(small, "--set", "board.lower.budget.process_ms=100", "--fix")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("nothing helps against 3.1 of lower")
+    assert done.stderr.startswith("no change helps with 3.1 of lower")
 
 
-def test_a_rack_that_fits_is_fixed_as_it_is(small: Path) -> None:
-    done = rack("check", small, *FITS, *ALONE, "--fix")
+def test_a_rack_that_fits_is_fixed_as_it_is(check: Check, small: Path) -> None:
+    done = check(small, *FITS, *ALONE, "--fix")
     assert (done.returncode, done.stderr) == (0, "nothing to change\n")
     assert done.stdout == load(small, [*FITS[1:], *ALONE[1::2]]).text()
 
 
-def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
-    done = rack("check", small, "--from", recorded, "--percentile", 90, "--json")
+def test_budgets_come_from_an_earlier_run(check: Check, small: Path, recorded: Path) -> None:
+    done = check(small, "--from", recorded, "--percentile", 90, "--json")
     timing = json.loads(done.stdout)["timing"]
     assert done.returncode == (0 if timing["holds"] else 1)
     levels = {level["board"]: level for level in timing["levels"]}
@@ -139,29 +161,29 @@ def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
     assert levels["upper"]["plan_ns"] is None
 
 
-def test_a_fix_carries_the_measured_budgets(small: Path, recorded: Path, tmp_path: Path) -> None:
+def test_a_fix_carries_the_measured_budgets(check: Check, small: Path, recorded: Path, tmp_path: Path) -> None:
     # A cycle this short leaves the measured planner nothing; whatever helps is judged by what was measured.
-    done = rack("check", small, "--from", recorded, "--percentile", 50, "--fix")
+    done = check(small, "--from", recorded, "--percentile", 50, "--fix")
     assert done.returncode == 0, done.stderr
     fixed = tmp_path / "fixed.toml"
     fixed.write_text(done.stdout)
     assert set(budgets(load(fixed))) == {"upper", "lower"}
-    assert rack("check", fixed).returncode == 0
+    assert check(fixed).returncode == 0
 
 
-def test_a_run_of_another_rack_is_refused_in_one_line(recorded: Path) -> None:
-    done = rack("check", "fig2", "--from", recorded)
+def test_a_run_of_another_rack_is_refused_in_one_line(check: Check, recorded: Path) -> None:
+    done = check("fig2", "--from", recorded)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"{recorded}: a run of other boards: lower, upper; 'fig2' has level\n"
 
 
-def test_a_folder_that_is_no_run_is_refused_in_one_line(small: Path, tmp_path: Path) -> None:
-    done = rack("check", small, "--from", tmp_path)
+def test_a_folder_that_is_no_run_is_refused_in_one_line(check: Check, small: Path, tmp_path: Path) -> None:
+    done = check(small, "--from", tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(small: Path) -> None:
-    done = rack("check", small, "--set", "board.upper.budget.plan_ms=6")
+def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(check: Check, small: Path) -> None:
+    done = check(small, "--set", "board.upper.budget.plan_ms=6")
     assert done.returncode == 2
     assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; leave it out, or name one\n"

@@ -1,6 +1,6 @@
-"""`rack check` of configs that somebody has spoilt: whatever stands in them, it ends in time with 0, 1 or 2.
+"""`rack check` of mutated configs: whatever they contain, it ends in time with exit status 0, 1 or 2.
 
-1 means one thing alone: the config is sound, and its timing does not fit. Anything else is a mistake, a line each.
+1 has one meaning: the config is valid, and its timing does not fit. Everything else is a mistake, one per line.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ KEYS = ("", "x", "every", "rate_hz", "below", "planner", "params", "a.b", "two\n
 
 
 def texts() -> dict[str, dict[str, Any]]:
-    """Every config that is shipped, by itself and resolved, and what is no rack by itself over one that is."""
+    """Every shipped config, as written and resolved; tables that are not a whole rack extend one that is."""
     found = {
         str(path.relative_to(CONFIGS)): tomllib.loads(path.read_text()) for path in sorted(CONFIGS.rglob("*.toml"))
     }
@@ -83,7 +83,7 @@ def at(node: Any, path: tuple[Any, ...]) -> Any:
 
 @st.composite
 def spoilt(draw: st.DrawFn) -> str:
-    """Draw the text of a config with one to three changes that a user, or somebody worse, might make."""
+    """Draw the text of a config with one to three changes that a user, or an attacker, might make."""
     tables = copy.deepcopy(TEXTS[draw(st.sampled_from(sorted(TEXTS)))])
     for _ in range(draw(st.integers(1, 3))):
         ways = list(paths(tables))
@@ -148,7 +148,7 @@ def bounded() -> Iterator[None]:
 
 
 def no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON")
+    raise ValueError(f"{name} is not JSON")
 
 
 def check(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:

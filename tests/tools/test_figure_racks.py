@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.trace import Flag
-from rack.boards.config import budgets, load, wire
+from rack.boards.config import load, rack_timing, wire
 from rack.levels.timing.tasks import Unit
+from rack.levels.timing.verdicts import verdicts
 from rack.tools.charting.measured import Run
 from rack.tools.charting.panel import Panel
 from rack.tools.charting.scheduled import Schedule
-from rack.tools.timing.verdicts import verdicts
 from tests.machine import needs_fifo, needs_two_cores
 from tests.tools.figure_runs import SLOWER, run, slowed, undisturbed, usual, whole
 
@@ -78,7 +78,7 @@ def test_figure_4_with_a_longer_executor_misses_cycles_though_its_planner_is_in_
 def test_what_is_predicted_to_fail_fails_in_the_run_and_nothing_else(name: str, panels: dict[str, Panel]) -> None:
     config = load(name)
     layout = wire(config)
-    predicted = all(verdict.holds for verdict in verdicts(config, layout, budgets(config)))
+    predicted = all(verdict.holds for verdict in verdicts(rack_timing(config, layout)))
     schedule = Schedule(config, layout, {}).panel(0, 1)
     scheduled = not any(count.late for count in schedule.counts.values())
     seen = max(late(panels[name], task) for task in ("level", "level.planner")) < 1 - MOSTLY

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rack.boards.config import load
-from rack.levels.timing.chart import Chart
+from rack.levels.timing.schedule import Chart
 from rack.tools.answer import Failure
 from rack.tools.charting.measured import Run
 from tests.tools.traces import EPOCH_NS, cycle, recorded

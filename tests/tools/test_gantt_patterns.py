@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from rack.levels.timing.chart import Chart, Job, Span
-from rack.levels.timing.schedule import simulate
+from rack.levels.timing.schedule import Chart, Job, Span, simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 from rack.tools.charting.lanes import Lane, lanes_of
 from rack.tools.charting.patterns import Detail, Patterns, patterns

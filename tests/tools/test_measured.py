@@ -10,14 +10,14 @@ import pytest
 
 from rack.backplane.trace import Flag
 from rack.boards.config import RackConfig, load
-from rack.levels.timing.budget import Budget
+from rack.levels.timing.tasks import Budget
 from rack.tools.analysis.cycles import cycles_of
+from rack.tools.analysis.measured_budgets import measured_budgets
 from rack.tools.analysis.occupation import Occupation
 from rack.tools.answer import Failure
 from rack.tools.display import SilentDisplay
 from rack.tools.recording import Recording
 from rack.tools.running import run_rack
-from rack.tools.timing.measured import measured_budgets
 from tests.tools.recordings import MS, Cycle, recorded
 
 PLANNED = int(Flag.PLANNED)

@@ -15,6 +15,7 @@ from rich.console import Console
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import RECORD
 from rack.boards.config import load, loads
+from rack.levels.timing.equations import response_ticks
 from rack.tools.display import SilentDisplay
 from rack.tools.recording import Recording
 from rack.tools.reporting.markdown import markdown, show
@@ -22,7 +23,6 @@ from rack.tools.reporting.report import report_of, write_report
 from rack.tools.reporting.response import system_response
 from rack.tools.reporting.timing import plan_age_ms, task_times
 from rack.tools.running import run_rack
-from rack.tools.timing.prediction import response_ticks
 from tests.boards.told_racks import TOLD, commands
 from tests.conftest import SMALL
 

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from rack.boards.config import RackConfig
-from rack.boards.config.timing import budgets
+from rack.boards.config.timing import rack_timing
+from rack.levels.timing.rack import LevelTiming
 from rack.tools.analysis.breaches import Breach, breaches
 from rack.tools.analysis.comparison import Pair, compare
 from rack.tools.analysis.cycles import Cycles, cycles_of
+from rack.tools.analysis.measured_budgets import WORST, budgets_of
 from rack.tools.analysis.model import Model
 from rack.tools.answer import Failure
 from rack.tools.recording import Recording
-from rack.tools.timing.level_timing import LevelTiming, level_timings
-from rack.tools.timing.measured import WORST, budgets_of
 
 MOSTLY = 99.0
 
@@ -50,8 +50,6 @@ class Analysis:
             raise Failure(f"{recording.folder}: no cycle was traced; there is nothing to analyze", 2)
         told(0.4)
         model = Model.of(config, layout)
-        both = (budgets(config), budgets_of(found, percentile))
-        predicted, measured = ({t.board: t for t in level_timings(config, layout, budget)} for budget in both)
         pairs = tuple(compare(recording, config, found, percentile))
         told(0.7)
         return cls(
@@ -60,8 +58,8 @@ class Analysis:
             model=model,
             percentile=percentile,
             cycles=found,
-            predicted=predicted,
-            measured=measured,
+            predicted=rack_timing(config, layout).levels,
+            measured=rack_timing(config, layout, budgets_of(found, percentile)).levels,
             pairs=pairs,
             mostly=tuple(compare(recording, config, found, min(percentile, MOSTLY))),
             breaches=tuple(breaches(found, model)),

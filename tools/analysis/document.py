@@ -6,6 +6,7 @@ from dataclasses import asdict
 from math import isfinite
 from typing import Any
 
+from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis
 from rack.tools.analysis.breaches import Breach
 from rack.tools.analysis.comparison import Pair
@@ -13,7 +14,6 @@ from rack.tools.analysis.cycles import START_UP_S, restarts
 from rack.tools.analysis.summary import summary
 from rack.tools.analysis.tasks import core_loads, task_document
 from rack.tools.reporting.response import system_response
-from rack.tools.timing.verdict import Verdict
 
 Document = dict[str, Any]
 
@@ -62,7 +62,7 @@ def _pair(pair: Pair) -> Document:
     }
 
 
-def _verdict(verdict: Verdict | None) -> Document | None:
+def _verdict(verdict: EquationVerdict | None) -> Document | None:
     if verdict is None:
         return None
     told = asdict(verdict) | {"margin": verdict.margin}

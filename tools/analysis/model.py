@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.timing import NS_PER_MS, is_critical, tick_ns
-from rack.tools.timing.prediction import hierarchy, longest_cycles
+from rack.boards.config.timing import rack_timing
 
 
 @dataclass(frozen=True)
@@ -32,17 +31,17 @@ class Model:
     @classmethod
     def of(cls, config: RackConfig, layout: Layout) -> Model:
         """Return the model of a config and its layout."""
-        tight = frozenset(name for name, board in config.board.items() if board.coupling == "tight")
+        rack = rack_timing(config, layout)
         return cls(
-            is_lockstep=config.clock.mode == "lockstep",
-            tick_ns=tick_ns(config),
-            cycles={name: layout.task(name).every for name in config.board},
-            longest_cycles=longest_cycles(config),
-            levels=hierarchy(config),
-            tight=tight,
-            critical=frozenset(name for name in tight if is_critical(config, layout, name)),
-            switch_ns=config.timing.context_switch_ms * NS_PER_MS,
-            small_share=config.timing.small_share,
+            is_lockstep=rack.is_lockstep,
+            tick_ns=rack.tick_ns,
+            cycles={name: board.every for name, board in rack.boards.items()},
+            longest_cycles=rack.longest_cycles,
+            levels=rack.hierarchy,
+            tight=frozenset(name for name, board in rack.boards.items() if board.coupling == "tight"),
+            critical=frozenset(name for name, board in rack.boards.items() if board.is_critical),
+            switch_ns=rack.context_switch_ns,
+            small_share=rack.small_share,
         )
 
     def cycle_ns(self, task: TaskSpec) -> int:

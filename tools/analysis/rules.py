@@ -10,6 +10,7 @@ import numpy as np
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.levels.timing.equations import (
+    Relation,
     coupling_may_be_tight,
     executes_in_time,
     fits_cycle,
@@ -18,10 +19,9 @@ from rack.levels.timing.equations import (
     plan_fits_tight,
     residual_is_left,
 )
-from rack.levels.timing.relation import Relation
+from rack.levels.timing.verdicts import LOOSE_PLAN, RESPONSE_TIME
 from rack.tools.analysis.cycles import Cycles
 from rack.tools.analysis.model import Model
-from rack.tools.timing.verdicts import LOOSE_PLAN, RESPONSE_TIME
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from math import ceil
 import numpy as np
 
 from rack.levels.timing.equations import plan_cycles_tight
+from rack.levels.timing.rack import LevelTiming
 from rack.tools.analysis.analysis import Analysis
-from rack.tools.timing.level_timing import LevelTiming
 
 MS = 1e-6
 UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "plan", "U": "update"}

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
+from rack.levels.timing.rack import LevelTiming
+from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis
 from rack.tools.analysis.breaches import Breach, Broken
 from rack.tools.analysis.comparison import Pair
@@ -13,8 +15,6 @@ from rack.tools.analysis.cycles import START_UP_S, Cycles, restarts
 from rack.tools.analysis.summary import summary, worst_words
 from rack.tools.analysis.tasks import task_document
 from rack.tools.text_table import table
-from rack.tools.timing.level_timing import LevelTiming
-from rack.tools.timing.verdict import Verdict
 
 SHOWN = 10
 """Cycles that broke an equation which the text shows; the document has them all."""
@@ -131,13 +131,13 @@ def _pair_row(pair: Pair) -> list[str]:
     ]
 
 
-def _sides(verdict: Verdict | None) -> tuple[str, str]:
+def _sides(verdict: EquationVerdict | None) -> tuple[str, str]:
     if verdict is None:
         return "-", ""
     return _relation(verdict), "ok" if verdict.holds else "FAILS"
 
 
-def _relation(relation: Verdict | Broken) -> str:
+def _relation(relation: EquationVerdict | Broken) -> str:
     return f"{_number(relation.left, relation.unit)} {relation.sign} {_number(relation.right, relation.unit)}"
 
 

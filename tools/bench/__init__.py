@@ -1,1 +1,1 @@
-"""Benchmarks: what the backplane costs on this machine."""
+"""Benchmarks: costs of the backplane, of recording and of partitions on this machine."""

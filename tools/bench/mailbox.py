@@ -1,11 +1,11 @@
-"""What one access to a mailbox costs: a message of 200 bytes, written and read, fields included."""
+"""Measures an access to a mailbox: a message of 200 bytes, written and read, its fields included."""
 
 from __future__ import annotations
 
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,7 @@ SIZES = {"joints": 8}
 
 @dataclass(frozen=True)
 class MailboxCost:
-    """One protocol's cost of an access in us: medians over rounds, and the fastest round."""
+    """Cost of an access by one protocol, us: medians over rounds, and the fastest round."""
 
     protocol: Protocol
     bytes: int
@@ -42,7 +42,7 @@ class MailboxCost:
 
 
 def measure() -> list[MailboxCost]:
-    """Return the cost of every protocol; their rounds are interleaved, for the machine's speed drifts."""
+    """Return the cost of every protocol; rounds are interleaved, as the machine's speed drifts."""
     rack = f"bench-{os.getpid()}"
     layout = _layout(rack)
     segment = Segment.create(layout, "")
@@ -111,7 +111,7 @@ def _us_a_call(call: Callable[[], None]) -> float:
 
 
 def _cost(layout: Layout, protocol: Protocol, rounds: list[tuple[float, float]]) -> MailboxCost:
-    # A read of an old message copies nothing: a read is what a pair of both takes beyond the write.
+    # Reading an old message again copies nothing: so a read is the time of a write and a read, less a write.
     writes, pairs = zip(*rounds, strict=True)
     write_us, best_us = statistics.median(writes), min(writes)
     return MailboxCost(
@@ -122,3 +122,12 @@ def _cost(layout: Layout, protocol: Protocol, rounds: list[tuple[float, float]])
         write_best_us=round(best_us, 3),
         read_best_us=round(min(pairs) - best_us, 3),
     )
+
+
+def lines_of(costs: Sequence[MailboxCost]) -> Iterator[str]:
+    """Yield the figures as text for people."""
+    yield f"mailbox: {costs[0].bytes} bytes, field access to numpy views included; us a call, median (best)"
+    for cost in costs:
+        write = f"{cost.write_us:.2f} ({cost.write_best_us:.2f})"
+        read = f"{cost.read_us:.2f} ({cost.read_best_us:.2f})"
+        yield f"  {cost.protocol:14} write {write:14} read {read}"

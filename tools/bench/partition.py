@@ -1,4 +1,4 @@
-"""What a partition of levels over processors costs: the same rack, run in real time in each, rounds interleaved."""
+"""Compares partitions of levels over processors: the same rack, run in real time in each, rounds interleaved."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
-from rack.boards.config import RackConfig, budgets, load, timed_tasks, wire
+from rack.boards.config import RackConfig, load, loads, rack_timing, wire
+from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.levels.timing.response_time import response_times
-from rack.tools.bench.partitions import PARTITIONS, Partition
+from rack.tools.answer import Failure
 from rack.tools.display import display_for
 from rack.tools.progress import Progress
 from rack.tools.recording import Recording
@@ -22,20 +23,60 @@ from rack.tools.reporting.statistics import Distribution, distribution
 from rack.tools.reporting.timing import plan_ages_ms
 from rack.tools.running import run_rack
 from rack.tools.text_table import table
-from rack.tools.timing.verdicts import context_switch_ns
 
 LAUNCH_S = 3.0
-"""About what launching and recording a run take besides its time."""
+"""About how long launching and recording a run take in addition to its time."""
 PLANNERS_DROPPED = ("plans", "median left", "median age")
-"""Columns that a narrow terminal does without, the first first."""
+"""Columns that a narrow terminal leaves out, in this order."""
+
+
+@dataclass(frozen=True)
+class Partition:
+    """One way of placing levels on processors. A board keeps its core, modulo `cores`."""
+
+    coupling: Coupling
+    cores: int
+
+    @property
+    def name(self) -> str:
+        """The partition, in words."""
+        return f"{self.coupling}, {self.cores} core{'s' if self.cores > 1 else ''}"
+
+    def of(self, config: RackConfig) -> RackConfig:
+        """Return the rack in this partition, in real time. Raises `ConfigError` if the rack does not permit it.
+
+        A loose planner gets its own board on the next core; with only one core, on the same one.
+        """
+        taken = {board.slot for board in config.board.values()}
+        free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
+        boards = {name: self._board(board, free) for name, board in config.board.items()}
+        clock = config.clock.model_copy(update={"mode": "realtime", "core": config.clock.core % self.cores})
+        changed = config.model_copy(update={"board": boards, "clock": clock})
+        # Copying validates nothing: only the loader finds mistakes.
+        return loads(changed.text())
+
+    def _board(self, board: BoardConfig, free: Iterator[int]) -> BoardConfig:
+        core = board.core % self.cores
+        changes: dict[str, object] = {"core": core, "planner_slot": None, "planner_core": None}
+        if board.planner is not None:
+            changes["coupling"] = self.coupling
+        if board.planner is not None and self.coupling == "loose":
+            slot = next(free, None)
+            if slot is None:
+                raise Failure(f"the crate has no slot left for every planner: slots go up to {LAST_SLOT}")
+            changes |= {"planner_slot": slot, "planner_core": (core + 1) % self.cores}
+        return board.model_copy(update=changes)
+
+
+PARTITIONS: tuple[Partition, ...] = tuple(Partition(c, n) for n in (1, 2) for c in ("tight", "loose"))
 
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """One task over all runs of a partition: cycles (plans, of a planner), misses, what was left of its time slice.
+    """One task over all runs of a partition: cycles (a planner's plans), misses, and the rest of its time slice.
 
-    `predicted_ms` is the worst-case response time by the config's budgets, None without a bound; `fits` whether it is
-    within the time slice, None where the config has no budget.
+    `predicted_ms` is the worst-case response time by the config's budgets, None without a bound. `fits` says whether it
+    is within the time slice, None without a budget.
     """
 
     slice_ms: float
@@ -49,7 +90,7 @@ class TaskFigures:
 
 @dataclass(frozen=True)
 class LevelFigures:
-    """One level in one partition. `plan_age_ms` is how old the plans were that its executor could read."""
+    """One level in one partition. `plan_age_ms` is the age of the plans that its executor could read."""
 
     level: str
     executor: TaskFigures
@@ -59,14 +100,14 @@ class LevelFigures:
 
 @dataclass(frozen=True)
 class PartitionFigures:
-    """One partition, measured."""
+    """The measurements of one partition."""
 
     partition: str
     levels: tuple[LevelFigures, ...]
 
 
 def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[PartitionFigures]:
-    """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return what was measured."""
+    """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return the figures."""
     config = load(name, [f"name=bench-{os.getpid()}"])
     racks = {partition: partition.of(config) for partition in PARTITIONS}
     progress.total(len(racks) * rounds * (seconds + LAUNCH_S))
@@ -88,8 +129,8 @@ def _run(config: RackConfig, seconds: float, folder: Path) -> Recording:
 
 def _figures(partition: Partition, config: RackConfig, runs: Sequence[Recording]) -> PartitionFigures:
     layout = wire(config)
-    tasks = timed_tasks(config, layout, budgets(config))
-    responses = response_times(tasks, context_switch_ns(config))
+    rack = rack_timing(config, layout)
+    responses = response_times(rack.tasks, rack.context_switch_ns)
     return PartitionFigures(partition.name, tuple(_level(name, layout, responses, runs) for name in config.board))
 
 
@@ -113,7 +154,7 @@ def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarra
 def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> TaskFigures:
     cycles = np.concatenate([run.cycles.get(task.name, run.no_cycles) for run in runs])
     if task.role == "planner":
-        # Not the releases that went by without a plan, which are traced when they came late.
+        # Releases without a plan do not count; they are traced only if they were late.
         skipped, cycles = cycles, cycles[(cycles["flags"] & Flag.PLANNED) > 0]
     else:
         skipped = cycles
@@ -132,14 +173,14 @@ def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], run
 
 
 def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Iterator[str]:
-    """Yield two tables for people, into `width`: executors, and planners with the ages of their plans; times in ms."""
+    """Yield two tables for people, fitted to `width`: executors, and planners with their plan ages; times in ms."""
     levels = [(one.partition, level) for one in found for level in one.levels]
     planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
-    yield "executors: the worst response predicted, and what was left of the cycle, ms"
+    yield "executors: predicted worst response, and time left of the cycle, ms"
     head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "median left", "worst"]
     yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "median left"))
     yield ""
-    yield "planners: the same of a plan's time slice, and how old plans were when read, ms"
+    yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
     head = ["partition", "level", "slice", "predicted", "plans", "late", "median left", "worst", "median age", "oldest"]
     yield from table(head, planned, width, PLANNERS_DROPPED)
 
@@ -158,7 +199,7 @@ def _planner_row(partition: str, level: LevelFigures) -> list[str]:
 
 
 def _prediction(task: TaskFigures) -> list[str]:
-    """Return the time slice, and what is predicted to be needed of it."""
+    """Return the time slice, and the predicted response."""
     if task.fits is None:
         return [f"{task.slice_ms:g}", "-"]
     response = "no bound" if task.predicted_ms is None else f"{task.predicted_ms:.2f}"

@@ -1,17 +1,19 @@
-"""What recording costs the boards: misses and lateness without, with a recorder, and with a live viewer, in one run."""
+"""Measures what recording costs the boards: misses and lateness without a recorder, with it, and with a live viewer."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from rack.backplane.process import processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, trace_ring
 from rack.boards.config import RackConfig, load
@@ -19,21 +21,21 @@ from rack.boards.rack import Rack
 from rack.tools.answer import Failure
 from rack.tools.recorder.process import RecorderProcess
 from rack.tools.reporting.statistics import Distribution, distribution
+from rack.tools.text_table import table
 from rack.tools.viewer.window import Window, free_port, url
 
 PHASES = ("without", "recording", "live viewer")
 PHASE_S = 6.0
 SETTLE_S = 1.0
-"""A recorder has attached, a viewer is about to draw: what starting them costs is not what is asked."""
+"""Time for a recorder to attach and a viewer to draw: the cost of starting them is not measured."""
 ROUNDS = 3
-CLOCK_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True)
 class RecordingCost:
-    """All rounds of one phase: cycles of all tasks, what was missed, lateness of the fastest task in ms.
+    """All rounds of one phase: cycles, misses and skips of all tasks, lateness of the fastest task in ms.
 
-    `recorder_percent` is the recorder's part of one core; 0 without one.
+    `recorder_percent` is the recorder's share of one core; 0 without one.
     """
 
     phase: str
@@ -41,6 +43,14 @@ class RecordingCost:
     missed: int
     skipped: int
     lateness_ms: Distribution | None
+    recorder_percent: float
+
+
+class _Sample(NamedTuple):
+    """One round of one phase; `flags` and `lateness_ms` are of shape (cycles,)."""
+
+    flags: np.ndarray
+    lateness_ms: np.ndarray
     recorder_percent: float
 
 
@@ -60,12 +70,12 @@ class Meter:
 
 
 def measure(name: str) -> list[RecordingCost]:
-    """Return the cost on the rack of a config; phases are interleaved, for the machine's speed drifts.
+    """Return the cost on the rack of a config; phases are interleaved, as the machine's speed drifts.
 
-    Raises `Failure` when the rack ends early or a recorder cannot attach.
+    Raises `Failure` if the rack ends early or a recorder cannot attach.
     """
     config = _endless(load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"]))
-    found: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {phase: [] for phase in PHASES}
+    found: dict[str, list[_Sample]] = {phase: [] for phase in PHASES}
     with tempfile.TemporaryDirectory() as folder, Rack(config) as rack:
         rack.start()
         meter = Meter(rack.segment)
@@ -75,14 +85,14 @@ def measure(name: str) -> list[RecordingCost]:
                 with _recorder(rack, phase, Path(folder) / f"{phase}-{turn}") as pid:
                     _watch(rack, SETTLE_S)
                     meter.read()
-                    cpu_s, began = _cpu_s(pid), time.monotonic()
-                    readings = [_reading(rack, meter) for _ in range(round(PHASE_S))]
-                    share = 100.0 * (_cpu_s(pid) - cpu_s) / (time.monotonic() - began)
-                    found[phase] += [(flags, lateness, share) for flags, lateness in readings]
+                    used_ns, began_ns = _processor_ns(pid), time.monotonic_ns()
+                    flags, lateness = zip(*(_reading(rack, meter) for _ in range(round(PHASE_S))), strict=True)
+                    share = 100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
+                    found[phase].append(_Sample(np.concatenate(flags), np.concatenate(lateness), share))
         rack.stop("measured")
         while rack.watch(0.5):
             continue
-    return [_cost(phase, taken) for phase, taken in found.items()]
+    return [_cost(phase, samples) for phase, samples in found.items()]
 
 
 def _endless(config: RackConfig) -> RackConfig:
@@ -98,7 +108,7 @@ def _reading(rack: Rack, meter: Meter) -> tuple[np.ndarray, np.ndarray]:
 
 @contextmanager
 def _recorder(rack: Rack, phase: str, folder: Path) -> Iterator[int | None]:
-    """Record while the context lasts, unless the phase is without; give the recorder's process id."""
+    """Record while the context lasts, unless the phase is without; yield the recorder's process id."""
     if phase == PHASES[0]:
         yield None
         return
@@ -120,24 +130,34 @@ def _watch(rack: Rack, seconds: float) -> None:
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0:
         if not rack.watch(left):
-            raise Failure(f"the rack ended while it was measured: {rack.outcome}")
+            raise Failure(f"the rack ended during the measurement: {rack.outcome}")
 
 
-def _cpu_s(pid: int | None) -> float:
-    """Return the processor time that a process has had, in s."""
-    if pid is None:
-        return 0.0
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * CLOCK_TICK_S
+def _processor_ns(pid: int | None) -> int:
+    return 0 if pid is None else processor_ns(pid)
 
 
-def _cost(phase: str, taken: list[tuple[np.ndarray, np.ndarray, float]]) -> RecordingCost:
-    flags, lateness = (np.concatenate(column) for column in list(zip(*taken, strict=True))[:2])
+def _cost(phase: str, samples: Sequence[_Sample]) -> RecordingCost:
+    flags = np.concatenate([sample.flags for sample in samples])
     return RecordingCost(
         phase=phase,
         cycles=len(flags),
         missed=int(np.count_nonzero(flags & Flag.MISSED)),
         skipped=int(np.count_nonzero(flags & Flag.SKIPPED)),
-        lateness_ms=distribution(lateness),
-        recorder_percent=round(float(np.mean([share for _, _, share in taken])), 2),
+        lateness_ms=distribution(np.concatenate([sample.lateness_ms for sample in samples])),
+        recorder_percent=round(float(np.mean([sample.recorder_percent for sample in samples])), 2),
     )
+
+
+def lines_of(costs: Sequence[RecordingCost], width: int | None = None) -> Iterator[str]:
+    """Yield a table for people, fitted to `width`."""
+    head = ["phase", "cycles", "missed", "skipped", "late p50, ms", "p99", "p99.9", "max", "recorder, % of a core"]
+    rows = [
+        [
+            *(cost.phase, str(cost.cycles), str(cost.missed), str(cost.skipped)),
+            *(f"{cost.lateness_ms[name]:.3f}" if cost.lateness_ms else "-" for name in ("p50", "p99", "p99_9", "max")),
+            f"{cost.recorder_percent:.1f}",
+        ]
+        for cost in costs
+    ]
+    yield from table(head, rows, width, ("cycles", "p99.9", "late p50, ms"))

@@ -1,7 +1,7 @@
 """The context switch t_cs of eqs 3.8 and 3.9: an executor wakes up while its planner computes on the same core.
 
-The planner looks at the time without pause until there is a gap in it; the executor keeps when it was awake. What the
-gap is longer than that are the two switches.
+The planner reads the clock in a loop until it sees a gap; the executor notes when it was awake. The gap without the
+executor's time is the two switches.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Barrier
 from threading import BrokenBarrierError
 from time import monotonic_ns
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import posix_ipc
@@ -28,11 +28,11 @@ from rack.tools.answer import Failure
 from rack.tools.reporting.statistics import Distribution, distribution
 
 PAPER_US = 100.0
-"""Task switching of NIST's boards (NISTIR 90-4251, section 4)."""
+"""Task switch on NIST's boards (NISTIR 90-4251, section 4)."""
 WAKES = 1000
 PERIOD_S, HEAD_START_S = 0.002, 0.0005
 EXECUTOR, PLANNER = 80, 1
-"""SCHED_FIFO priorities: nobody of ordinary scheduling comes between the two."""
+"""SCHED_FIFO priorities: no task under ordinary scheduling runs between the two."""
 PATIENCE_NS = 20_000_000
 READY_S = 20.0
 
@@ -51,37 +51,45 @@ class SwitchCost:
     switch_us: Distribution
     paper_us: float = PAPER_US
 
-    def text(self) -> str:
-        """Return the figures for people."""
-        rows = (("planner to executor", self.in_us), ("executor to planner", self.out_us), ("t_cs", self.switch_us))
-        lines = [f"context switch on core {self.core}, us; {self.wakes} times an executor came before its planner"]
-        for name, found in rows:
-            lines.append(f"  {name:20} p50 {found['p50']:6.1f}   p99 {found['p99']:6.1f}   max {found['max']:8.1f}")
-        lines.append(f"  the paper's boards   {self.paper_us:g}")
-        lines.append(f"for a config: timing.context_switch_ms = {ceil(self.switch_us['p99']) * 1e-3:.3f}")
-        return "\n".join(lines)
+    def lines(self) -> Iterator[str]:
+        """Yield the figures as text for people."""
+        yield f"context switch on core {self.core}, us; an executor preempted its planner {self.wakes} times"
+        rows = {"planner to executor": self.in_us, "executor to planner": self.out_us, "t_cs": self.switch_us}
+        for name, found in rows.items():
+            yield f"  {name:20} p50 {found['p50']:6.1f}   p99 {found['p99']:6.1f}   max {found['max']:8.1f}"
+        yield f"  the paper's boards   {self.paper_us:g}"
+        yield f"for a config: timing.context_switch_ms = {ceil(self.switch_us['p99']) * 1e-3:.3f}"
 
 
 def measure() -> SwitchCost:
-    """Measure on the last core of this machine, woken from another. Raises `Failure` where that cannot be had."""
+    """Measure on the last core of this machine, woken from another. Raises `Failure` if the machine has one core."""
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
-        raise Failure("a context switch is measured on one core and asked for on another: this machine has one")
+        raise Failure("measuring a context switch needs two cores: this machine has one")
     return cost_of(cores[-1], *_run(cores[-1], cores[0]))
 
 
+class _Shared(NamedTuple):
+    """Shared by both processes. `gaps` and `awake` hold two times per wake-up, ns; `ready` 1 or -1 for each process."""
+
+    parent: int
+    core: int
+    gaps: Any
+    awake: Any
+    ready: Any
+    start: Barrier
+
+
 def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
-    """Let both processes run; return the planner's gaps and the executor's times awake, shape (n, 2), ns."""
+    """Run both processes; return the planner's gaps and the executor's times awake, shape (n, 2), ns."""
     spawn = multiprocessing.get_context("spawn")
     gaps, awake, ready = (spawn.RawArray("q", size) for size in (2 * WAKES, 2 * WAKES, 2))
-    start = spawn.Barrier(3)
+    shared = _Shared(os.getpid(), core, gaps, awake, ready, spawn.Barrier(3))
     with _semaphore() as wake, _semaphore() as work:
-        executor = spawn.Process(target=_execute, args=(os.getpid(), core, wake.name, awake, ready, start), daemon=True)
-        planner = spawn.Process(
-            target=_plan, args=(os.getpid(), core, work.name, gaps, awake, ready, start), daemon=True
-        )
+        executor = spawn.Process(target=_execute, args=(wake.name, shared), daemon=True)
+        planner = spawn.Process(target=_plan, args=(work.name, shared), daemon=True)
         with _alive(executor, planner), _pinned(other):
-            _await(start, ready)
+            _await(shared)
             for _ in range(WAKES):
                 work.release()
                 time.sleep(HEAD_START_S)
@@ -92,32 +100,24 @@ def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(gaps).reshape(-1, 2), np.array(awake).reshape(-1, 2)
 
 
-def _execute(parent: int, core: int, wake: str, awake: Any, ready: Any, start: Barrier) -> None:
-    """Wake up and wait again: an executor that has nothing to do."""
-    die_with_parent(parent)
-    pin(core)
-    semaphore = posix_ipc.Semaphore(wake)
-    ready[0] = 1 if set_priority(EXECUTOR) else -1
-    start.wait(READY_S)
+def _execute(wake: str, shared: _Shared) -> None:
+    """Wake up and wait again: an executor with nothing to do."""
+    semaphore, awake = _begin(wake, shared, 0, EXECUTOR), shared.awake
     for at in range(WAKES):
         semaphore.acquire()
         awake[2 * at] = monotonic_ns()
         awake[2 * at + 1] = monotonic_ns()
 
 
-def _plan(parent: int, core: int, work: str, gaps: Any, awake: Any, ready: Any, start: Barrier) -> None:
-    """Compute when there is work, until the executor has come between; keep the longest gap."""
-    die_with_parent(parent)
-    pin(core)
-    semaphore = posix_ipc.Semaphore(work)
-    ready[1] = 1 if set_priority(PLANNER) else -1
-    start.wait(READY_S)
+def _plan(work: str, shared: _Shared) -> None:
+    """Compute when there is work, until the executor has interrupted; keep the longest gap."""
+    semaphore, gaps, awake = _begin(work, shared, 1, PLANNER), shared.gaps, shared.awake
     for at in range(WAKES):
         semaphore.acquire()
         begin = last = monotonic_ns()
         longest, over, seen = 0, 2 * at + 1, 0
         while not seen and last - begin < PATIENCE_NS:
-            # Before the time: wherever in this loop the executor comes, the next look at the time shows it.
+            # Read before the clock: wherever in this loop the executor interrupts, the next clock value shows it.
             seen = awake[over]
             now = monotonic_ns()
             if now - last > longest:
@@ -125,6 +125,16 @@ def _plan(parent: int, core: int, work: str, gaps: Any, awake: Any, ready: Any, 
                 gaps[2 * at], gaps[over] = last, now
                 now = monotonic_ns()
             last = now
+
+
+def _begin(semaphore: str, shared: _Shared, number: int, priority: int) -> posix_ipc.Semaphore:
+    """Pin this process, set its priority, and wait for the other one; return its semaphore."""
+    die_with_parent(shared.parent)
+    pin(shared.core)
+    found = posix_ipc.Semaphore(semaphore)
+    shared.ready[number] = 1 if set_priority(priority) else -1
+    shared.start.wait(READY_S)
+    return found
 
 
 @contextmanager
@@ -150,7 +160,7 @@ def _alive(*processes: BaseProcess) -> Iterator[None]:
 
 @contextmanager
 def _pinned(core: int) -> Iterator[None]:
-    """Keep the calling process off the core that is measured."""
+    """Keep the calling process off the measured core."""
     cores = os.sched_getaffinity(0)
     pin(core)
     try:
@@ -159,21 +169,21 @@ def _pinned(core: int) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _await(start: Barrier, ready: Any) -> None:
-    """Wait until both are at work: they import for a moment."""
+def _await(shared: _Shared) -> None:
+    """Wait until both run: importing takes a moment."""
     try:
-        start.wait(READY_S)
+        shared.start.wait(READY_S)
     except BrokenBarrierError:
         raise Failure("a process of the measurement did not start") from None
-    if min(ready) < 0:
-        raise Failure("SCHED_FIFO is refused: an executor cannot come before its planner at once")
+    if min(shared.ready) < 0:
+        raise Failure("SCHED_FIFO is refused: an executor cannot preempt its planner")
 
 
 def cost_of(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
-    """Keep the wake-ups that fell into the planner's time: with the gap around the executor's."""
+    """Return the cost over the wake-ups that interrupted the planner. Raises `Failure` if none did."""
     found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
     if not found.any():
-        raise Failure("no wake-up fell into the planner's time: the machine is too busy to measure")
+        raise Failure("no wake-up interrupted the planner: the machine is too busy to measure")
     into, back = (awake - gaps)[found, 0] * 1e-3, (gaps - awake)[found, 1] * 1e-3
     in_us, out_us, switch_us = (distribution(times) or {} for times in (into, back, (into + back) / 2))
     return SwitchCost(core, int(found.sum()), in_us, out_us, switch_us)

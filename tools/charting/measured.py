@@ -11,10 +11,9 @@ from itertools import pairwise
 import numpy as np
 
 from rack.backplane.trace import FIELDS, SKIPPED_SHIFT, Flag
-from rack.boards.config import RackConfig, timed_tasks
-from rack.levels.timing.budget import Budget
-from rack.levels.timing.chart import Chart, Job, Span
-from rack.levels.timing.tasks import TimedTask, Unit
+from rack.boards.config import RackConfig, rack_timing
+from rack.levels.timing.schedule import Chart, Job, Span
+from rack.levels.timing.tasks import Budget, TimedTask, Unit
 from rack.tools.answer import Failure
 from rack.tools.charting.lanes import Lane, lanes_of
 from rack.tools.charting.panel import Count, Panel
@@ -47,7 +46,7 @@ class Run:
             raise Failure(f"{recording.folder}: recorded by an earlier rack, its trace has no {', '.join(missing)}", 2)
         self.config: RackConfig = recording.rack_config
         layout = recording.layout
-        known = timed_tasks(self.config, layout, dict.fromkeys(self.config.board, Budget()))
+        known = rack_timing(self.config, layout, dict.fromkeys(self.config.board, Budget())).tasks
         # Cores as the run obtained them; of the clock there is no trace.
         self.tasks = tuple(replace(t, core=layout.task(t.name).core) for t in known if t.role != "clock")
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rack.levels.timing.chart import Chart, Job
+from rack.levels.timing.schedule import Chart, Job
 from rack.tools.charting.lanes import Lane
 from rack.tools.charting.patterns import Patterns
 

@@ -9,7 +9,7 @@ from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
 
-from rack.levels.timing.chart import Chart, Span
+from rack.levels.timing.schedule import Chart, Span
 from rack.levels.timing.tasks import Unit
 from rack.tools.charting.lanes import Lane
 

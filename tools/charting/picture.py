@@ -19,7 +19,7 @@ from rack.tools.charting.text import step_for
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from rack.levels.timing.chart import Chart, Job
+    from rack.levels.timing.schedule import Chart, Job
     from rack.tools.charting.lanes import Lane
 
 COLOURS = {

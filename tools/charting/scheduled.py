@@ -7,9 +7,8 @@ from dataclasses import replace
 from math import lcm
 
 from rack.backplane.layout import Layout
-from rack.boards.config import RackConfig, budgets, timed_tasks
-from rack.levels.timing.chart import Chart
-from rack.levels.timing.schedule import simulate
+from rack.boards.config import RackConfig, rack_timing
+from rack.levels.timing.schedule import Chart, simulate
 from rack.levels.timing.tasks import Part, Unit
 from rack.tools.answer import Failure
 from rack.tools.charting.lanes import lanes_of
@@ -30,7 +29,7 @@ class Schedule:
     """
 
     def __init__(self, config: RackConfig, layout: Layout, process_ns: Mapping[str, Sequence[int]]) -> None:
-        self.tasks = timed_tasks(config, layout, budgets(config))
+        self.tasks = rack_timing(config, layout).tasks
         self.switch_ns = round(config.timing.context_switch_ms * 1e6)
         self._variants = {name: self._variant(name, times) for name, times in process_ns.items()}
 

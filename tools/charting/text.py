@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from itertools import groupby
 
-from rack.levels.timing.chart import Chart, Job, Span
+from rack.levels.timing.schedule import Chart, Job, Span
 from rack.tools.charting.lanes import Lane
 from rack.tools.charting.panel import NS_PER_MS, Panel
 from rack.tools.charting.patterns import IDLE

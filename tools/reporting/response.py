@@ -14,9 +14,10 @@ import numpy as np
 from rack.backplane.layout import Layout
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config.schema import RackConfig
+from rack.boards.config.timing import rack_timing
+from rack.levels.timing.system_response import predict
 from rack.tools.recording import Recording
 from rack.tools.reporting.statistics import distribution
-from rack.tools.timing.prediction import hierarchy, predict
 
 LOSSES = ("died", "hang")
 """Codes of events that say that a board was lost."""
@@ -28,10 +29,10 @@ def system_response(recording: Recording, config: RackConfig, layout: Layout) ->
     `beyond` are the responses longer than their bound, each with what the run shows to have delayed it; `unseen`
     counts those that cannot be measured because the recording lacks messages.
     """
-    levels = list(hierarchy(config))
+    predicted = predict(rack_timing(config, layout))
+    levels = list(predicted.levels)
     if len(levels) < 2:
         return None
-    predicted = predict(config, layout)
     return {
         "levels": levels,
         "bound_eq_3_2_ms": predicted.bound_eq_3_2_ms,

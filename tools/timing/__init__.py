@@ -1,1 +1,1 @@
-"""The timing model of one rack: predicted from budgets, measured in a run."""
+"""The timing model applied to configs and recordings: changes that make a rack fit, and the response to an operator."""

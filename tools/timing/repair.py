@@ -1,39 +1,61 @@
-"""One change after another until a rack fits its cycles, or until nothing helps any more."""
+"""Changes that make a rack fit its cycles: of every kind the smallest, each tried on the whole rack.
+
+The paper names two kinds: another processor for the planner, and a longer response time (sections 3.2 and 3.3).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
-from rack.tools.timing.change import Change
-from rack.tools.timing.changes import LONGEST, changes_for
-from rack.tools.timing.trial import Trial
-from rack.tools.timing.verdict import Verdict
+from rack.backplane.layout import Protocol
+from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
+from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.verdicts import EquationVerdict
+from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
+
+MAX_CYCLES = 10_000
+"""Largest permitted `within_cycles`."""
+MAX_FACTOR = 16
+"""Cycles and plan ages are tried up to this many times as long: beyond, it would be another level."""
+MAX_CYCLES_TRIED = 400
+"""Longer cycles tried for one board; for a long cycle not every tick."""
+MAX_OTHERS = 3
+"""Other boards on the same core that changes are tried on, those with the highest load."""
+HIGHEST = 99
+"""SCHED_FIFO's highest priority."""
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
 class Repair:
-    """What makes a rack fit. `steps` have each the changes for a board, cheapest first, which the next one rests on."""
+    """The changes that make a rack fit. Each step holds the changes for one board, cheapest first.
+
+    The next step builds on the first change of the step before it.
+    """
 
     steps: tuple[tuple[Change, ...], ...]
-    end: Trial
+    end: JudgedConfig
 
     @property
-    def left(self) -> tuple[Verdict, ...]:
-        """What still fails behind the last step."""
+    def left(self) -> tuple[EquationVerdict, ...]:
+        """The failures that remain after the last step."""
         return self.end.failing
 
     def lines(self) -> list[str]:
-        """Return every step as text, a line a change, and what they leave."""
+        """Return every step as text, a line per change, and the failures that remain."""
         found: list[str] = []
         for changes in self.steps:
-            start = "with the first of those, then" if found else "what would do"
-            found.append(f"{start}{', any one of them, the cheapest first' if len(changes) > 1 else ''}:")
+            start = "then, with the first of these" if found else "to make it fit"
+            found.append(f"{start}{', one of these, cheapest first' if len(changes) > 1 else ''}:")
             found += [f"  {change.text}" for change in changes]
         if self.left:
             failing = ", ".join(dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left))
-            tried = f"other priorities and cores, plans and cycles up to {LONGEST} times as long, others' cycles too"
-            found.append(f"nothing helps against {failing}; tried: {tried}")
+            tried = f"other priorities and cores, cycles and plans up to {MAX_FACTOR} times as long, also of others"
+            found.append(f"no change helps with {failing}; tried: {tried}")
         return found
 
     def document(self) -> dict[str, Any]:
@@ -44,22 +66,188 @@ class Repair:
         }
 
 
-def repair(trial: Trial) -> Repair:
-    """Return the changes that make a rack fit: the cheapest for one board, then with it those for the next one."""
+def repair(rack: JudgedConfig) -> Repair:
+    """Return the changes that make a rack fit: for one board, then, with the cheapest of them, for the next."""
     steps: list[tuple[Change, ...]] = []
-    while trial.failing:
-        found = next((changes for board in _ailing(trial) if (changes := changes_for(trial, board))), None)
+    while rack.failing:
+        found = next((changes for board in _failing_boards(rack) if (changes := changes_for(rack, board))), None)
         if found is None:
             break
         steps.append(tuple(found))
-        trial = found[0].after
-    return Repair(tuple(steps), trial)
+        rack = found[0].after
+    return Repair(tuple(steps), rack)
 
 
-def _ailing(trial: Trial) -> list[str]:
-    """Return the boards of which something fails, those first that others wait for."""
-    boards = trial.config.board
-    failing = [name for name in boards if name in trial.budgets and trial.failing_of(name)]
-    own = {verdict.subject.partition(".")[0] for verdict in trial.failing}
-    # An overloaded core concerns all its boards; who is late on it is asked first.
-    return sorted(failing, key=lambda name: (name not in own, -boards[name].priority))
+def _failing_boards(rack: JudgedConfig) -> list[str]:
+    """Return the boards with failures, those first that others wait for."""
+    failing = [name for name in rack.timing.levels if rack.failing_of(name)]
+    own = {verdict.subject.partition(".")[0] for verdict in rack.failing}
+    # An overloaded core concerns all its boards; those with failures of their own come first.
+    return sorted(failing, key=lambda name: (name not in own, -rack.config.board[name].priority))
+
+
+def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
+    """Return the changes that make a board fit, sorted by `Change.cost`: the smallest of each kind.
+
+    Another priority, or a core already in use, costs nothing. Next come a slot and a new core, then older plans and
+    longer cycles, of the board or of one that shares its core, by their factor. If none of these helps alone, moving
+    the planner and lengthening the cycle together may.
+    """
+    kinds = (_other_priority, _board_elsewhere, _planner_elsewhere, _more_cycles, _longer_cycle)
+    found = [change for kind in kinds if (change := kind(rack, board)) is not None]
+    found += _changes_of_others(rack, board)
+    found = found or [change for change in [_elsewhere_and_longer(rack, board)] if change is not None]
+    return sorted(found, key=lambda change: change.cost)
+
+
+def _other_priority(rack: JudgedConfig, board: str) -> Change | None:
+    """Put the board's executor, or its planner, above another task on its core; the smallest rise that helps."""
+    table, limit = rack.config.board[board], rack.config.clock.priority or HIGHEST + 1
+    tried: list[Settings] = []
+    for key, task in (("priority", board), ("planner_priority", f"{board}.planner")):
+        core, own = rack.timing.cores.get(task), getattr(table, key)
+        above = {other.priority + 1 for other in rack.timing.tasks if other.core == core and other.name != task}
+        tried += [{key: priority} for priority in sorted(above) if own < priority < limit]
+    return _any(rack, board, tried)
+
+
+def _changes_of_others(rack: JudgedConfig, board: str) -> list[Change]:
+    """Return the cheapest change of each board that shares a core with this one: another core, or a longer cycle."""
+    timing = rack.timing
+    cores, loads = timing.cores_of(board), {task.board: 0.0 for task in timing.tasks}
+    for task in timing.tasks:
+        loads[task.board] += task.cost_ns / task.period_ns if task.core in cores else 0.0
+    others = [name for name in timing.boards if loads.get(name) and name != board]
+    found = []
+    for other in sorted(others, key=lambda name: -loads[name])[:MAX_OTHERS]:
+        changes = (_task_elsewhere(rack, other, board), _longer_cycle(rack, other, cures=board))
+        found += sorted((change for change in changes if change is not None), key=lambda change: change.cost)[:1]
+    return found
+
+
+def _more_cycles(rack: JudgedConfig, board: str) -> Change | None:
+    level = rack.timing.level(board)
+    if level.within_cycles is None:
+        return None
+    return _first(rack, board, [{"within_cycles": d} for d in _cycles(level, level.within_cycles + 1)])
+
+
+def _planner_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
+    """Couple a planner loosely, or move a loose one to another core; if that is not enough, with more cycles."""
+    level, places = rack.timing.level(board), list(_places(rack, board))
+    if (change := _any(rack, board, places)) is not None:
+        return change
+    older = _cycles(level, (level.within_cycles or 0) + 1)
+    found = [_first(rack, board, [{**place, "within_cycles": d} for d in older]) for place in places]
+    return min((change for change in found if change is not None), key=lambda change: change.cost, default=None)
+
+
+def _board_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
+    return _any(rack, board, ({"core": core} for core in _other_cores(rack, rack.config.board[board].core)))
+
+
+def _task_elsewhere(rack: JudgedConfig, board: str, cures: str) -> Change | None:
+    """Move a board, or its loose planner alone, to another used core so that another board fits."""
+    table = rack.config.board[board]
+    keys = ["core"] if table.planner_core is None else ["planner_core", "core"]
+    return _any(rack, board, ({key: core} for key in keys for core in _other_cores(rack, getattr(table, key))), cures)
+
+
+def _longer_cycle(
+    rack: JudgedConfig, board: str, place: Settings | None = None, cures: str | None = None
+) -> Change | None:
+    """Lengthen a cycle; with a limit on the age of plans, a plan may then get fewer cycles."""
+    every = rack.timing.boards[board].every
+    timing = rack.timing if place is None else rack.timing.changed(board, coupling="loose")
+    step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
+    longest = min(MAX_FACTOR * every, LONGEST_EVERY)
+    tried = (_lengthened(timing, board, longer) for longer in range(every + step, longest + 1, step))
+    # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the other levels less well, or
+    # leave plans too few cycles.
+    sound = [{**(place or {}), **settings} for changed, settings in tried if rack.is_sound(changed, board)]
+    return _first(rack, board, sound, cures)
+
+
+def _elsewhere_and_longer(rack: JudgedConfig, board: str) -> Change | None:
+    places = _places(rack, board)
+    return next((change for place in places if (change := _longer_cycle(rack, board, place)) is not None), None)
+
+
+def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
+    """Yield settings for each place where the board's planner could be loosely coupled; none without a planner."""
+    table = rack.config.board[board]
+    slot = _free_slot(rack) if table.planner_slot is None else table.planner_slot
+    if rack.timing.level(board).within_cycles is not None and slot is not None:
+        for other in _other_cores(rack, rack.timing.boards[board].planner_core):
+            yield {"coupling": "loose", "planner_slot": slot, "planner_core": other}
+
+
+def _cycles(level: LevelTiming, least: int) -> range:
+    """Return the cycles that a plan of a level may take, from `least` on."""
+    longest = min((level.within_cycles or 1) * MAX_FACTOR, MAX_CYCLES)
+    if level.plan_within_ns is not None:
+        longest = min(level.plan_within_ns // level.cycle_ns, longest)
+    return range(least, longest + 1)
+
+
+def _lengthened(timing: RackTiming, board: str, every: int) -> tuple[RackTiming, Settings]:
+    """Return a rack with another cycle of a board, and the settings that make it."""
+    level, settings = timing.level(board), {"every": every, "rate_hz": None}
+    if level.within_cycles is not None and level.plan_within_ns is not None:
+        cycles = level.plan_within_ns // (every * timing.tick_ns)
+        settings["within_cycles"] = max(min(level.within_cycles, cycles), 1)
+    cycles = settings.get("within_cycles") or timing.boards[board].within_cycles
+    return timing.changed(board, every=every, within_cycles=cycles), settings
+
+
+def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
+    """Yield the cores to which a task could move: used ones, the least loaded first, then an unused one.
+
+    A core of a board without a budget is left out: its free time is unknown.
+    """
+    timing = rack.timing
+    used = set(timing.cores.values())
+    unknown = {core for name in timing.boards.keys() - timing.levels.keys() for core in timing.cores_of(name)}
+    yield from sorted(used - unknown - {core}, key=lambda other: (timing.loads.get(other, 0.0), other))
+    yield next(free for free in range(len(used) + 1) if free not in used)
+
+
+def _free_slot(rack: JudgedConfig) -> int | None:
+    taken = {slot for table in rack.config.board.values() for slot in (table.slot, table.planner_slot)}
+    return next((slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken), None)
+
+
+def _attempt(rack: JudgedConfig, board: str, settings: Settings, cures: str | None) -> Change | None:
+    """Return the change of a board if it cures the board, or the board `cures`."""
+    mailboxes: dict[str, Protocol] = {}
+    if settings.get("coupling") == "loose" and rack.timing.boards[board].is_critical:
+        # Between two processors the paper uses time slices or double buffers (section 3.3).
+        mailboxes = {f"{board}.plan": "time-slice"}
+    after = rack.changed(board, settings, mailboxes)
+    return Change(board, rack, after) if after is not None and after.cures(cures or board, rack) else None
+
+
+def _any(rack: JudgedConfig, board: str, tried: Iterable[Settings], cures: str | None = None) -> Change | None:
+    """Return the first change that works, trying one after another."""
+    return next((change for one in tried if (change := _attempt(rack, board, one, cures)) is not None), None)
+
+
+def _first(rack: JudgedConfig, board: str, tried: Sequence[Settings], cures: str | None = None) -> Change | None:
+    """Return the first change that works, in few attempts; see `first_that`."""
+    return first_that(tried, lambda settings: _attempt(rack, board, settings, cures))
+
+
+def first_that(tried: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:
+    """Return the result of `attempt` for the first item that has one, in few attempts; None if none has.
+
+    The items must be ordered: all items after one that works also work.
+    """
+    # Doubling steps find an item that works, halving steps the first one.
+    low, high, found = -1, 0, None
+    while high < len(tried) and (found := attempt(tried[high])) is None:
+        low, high = high, min(2 * high + 1, max(len(tried) - 1, high + 1))
+    while found is not None and high - low > 1:
+        middle = (low + high) // 2
+        earlier = attempt(tried[middle])
+        low, high, found = (middle, high, found) if earlier is None else (low, middle, earlier)
+    return found

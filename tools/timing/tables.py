@@ -1,54 +1,69 @@
-"""Verdicts and the times that they rest on, as tables for people; times in ms.
+"""A forecast as text: the system's response, and tables of levels, verdicts and response times; times in ms.
 
-To fit into a `width` they do without some columns.
+To fit into a `width` the tables leave out some columns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.rack import LevelTiming
+from rack.levels.timing.response_time import TaskResponse
+from rack.levels.timing.system_response import Prediction
+from rack.levels.timing.verdicts import LOAD, RESPONSE_TIME, EquationVerdict
 from rack.tools.text_table import table
-from rack.tools.timing.level_timing import LevelTiming
-from rack.tools.timing.task_response import TaskResponse
-from rack.tools.timing.verdict import Verdict
+
+
+def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:
+    """Yield a forecast as text for people."""
+    yield from _prediction_lines(forecast.system)
+    if forecast.levels:
+        yield from ("", f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:", "")
+        yield from level_table(forecast.levels, width)
+    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in (RESPONSE_TIME, LOAD)]:
+        yield ""
+        yield from verdict_table(paper, width)
+    if forecast.responses:
+        yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
+        yield from response_table(forecast.responses, width)
+        yield ""
+        loads = (f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}" for core, load in forecast.loads.items())
+        yield f"load: {', '.join(loads)}"
+    yield from forecast.notes
+
+
+def _prediction_lines(system: Prediction) -> Iterator[str]:
+    if system.levels:
+        yield ""
+        yield f"system response, {' > '.join(system.levels)}:"
+        yield f"  eq. 3.3 sum of the cycles {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound {system.bound_eq_3_2_ms:g} ms"
+        yield f"  on the clock's grid: a command down {system.command_ms:g} ms, a status up {system.status_ms:g} ms"
+    for level, plan_ms in system.plan_ms.items():
+        yield f"plan of {level}: available {plan_ms:g} ms after its planner's release"
 
 
 def level_table(levels: Iterable[LevelTiming], width: int | None = None) -> Iterator[str]:
-    """Yield a line a level: its cycle, what fills it, and what is left of it for its planner."""
-    head = [
-        "level",
-        "coupling",
-        "R_i",
-        "t_exec",
-        "t_comm",
-        "R",
-        "W",
-        "C",
-        "t_residual",
-        "t_plan",
-        "P",
-        "U",
-        "d",
-        "d R_i",
-    ]
-    yield from table(head, [_level_row(level) for level in levels], width, ("C", "R", "W", "U", "P", "d"))
+    """Yield a line per level: its cycle, its parts, and the residual for its planner."""
+    head = ["level", "coupling", "R_i", "t_exec", "t_comm", "R", "W", "C", "t_residual", "t_plan", "P", "U", "d"]
+    yield from table([*head, "d R_i"], [_level_row(level) for level in levels], width, ("C", "R", "W", "U", "P", "d"))
 
 
-def verdict_table(verdicts: Iterable[Verdict], width: int | None = None) -> Iterator[str]:
-    """Yield a line a verdict: both sides, the margin, whether it holds."""
+def verdict_table(verdicts: Iterable[EquationVerdict], width: int | None = None) -> Iterator[str]:
+    """Yield a line per verdict: both sides, the margin, whether it holds."""
     head = ["eq.", "of", "left", "", "right", "margin", "", "which is"]
     yield from table(head, [_verdict_row(verdict) for verdict in verdicts], width, ("which is", "margin"))
 
 
 def response_table(responses: Iterable[TaskResponse], width: int | None = None) -> Iterator[str]:
-    """Yield a line a task: what it computes, what keeps it waiting, and its deadline; a core after the other."""
+    """Yield a line per task, core by core: its cost, its blocking, its response and its deadline."""
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
     yield from table(head, [_response_row(response) for response in ordered], width, ("FIFO", "margin"))
 
 
 def ms(time_ns: float | None) -> str:
-    """Return a time in ms as text, to the us; "-" for none."""
+    """Return a time in ms as text, rounded to 1 us; "-" for None."""
     return "-" if time_ns is None else f"{round(time_ns * 1e-6, 3):g}"
 
 
@@ -60,10 +75,10 @@ def _level_row(level: LevelTiming) -> list[str]:
     return [level.board, level.coupling, *times, cycles, ms(level.slice_ns)]
 
 
-def _verdict_row(verdict: Verdict) -> list[str]:
-    sides = verdict.left, verdict.right, verdict.margin
+def _verdict_row(verdict: EquationVerdict) -> list[str]:
+    sides, result = (verdict.left, verdict.right, verdict.margin), _result(verdict.holds)
     left, right, margin = (ms(side) if verdict.unit == "ns" else f"{side:.3g}" for side in sides)
-    return [verdict.equation, verdict.subject, left, verdict.sign, right, margin, _said(verdict.holds), verdict.meaning]
+    return [verdict.equation, verdict.subject, left, verdict.sign, right, margin, result, verdict.meaning]
 
 
 def _response_row(response: TaskResponse) -> list[str]:
@@ -71,8 +86,8 @@ def _response_row(response: TaskResponse) -> list[str]:
     margin = None if found is None else response.deadline_ns - found
     times = (response.job_ns, response.blocking_ns, found, response.deadline_ns, margin)
     priority = str(response.priority or "-")
-    return [str(response.core), response.task, priority, *(ms(time) for time in times), _said(response.holds)]
+    return [str(response.core), response.task, priority, *(ms(time) for time in times), _result(response.holds)]
 
 
-def _said(holds: bool) -> str:
+def _result(holds: bool) -> str:
     return "ok" if holds else "FAILS"

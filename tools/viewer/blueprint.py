@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 from rack.backplane.layout import Layout
-from rack.boards.config import RackConfig
+from rack.boards.config import RackConfig, rack_timing
 from rack.levels.cell import Cell
 from rack.levels.messages import SERVO_STATUS
-from rack.tools.timing.prediction import hierarchy
 from rack.tools.viewer import ages, load
 from rack.tools.viewer.activity import LEVELS, LOG
 from rack.tools.viewer.document import CONFIG
@@ -104,7 +103,7 @@ def _log() -> rrb.Container:
 
 
 def _graph(layout: Layout, config: RackConfig) -> rrb.View:
-    places = positions(layout, hierarchy(config)).values()
+    places = positions(layout, rack_timing(config, layout).hierarchy).values()
     columns, rows = zip(*places, strict=True)
     bounds = rrb.VisualBounds2D(
         x_range=(min(columns) - 0.6 * COLUMN, max(columns) + 0.6 * COLUMN), y_range=(min(rows) - ROW, max(rows) + ROW)

@@ -11,8 +11,7 @@ import numpy as np
 from rack.backplane.address_map import CLOCK
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
-from rack.boards.config import loads
-from rack.tools.timing.prediction import hierarchy
+from rack.boards.config import loads, rack_timing
 from rack.tools.viewer.ages import Age
 from rack.tools.viewer.blocks import Block, Part
 from rack.tools.viewer.blueprint import blueprint
@@ -72,7 +71,7 @@ class ViewSink:
         # An operator's mailbox has no age: commands come now and then.
         periodic = [mailbox for mailbox in layout.mailboxes if mailbox.writer != CLOCK]
         self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
-        self._hierarchy = Hierarchy(stream, layout, hierarchy(config))
+        self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout).hierarchy)
         self._events = Events(stream, folder / "events.jsonl", self._hierarchy)
         self._losses = Losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name

@@ -27,8 +27,8 @@ class Plain(NamedTuple):
 def seen(tasks: list[Plain], blocked: int = 0) -> list[int]:
     """Draw the schedule of queueing jobs, unit by unit, until nothing is left to do; return the longest responses.
 
-    It is the worst there is: all tasks become known at 0, as long behind their release as their jitter allows, and
-    never again that late; what cannot be preempted has taken the core just before, until `blocked`.
+    It is the worst case: all tasks become known at 0, as late after their release as their jitter allows, and never
+    again that late; a part that cannot be preempted has taken the core just before, until `blocked`.
     """
     queues: list[list[list[int]]] = [[] for _ in tasks]  # the jobs of each task: release, time left
     worst, made, now = [0] * len(tasks), [0] * len(tasks), 0
@@ -115,7 +115,7 @@ def test_jobs_that_skip_instead_of_queueing_respond_as_the_first_one_does() -> N
         tasks = drawn(draw, full=True)
         queueing, skipping = analysed(tasks), analysed(tasks, queueing=False)
         for task, queued, skipped in zip(tasks, queueing, skipping, strict=True):
-            # Full load above leaves a job no bound of its own; nobody below it is drawn then.
+            # With full load above, a job has no bound; such sets are not drawn.
             assert queued is not None
             assert skipped is not None
             assert skipped <= queued
@@ -202,7 +202,7 @@ def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:
 
 def test_jitter_of_a_timed_task_counts() -> None:
     tasks = [timed("high", 0, 20, 10, computing(4), jitter_ns=3), timed("low", 0, 10, 40, computing(4))]
-    # The second job of the high one may come 7 behind the first.
+    # The second job of the high one may come 7 after the first.
     assert response_times(tasks) == {"high": 7, "low": 12}
 
 
@@ -217,9 +217,9 @@ def test_no_schedule_of_executors_and_planners_goes_beyond_the_bound() -> None:
         bounds, periods = response_times(tasks, switch), {task.name: task.period_ns for task in tasks}
         for job in simulate(tasks, 480, switch).jobs:
             bound = bounds[job.task]
-            # Whoever is late once may take up its next release late.
+            # A task that was late once may take up its next release late.
             if job.end_ns is not None and bound is not None and bound <= periods[job.task]:
-                # A schedule tells the end of a job's last part; the switch out of it comes behind.
+                # A schedule gives the end of a job's last part; the switch out of it comes after.
                 assert job.end_ns + switch - job.release_ns <= bound, (job, tasks)
                 attained += job.end_ns + switch - job.release_ns == bound
     assert attained > SETS

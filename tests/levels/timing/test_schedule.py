@@ -1,16 +1,15 @@
-"""Schedules: the paper's figures to the millisecond, and the rack's rules for whoever is late."""
+"""Schedules: the paper's figures to the millisecond, and the rack's rules for late tasks."""
 
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
-from rack.levels.timing.chart import Chart
-from rack.levels.timing.schedule import simulate
+from rack.levels.timing.schedule import Chart, Job, Span, simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
-from tests.levels.timing.step_by_step import run
 
 C, R, X, W, P, U = Unit
 
@@ -29,7 +28,7 @@ def planner(text: str, every: int, cycles: int, core: int = 1, ceiling: int = 80
 
 
 def row(chart: Chart, core: int = 1) -> str:
-    """Return who computes in each unit of time, as the paper's figures have it."""
+    """Return the unit function of each unit of time, as in the paper's figures."""
     letters = ["-"] * chart.end_ns
     for span in (span for span in chart.spans if span.core == core):
         letters[span.start_ns : span.end_ns] = span.unit.value * (span.end_ns - span.start_ns)
@@ -45,7 +44,7 @@ FIG_3 = (executor("R1 X2 W1", 6), planner("P6 U1", 6, 3))
 FIG_4 = (executor("C1 R1 X2 W1", 6), planner("P6 U1", 6, 2, core=2, ceiling=0))
 
 
-def test_figure_2_is_printed_as_the_paper_has_it() -> None:
+def test_figure_2_is_as_in_the_paper() -> None:
     assert row(simulate(FIG_2, 32)) == "RXXWPPPPRXXWPPU-" * 2
 
 
@@ -78,7 +77,7 @@ def test_figure_4_with_a_longer_executor_misses_every_cycle() -> None:
     assert len(chart.late("level")) == 10
 
 
-def test_whoever_is_late_takes_the_newest_release_and_skips_the_others() -> None:
+def test_a_late_task_takes_the_newest_release_and_skips_the_others() -> None:
     chart = simulate([executor("X25", 10)], 60)
     # Done at 25 and at 45: the releases of 10 and of 30 have passed, those of 20 and 40 are the newest.
     assert ends(chart, "level") == [(0, 25), (10, None), (20, 50), (30, None), (40, None), (50, None)]
@@ -100,7 +99,7 @@ def test_a_planner_that_lost_more_than_its_slice_skips_to_the_oldest_release_tha
     assert ends(chart, "level.planner") == [(0, 35), (30, 70), (65, 105), (100, None)]
 
 
-def test_the_plan_update_keeps_its_executor_out_and_nobody_above_it() -> None:
+def test_the_plan_update_blocks_its_executor_but_no_task_above_it() -> None:
     tasks = executor("R1 X1", 4), planner("P2 U3", 4, 3)
     assert row(simulate(tasks, 12)) == "RXPPRXUUURX-"
     above = TimedTask("clock", "clock", "clock", 1, 90, 8, parts("X1"))
@@ -158,15 +157,85 @@ def random_tasks(seed: int) -> list[TimedTask]:
     return tasks
 
 
+def step_by_step(tasks: Sequence[TimedTask], until: int) -> tuple[list[str], dict[tuple[str, int], int]]:
+    """Return who computes in each unit of time, "X of a", and the end of every job by task and release.
+
+    It is written from the rules alone, unit by unit: slow, and too simple to be wrong in the same way.
+    """
+    todo: dict[str, list[tuple[str, bool, bool]]] = {task.name: [] for task in tasks}
+    release = {task.name: -1 for task in tasks}
+    free_from = {task.name: 0 for task in tasks}
+    late_by = {task.name: 0 for task in tasks}
+    row, ends = [], {}
+    for now in range(until):
+        able = [task for task in tasks if todo[task.name] or free_from[task.name] <= now]
+        if not able:
+            row.append("-")
+            continue
+        task = min(able, key=lambda task: place(task, todo[task.name], free_from[task.name]))
+        name = task.name
+        if not todo[name]:
+            newest = now - now % task.every_ns
+            release[name] = max(free_from[name], newest - late_by[name])
+            late_by[name] = (task.within_cycles - 1) * task.every_ns
+            for part in task.parts:
+                units = [(part.unit.value, not part.preemptible, at > 0) for at in range(part.time_ns)]
+                todo[name] += units
+        letter, _, _ = todo[name].pop(0)
+        row.append(f"{letter} of {name}")
+        if not todo[name]:
+            ends[name, release[name]] = now + 1
+            free_from[name] = release[name] + task.period_ns
+    return row, ends
+
+
+def place(task: TimedTask, todo: list[tuple[str, bool, bool]], since: int) -> tuple[int, int, int, str]:
+    """Return the order in which tasks get the core; the lowest does."""
+    is_locked = bool(todo) and todo[0][1] and todo[0][2]
+    priority = max(task.priority, task.ceiling) if is_locked else task.priority
+    return -priority, 0 if is_locked else 1, since, task.name
+
+
 @pytest.mark.parametrize("seed", range(60))
 def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
     for number in range(10):
         tasks, until = random_tasks(1000 * seed + number), 300
         chart = simulate(tasks, until)
-        expected, ended = run(tasks, until)
+        expected, ended = step_by_step(tasks, until)
         found = ["-"] * until
         for span in chart.spans:
             assert set(found[span.start_ns : span.end_ns]) == {"-"}
             found[span.start_ns : span.end_ns] = [f"{span.unit.value} of {span.task}"] * (span.end_ns - span.start_ns)
         assert found == expected
         assert {(job.task, job.release_ns): job.end_ns for job in chart.jobs if job.end_ns is not None} == ended
+
+
+SPANS = (
+    Span("a", 0, Unit.PROCESS, 0, 10, 0),
+    Span("a", 0, Unit.WRITE, 10, 14, 0),
+    Span("a", 0, Unit.PROCESS, 20, 26, 20),
+)
+JOBS = (Job("a", 0, 20, 14), Job("a", 20, 40, 45), Job("b", 0, 30, None), Job("b", 40, 70, None))
+CHART = Chart(0, 60, SPANS, JOBS)
+
+
+def test_a_job_is_late_if_it_ended_after_its_deadline_or_did_not_end_by_then() -> None:
+    assert CHART.late("a") == [JOBS[1]]
+    # The second one still has time when the chart ends.
+    assert CHART.late("b") == [JOBS[2]]
+
+
+def test_a_window_cuts_spans_and_leaves_out_what_lies_outside() -> None:
+    window = CHART.window(4, 12)
+    assert [(span.unit, span.start_ns, span.end_ns) for span in window.spans] == [("X", 4, 10), ("W", 10, 12)]
+    assert (window.start_ns, window.end_ns) == (4, 12)
+
+
+def test_a_window_keeps_the_jobs_that_it_has_to_do_with_whole() -> None:
+    assert CHART.window(42, 50).jobs == (JOBS[1], JOBS[3])
+    assert CHART.window(20, 25).jobs == (JOBS[1], JOBS[2])
+
+
+def test_a_job_that_is_not_due_within_the_window_is_not_late_in_it() -> None:
+    assert CHART.window(0, 25).late("b") == []
+    assert CHART.window(0, 30).late("b") == [JOBS[2]]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import budgets, load
-from rack.tools.timing.trial import Trial
+from rack.boards.config import load
+from rack.tools.timing.judged_config import JudgedConfig
 
 BUDGETED = f"""
 name = "budgeted"
@@ -56,7 +56,7 @@ update_ms = 0.5
 """
 """Lower: R 10 ms, t_exec 3, t_comm 1.25, t_residual 5.75, t_plan 8.5 within 4 cycles: fits, and could within 2."""
 
-Judge = Callable[..., Trial]
+Judge = Callable[..., JudgedConfig]
 
 
 @pytest.fixture
@@ -71,8 +71,7 @@ def budgeted(tmp_path: Path) -> Path:
 def judge(budgeted: Path) -> Judge:
     """Put the rack, with settings, to the timing model."""
 
-    def judged(*settings: str) -> Trial:
-        config = load(budgeted, settings)
-        return Trial.of(config, budgets(config))
+    def judged(*settings: str) -> JudgedConfig:
+        return JudgedConfig.of(load(budgeted, settings))
 
     return judged

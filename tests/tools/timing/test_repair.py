@@ -1,24 +1,22 @@
-"""What would do where something fails: the smallest change of each kind, tried and not assumed."""
+"""Changes that make a rack fit: the smallest of each kind, tried and not assumed."""
 
 from __future__ import annotations
 
 import pytest
 
 from rack.boards.config import budgets, load, loads
-from rack.tools.timing.change import Change
-from rack.tools.timing.changes import changes_for, first_that
-from rack.tools.timing.repair import repair
-from rack.tools.timing.trial import Trial
+from rack.tools.timing.judged_config import Change, JudgedConfig
+from rack.tools.timing.repair import changes_for, first_that, repair
 from tests.tools.timing.conftest import Judge
 
 
-def settings_for(trial: Trial, board: str = "lower") -> list[dict[str, object]]:
-    return [change.settings for change in changes_for(trial, board)]
+def settings_for(judged: JudgedConfig, board: str = "lower") -> list[dict[str, object]]:
+    return [change.settings for change in changes_for(judged, board)]
 
 
-def change_of(trial: Trial, key: str) -> Change:
+def change_of(judged: JudgedConfig, key: str) -> Change:
     """Return the first change for the lower board that sets `key`."""
-    return next(change for change in changes_for(trial, "lower") if key in change.settings)
+    return next(change for change in changes_for(judged, "lower") if key in change.settings)
 
 
 def test_the_first_that_works_is_found_in_few_attempts() -> None:
@@ -38,8 +36,8 @@ def test_the_first_that_works_is_found_in_few_attempts() -> None:
 
 def test_older_plans_come_first_then_a_longer_cycle_then_a_core_that_the_machine_lacks(judge: Judge) -> None:
     # 8.5 of planning, 5.55 left in a cycle.
-    trial = judge("board.lower.within_cycles=1")
-    assert settings_for(trial) == [
+    judged = judge("board.lower.within_cycles=1")
+    assert settings_for(judged) == [
         {"within_cycles": 2},
         # 5, 6 and 7 ticks are no grid with 8: waiting for it would take more than n R_max.
         {"every": 8, "rate_hz": None},
@@ -59,9 +57,9 @@ def test_a_core_that_the_machine_has_comes_before_older_plans(judge: Judge, monk
 def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
     # Both on core 1, the slow level above the fast one: its 7.2 and 4.45 are more than the fast one's 10.
     settings = ("core=1", "priority=85", "budget.process_ms=5")
-    trial = judge(*(f"board.upper.{setting}" for setting in settings), "board.lower.budget.plan_ms=0.1")
-    assert ("response time", "lower") in {(verdict.equation, verdict.subject) for verdict in trial.failing}
-    first = changes_for(trial, "lower")[0]
+    judged = judge(*(f"board.upper.{setting}" for setting in settings), "board.lower.budget.plan_ms=0.1")
+    assert ("response time", "lower") in {(verdict.equation, verdict.subject) for verdict in judged.failing}
+    first = changes_for(judged, "lower")[0]
     assert (first.settings, first.text) == ({"priority": 86}, "board 'lower': priority 80 -> 86")
     assert first.after.failing == ()
 
@@ -70,8 +68,8 @@ def test_a_longer_cycle_of_a_board_on_the_same_core_is_a_change_too(judge: Judge
     # Every 40 ms 4 cycles of each level, 4.45 and 3.2, and 11.7 of planning: 42.3; with half of the upper level's 35.9.
     settings = ("core=1", "priority=85", "rate_hz=100", "budget.process_ms=1")
     full = ("timing.clock_ms=2.2", "board.lower.budget.plan_ms=11")
-    trial = judge(*(f"board.upper.{setting}" for setting in settings), *full)
-    change = next(change for change in changes_for(trial, "lower") if change.board == "upper")
+    judged = judge(*(f"board.upper.{setting}" for setting in settings), *full)
+    change = next(change for change in changes_for(judged, "lower") if change.board == "upper")
     assert change.settings == {"every": 8, "rate_hz": None}
     assert change.after.failing == ()
 
@@ -84,39 +82,39 @@ def test_a_plan_many_times_as_old_is_no_change(judge: Judge) -> None:
 
 
 def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
-    trial = judge("board.lower.within_cycles=1")
-    for change in changes_for(trial, "lower"):
-        assert not Trial.of(loads(change.after.config.text()), trial.budgets).failing
+    judged = judge("board.lower.within_cycles=1")
+    for change in changes_for(judged, "lower"):
+        assert not JudgedConfig.of(loads(change.after.config.text()), judged.budgets).failing
 
 
 def test_plans_that_must_not_grow_old_leave_fewer_changes(judge: Judge) -> None:
-    trial = judge("board.lower.within_cycles=1", "board.lower.budget.plan_within_ms=15")
-    assert settings_for(trial) == [{"coupling": "loose", "planner_slot": 4, "planner_core": 2}]
+    judged = judge("board.lower.within_cycles=1", "board.lower.budget.plan_within_ms=15")
+    assert settings_for(judged) == [{"coupling": "loose", "planner_slot": 4, "planner_core": 2}]
 
 
 def test_the_next_smaller_change_would_not_do(judge: Judge) -> None:
-    trial = judge("board.lower.budget.plan_ms=60")
-    assert {"within_cycles": 11} in settings_for(trial)
+    judged = judge("board.lower.budget.plan_ms=60")
+    assert {"within_cycles": 11} in settings_for(judged)
     assert judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=10").failing
     assert not judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=11").failing
 
 
 def test_a_new_core_is_asked_for_where_no_used_one_has_room(judge: Judge) -> None:
-    trial = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
-    change = change_of(trial, "planner_core")
+    judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
+    change = change_of(judged, "planner_core")
     assert change.settings["planner_core"] == 2
-    assert "planner_core 2 (a core of its own" in change.text
+    assert "planner_core 2 (not shared" in change.text
 
 
 def test_a_core_of_unknown_load_is_left_alone(judge: Judge, budgeted: object) -> None:
     config = load(str(budgeted), ["board.lower.within_cycles=1"])
     known = {name: budget for name, budget in budgets(config).items() if name == "lower"}
-    assert change_of(Trial.of(config, known), "planner_core").settings["planner_core"] == 2
+    assert change_of(JudgedConfig.of(config, known), "planner_core").settings["planner_core"] == 2
 
 
 def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
-    trial = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
-    loosened = change_of(trial, "coupling")
+    judged = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
+    loosened = change_of(judged, "coupling")
     assert loosened.after.layout.mailbox("lower.plan").protocol == "time-slice"
     assert loosened.document()["protocols"] == {"lower.plan": "time-slice"}
     assert "lower.plan by time-slice" in loosened.text
@@ -125,29 +123,29 @@ def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge
 def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
     loose = ["coupling=loose", "planner_slot=4", "planner_core=0", "budget.plan_ms=31"]
     # 8.4 of every 40 are the upper level's.
-    trial = judge(*(f"board.lower.{setting}" for setting in loose))
-    assert {"planner_core": 2} in settings_for(trial)
+    judged = judge(*(f"board.lower.{setting}" for setting in loose))
+    assert {"planner_core": 2} in settings_for(judged)
     # The upper level could go instead, at no cost.
-    assert changes_for(trial, "lower")[0].board == "upper"
+    assert changes_for(judged, "lower")[0].board == "upper"
 
 
 def test_an_executor_too_long_for_its_cycle_gets_a_longer_one_and_nothing_else(judge: Judge) -> None:
-    trial = judge("board.lower.budget.process_ms=9")
-    assert settings_for(trial) == [{"every": 8, "rate_hz": None}]
-    assert "every 4 -> 8 (cycle 10 -> 20 ms; R_s 30 -> 40 ms)" in changes_for(trial, "lower")[0].text
+    judged = judge("board.lower.budget.process_ms=9")
+    assert settings_for(judged) == [{"every": 8, "rate_hz": None}]
+    assert "every 4 -> 8 (cycle 10 -> 20 ms; R_s 30 -> 40 ms)" in changes_for(judged, "lower")[0].text
 
 
 def test_a_core_of_its_own_with_older_plans_ranks_by_their_age(judge: Judge, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1, 2})
     loose = ["coupling=loose", "planner_slot=4", "planner_core=1", "within_cycles=2", "budget.plan_ms=24"]
-    # 24.7 of planning need 5 cycles beside its executor, 5 beside the upper level, 3 alone.
-    trial = judge(*(f"board.lower.{setting}" for setting in loose), "board.upper.budget.process_ms=6")
-    assert settings_for(trial)[:2] == [{"within_cycles": 3, "planner_core": 2}, {"within_cycles": 5}]
+    # 24.7 of planning need 5 cycles on the core of its executor or of the upper level, 3 alone.
+    judged = judge(*(f"board.lower.{setting}" for setting in loose), "board.upper.budget.process_ms=6")
+    assert settings_for(judged)[:2] == [{"within_cycles": 3, "planner_core": 2}, {"within_cycles": 5}]
 
 
 def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() -> None:
     config = load("fig3")
-    changes = changes_for(Trial.of(config, budgets(config)), "level")
+    changes = changes_for(JudgedConfig.of(config), "level")
     # The paper's own way out first, its figure 4; then its figure 2.
     assert [change.settings for change in changes] == [
         {"coupling": "loose", "planner_slot": 3, "planner_core": 0},
@@ -157,35 +155,35 @@ def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() ->
 
 def test_more_cycles_would_do_for_figure_3_if_plans_could_be_old() -> None:
     config = load("fig3", ["board.level.budget.plan_within_ms=24"])
-    assert {"within_cycles": 4} in settings_for(Trial.of(config, budgets(config)), "level")
+    assert {"within_cycles": 4} in settings_for(JudgedConfig.of(config), "level")
 
 
 def test_a_board_that_waits_for_others_gets_a_core_of_its_own(judge: Judge) -> None:
-    trial = judge("board.upper.core=1", "board.upper.budget.process_ms=13", "board.lower.budget.plan_ms=1")
-    assert {verdict.subject for verdict in trial.failing} >= {"upper"}
-    assert {"core": 0} in settings_for(trial, "upper")
+    judged = judge("board.upper.core=1", "board.upper.budget.process_ms=13", "board.lower.budget.plan_ms=1")
+    assert {verdict.subject for verdict in judged.failing} >= {"upper"}
+    assert {"core": 0} in settings_for(judged, "upper")
 
 
 def test_a_planner_elsewhere_and_a_longer_cycle_together_are_a_last_resort(judge: Judge) -> None:
     settings = ["budget.process_ms=9", "budget.plan_ms=29", "budget.plan_within_ms=30", "budget.exchange_ms=0"]
     alone = ("timing.context_switch_ms=0", "board.upper.rate_hz=16.666666666666668")
-    # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of 15 beside it: just.
+    # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of 15 on another core: just.
     assert settings_for(judge(*(f"board.lower.{setting}" for setting in settings), *alone)) == [
         {"within_cycles": 2, "coupling": "loose", "planner_slot": 4, "planner_core": 2, "every": 6, "rate_hz": None}
     ]
 
 
 def test_boards_are_mended_one_after_another(judge: Judge) -> None:
-    trial = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=19")
-    mended = repair(trial)
+    judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=19")
+    mended = repair(judged)
     assert [changes[0].board for changes in mended.steps] == ["lower", "upper"]
     assert mended.left == ()
     assert mended.end.failing == ()
     # The second step rests on the first.
     assert mended.end.config.board["lower"].within_cycles == 2
     assert [line.split(":")[0] for line in mended.lines() if not line.startswith(" ")] == [
-        "what would do, any one of them, the cheapest first",
-        "with the first of those, then",
+        "to make it fit, one of these, cheapest first",
+        "then, with the first of these",
     ]
 
 
@@ -193,21 +191,21 @@ def test_what_nothing_helps_against_is_said(judge: Judge) -> None:
     hopeless = repair(judge("board.lower.budget.process_ms=200"))
     assert hopeless.steps == ()
     assert {verdict.equation for verdict in hopeless.left} >= {"3.1", "3.4"}
-    assert hopeless.lines()[-1].startswith("nothing helps against 3.1 of lower, ")
+    assert hopeless.lines()[-1].startswith("no change helps with 3.1 of lower, ")
     assert hopeless.document() == {"steps": [], "fits": False}
 
 
 def test_a_rack_that_fits_is_left_alone(judge: Judge) -> None:
-    trial = judge()
-    assert repair(trial).end is trial
-    assert repair(trial).lines() == []
+    judged = judge()
+    assert repair(judged).end is judged
+    assert repair(judged).lines() == []
 
 
 def test_a_crate_without_a_free_slot_has_no_board_for_a_planner(judge: Judge) -> None:
     full = "executor = 'two_levels:Upper', below = 'lower', every = 8, core = 3"
     others = [f"board.other{slot}={{ slot = {slot}, {full} }}" for slot in range(4, 22)]
-    trial = judge("board.lower.within_cycles=1", *others)
-    assert settings_for(trial) == [{"within_cycles": 2}, {"every": 8, "rate_hz": None}]
+    judged = judge("board.lower.within_cycles=1", *others)
+    assert settings_for(judged) == [{"within_cycles": 2}, {"every": 8, "rate_hz": None}]
 
 
 @pytest.fixture(autouse=True)
@@ -217,5 +215,5 @@ def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_core_that_the_machine_lacks_is_said_to_be_lacking(judge: Judge) -> None:
-    trial = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
-    assert "this machine has no core 2 and gives core 0" in change_of(trial, "planner_core").text
+    judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
+    assert "this machine has no core 2, uses core 0" in change_of(judged, "planner_core").text

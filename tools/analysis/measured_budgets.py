@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rack.levels.timing.budget import Budget
+from rack.levels.timing.tasks import Budget
 from rack.tools.analysis.cycles import Cycles, cycles_of
 from rack.tools.recording import Recording
 

@@ -1,0 +1,77 @@
+"""Everything that the timing model predicts of a rack before it is launched."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.response_time import TaskResponse, task_responses
+from rack.levels.timing.system_response import Prediction, predict
+from rack.levels.timing.verdicts import EquationVerdict, verdicts
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction."""
+
+    system: Prediction
+    context_switch_ns: int
+    levels: tuple[LevelTiming, ...]
+    verdicts: tuple[EquationVerdict, ...]
+    responses: tuple[TaskResponse, ...]
+    loads: dict[int, float]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, rack: RackTiming, has_cores: bool = True) -> Forecast:
+        """Return the forecast of a rack; `has_cores` is false if this machine lacks cores that the config asks for."""
+        return cls(
+            system=predict(rack),
+            context_switch_ns=rack.context_switch_ns,
+            levels=tuple(rack.levels.values()),
+            verdicts=tuple(verdicts(rack)),
+            responses=task_responses(rack.tasks, rack.context_switch_ns),
+            loads=rack.loads,
+            notes=tuple(_notes(rack, has_cores)),
+        )
+
+    @property
+    def holds(self) -> bool:
+        """Whether every verdict holds."""
+        return all(verdict.holds for verdict in self.verdicts)
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data; times whose names end in _ns are wall-clock times."""
+        return {
+            **asdict(self.system),
+            "context_switch_ns": self.context_switch_ns,
+            "levels": [level.document() for level in self.levels],
+            "verdicts": [verdict.document() for verdict in self.verdicts],
+            "responses": [response.document() for response in self.responses],
+            "loads": {str(core): load for core, load in self.loads.items()},
+            "notes": list(self.notes),
+            "holds": self.holds,
+        }
+
+
+def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
+    known = [board for board in rack.boards.values() if board.budget is not None]
+    if known and rack.is_lockstep:
+        yield "in lockstep a tick waits for late tasks; this is the timing of the same rack in real time"
+    if known and rack.speed != 1.0:
+        yield f"times are of the wall clock: speed {rack.speed:g} changes the cycles, not the budgets"
+    if known and not has_cores:
+        yield "cores are those of the config; this machine lacks some of them"
+    if without := [name for name, board in rack.boards.items() if board.budget is None]:
+        names = ", ".join(without)
+        yield f"no budget, so not judged and not counted (set one in the config, or use --from RUN): {names}"
+    if silent := [board.name for board in known if board.has_planner and not board.is_plan_budgeted]:
+        yield f"planner not judged, no plan_ms in the budget: {', '.join(silent)}"
+    if not rack.clock.cost_ns:
+        yield "the clock is not counted on its core: timing.clock_ms is 0"
+    sharing = [task for task in rack.tasks if task.cost_ns and not task.priority]
+    crowded = [task.name for task in sharing if sum(other.core == task.core for other in sharing) > 1]
+    if crowded:
+        yield f"ordinary scheduling guarantees nothing; bounds that assume fair turns: {', '.join(crowded)}"

@@ -1,0 +1,254 @@
+"""A rack as the timing model sees it, as plain data, and the times of its levels in the paper's terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+from rack.levels.timing.equations import communication_ns, residual_ns, response_ticks
+from rack.levels.timing.response_time import load_of
+from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
+
+Coupling = Literal["tight", "loose", "none"]
+
+
+@dataclass(frozen=True)
+class BoardTiming:
+    """One board. `every` is its cycle in ticks; cores are those that the config asks for.
+
+    `is_critical` is true if the plan update is the paper's critical section: it keeps the executor waiting. `budget` is
+    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock.
+    """
+
+    name: str
+    above: str | None
+    below: str | None
+    coupling: Coupling
+    every: int
+    within_cycles: int
+    core: int
+    priority: int
+    planner_core: int
+    planner_priority: int
+    has_planner: bool
+    is_critical: bool
+    budget: Budget | None
+    plan_within_ns: int | None = None
+
+    @property
+    def is_plan_budgeted(self) -> bool:
+        """Whether the budget covers its planner: in a measured run the planner may have made no plan."""
+        return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
+
+
+@dataclass(frozen=True)
+class LevelTiming:
+    """One level in the worst case, ns of the wall clock.
+
+    `cycle_ns` is R_i, `longest_cycle_ns` is R_max (see `RackTiming.longest_cycles`). `exchange_ns` (C) and `update_ns`
+    (U) pass the plan between planner and executor. `within_cycles` is d; it and `plan_ns` (P) are None without a
+    planner, or if the budget does not cover it.
+    """
+
+    board: str
+    coupling: Coupling
+    cycle_ns: int
+    longest_cycle_ns: int
+    read_ns: int
+    execution_ns: int
+    write_ns: int
+    exchange_ns: int
+    plan_ns: int | None
+    update_ns: int
+    within_cycles: int | None
+    plan_within_ns: int | None
+
+    @property
+    def interlevel_ns(self) -> int:
+        """t_interlevel of eq. 3.9: commands and statuses, R and W."""
+        return self.read_ns + self.write_ns
+
+    @property
+    def communication_ns(self) -> int:
+        """t_comm of eq. 3.5: the executor's communication in every cycle, R, W and C."""
+        return round(communication_ns(self.interlevel_ns, self.exchange_ns))
+
+    @property
+    def executor_planner_ns(self) -> int:
+        """t_executor-planner of eqs 3.9 and 3.10: the plan read and updated, C and U, both in the worst cycle."""
+        return self.exchange_ns + self.update_ns
+
+    @property
+    def residual_ns(self) -> int:
+        """t_residual of eq. 3.5, and alpha of eq. 3.6: the budget's times are the longest of all cycles."""
+        return round(residual_ns(self.cycle_ns, self.execution_ns, self.communication_ns))
+
+    @property
+    def planning_ns(self) -> int | None:
+        """t_plan of eq. 3.8: one plan and its update, P and U."""
+        return None if self.plan_ns is None else self.plan_ns + self.update_ns
+
+    @property
+    def slice_ns(self) -> int | None:
+        """Time from a planner's release until its plan is available: d R_i."""
+        return None if self.within_cycles is None else self.within_cycles * self.cycle_ns
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        derived = ("communication_ns", "executor_planner_ns", "residual_ns", "planning_ns", "slice_ns")
+        return asdict(self) | {name: getattr(self, name) for name in derived}
+
+
+@dataclass(frozen=True)
+class RackTiming:
+    """Everything that the timing model needs to know of a rack.
+
+    `clock_ns` is one tick of simulated time. `clock` is the task of the system clock, released every tick of the wall
+    clock; its cost is 0 if unknown. `context_switch_ns` is t_cs, `small_share` the limit of eq. 3.10.
+    `response_goal_ns` is the goal for the system's response, simulated time. Budgets are processor times: a `speed`
+    factor shortens the cycles, not the budgets.
+    """
+
+    is_lockstep: bool
+    speed: float
+    clock_ns: int
+    clock: TimedTask
+    boards: Mapping[str, BoardTiming]
+    context_switch_ns: int
+    small_share: float
+    response_goal_ns: float | None = None
+
+    @property
+    def tick_ns(self) -> int:
+        """One tick of the wall clock."""
+        return self.clock.every_ns
+
+    def changed(self, board: str, **changes: Any) -> RackTiming:
+        """Return the rack with other values of a board."""
+        return replace(self, boards={**self.boards, board: replace(self.boards[board], **changes)})
+
+    @cached_property
+    def chains(self) -> tuple[tuple[str, ...], ...]:
+        """Every chain of boards from a highest to a lowest; a rack with a board per joint has one for every joint."""
+        lowest = [board.name for board in self.boards.values() if board.above is not None and board.below is None]
+        return tuple(self._chain(name) for name in lowest)
+
+    def _chain(self, lowest: str) -> tuple[str, ...]:
+        chain = [lowest]
+        while (above := self.boards[chain[0]].above) is not None and above not in chain:
+            chain.insert(0, above)
+        return tuple(chain)
+
+    @property
+    def hierarchy(self) -> tuple[str, ...]:
+        """The chain with the longest response, from the highest board to the lowest; empty without one."""
+        return max(
+            self.chains, key=lambda chain: response_ticks([self.boards[name].every for name in chain]), default=()
+        )
+
+    @cached_property
+    def longest_cycles(self) -> dict[str, float]:
+        """R_max by board, in ticks: the longest cycle that a level may have.
+
+        With a goal for the response it is R_s / n (eq. 3.2), otherwise the longest cycle in the board's hierarchy. A
+        board outside of all hierarchies has its own cycle.
+        """
+        found = {name: float(board.every) for name, board in self.boards.items()}
+        for chain in sorted(self.chains, key=len):
+            if self.response_goal_ns is None:
+                together = {name for other in self.chains if other[0] == chain[0] for name in other}
+                longest = float(max(self.boards[name].every for name in together))
+            else:
+                longest = self.response_goal_ns / self.clock_ns / len(chain)
+            found |= dict.fromkeys(chain, longest)
+        return found
+
+    def level(self, board: str) -> LevelTiming:
+        """Return the timing of a level that has a budget. Raises `KeyError`."""
+        table = self.boards[board]
+        budget, plans = table.budget, table.is_plan_budgeted
+        if budget is None:
+            raise KeyError(board)
+        return LevelTiming(
+            board=board,
+            coupling=table.coupling,
+            cycle_ns=table.every * self.tick_ns,
+            longest_cycle_ns=round(self.longest_cycles[board] * self.tick_ns),
+            read_ns=budget.read_ns,
+            execution_ns=budget.process_ns,
+            write_ns=budget.write_ns,
+            exchange_ns=budget.exchange_ns if table.has_planner else 0,
+            plan_ns=budget.plan_ns if plans else None,
+            update_ns=budget.update_ns if plans else 0,
+            within_cycles=table.within_cycles if plans else None,
+            plan_within_ns=table.plan_within_ns if plans else None,
+        )
+
+    @cached_property
+    def levels(self) -> dict[str, LevelTiming]:
+        """The timing of every level that has a budget, by board."""
+        return {name: self.level(name) for name, board in self.boards.items() if board.budget is not None}
+
+    @cached_property
+    def tasks(self) -> tuple[TimedTask, ...]:
+        """The clock's task if its cost is known, and those of every board that has a budget."""
+        clock = (self.clock,) if self.clock.cost_ns else ()
+        return (*clock, *(task for board in self.boards.values() for task in self._tasks(board)))
+
+    def _tasks(self, board: BoardTiming) -> list[TimedTask]:
+        budget = board.budget
+        if budget is None:
+            return []
+        executor = TimedTask(
+            name=board.name,
+            board=board.name,
+            role="executor",
+            core=board.core,
+            priority=board.priority,
+            every_ns=board.every * self.tick_ns,
+            parts=_nonzero(
+                Part(Unit.EXCHANGE, budget.exchange_ns if board.has_planner else 0),
+                Part(Unit.READ, budget.read_ns),
+                Part(Unit.PROCESS, budget.process_ns),
+                Part(Unit.WRITE, budget.write_ns),
+            ),
+        )
+        planner = replace(
+            executor,
+            name=f"{board.name}.planner",
+            role="planner",
+            core=board.planner_core,
+            priority=board.planner_priority,
+            parts=_nonzero(
+                Part(Unit.PLAN, budget.plan_ns),
+                Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical),
+            ),
+            within_cycles=board.within_cycles,
+            ceiling=board.priority if board.is_critical else 0,
+        )
+        return [executor, planner] if board.has_planner else [executor]
+
+    @cached_property
+    def cores(self) -> dict[str, int]:
+        """The cores that the config asks for, by task, the clock's first; this machine may lack some."""
+        found = {self.clock.name: self.clock.core}
+        for board in self.boards.values():
+            found[board.name] = board.core
+            if board.has_planner:
+                found[f"{board.name}.planner"] = board.planner_core
+        return found
+
+    def cores_of(self, board: str) -> set[int]:
+        """Return the cores of a board's tasks."""
+        return {core for name, core in self.cores.items() if name.partition(".")[0] == board}
+
+    @cached_property
+    def loads(self) -> dict[int, float]:
+        """The load of every core, by core; above 1 the core is overloaded."""
+        return load_of(self.tasks, self.context_switch_ns)
+
+
+def _nonzero(*parts: Part) -> tuple[Part, ...]:
+    return tuple(part for part in parts if part.time_ns)

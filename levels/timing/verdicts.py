@@ -1,0 +1,155 @@
+"""Verdicts: every equation of the timing model applied to every level, core and task of a rack.
+
+Equations 3.1 to 3.10 are judged as in the paper, each level as if it had its own processor. Response times and core
+loads account for levels that share a core.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import chain
+from math import inf, isfinite
+from typing import Any
+
+from rack.levels.timing import equations
+from rack.levels.timing.equations import Relation, response_ticks
+from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.response_time import response_times
+
+SYSTEM = "system"
+"""The subject of the system's response."""
+LOOSE_PLAN = "fig. 4"
+"""A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation number."""
+PLAN_WITHIN, RESPONSE_TIME, LOAD = "plan within", "response time", "load"
+"""Criteria beyond the paper."""
+EQUATIONS = "3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.8", LOOSE_PLAN, "3.9", "3.10"
+BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD
+ORDER = (*EQUATIONS, *BEYOND)
+"""All equations and criteria, in the order of the verdicts."""
+
+
+@dataclass(frozen=True)
+class EquationVerdict:
+    """Both sides of one equation for one subject, and whether it holds; predicted or measured.
+
+    `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task, a core or
+    "system". `left` and `right` are ns, or shares if `unit` is "1". `meaning` names both sides in the paper's terms, as
+    in "t_plan / d < t_residual - 2 t_cs".
+    """
+
+    equation: str
+    subject: str
+    left: float
+    sign: str
+    right: float
+    holds: bool
+    meaning: str
+    unit: str = "ns"
+
+    @classmethod
+    def of(cls, equation: str, subject: str, relation: Relation, meaning: str, unit: str = "ns") -> EquationVerdict:
+        """Return the verdict on a relation."""
+        return cls(equation, subject, *relation, relation.holds, meaning, unit)
+
+    @property
+    def margin(self) -> float:
+        """Right side minus left side, in `unit`; negative if the equation fails."""
+        return self.right - self.left
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """What was judged, the same before and after a change of the rack."""
+        return self.equation, self.subject, self.meaning
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data; an infinite side is None."""
+        sides = {"left": self.left, "right": self.right, "margin": self.margin}
+        return asdict(self) | {name: side if isfinite(side) else None for name, side in sides.items()}
+
+
+def verdicts(rack: RackTiming) -> list[EquationVerdict]:
+    """Return the verdicts on everything that has a budget, in the order of the equations.
+
+    A response time without a bound is infinite.
+    """
+    levels = (level_verdicts(rack, level) for level in rack.levels.values())
+    found = chain(system_verdicts(rack), *levels, _of_tasks(rack), _of_cores(rack))
+    return sorted(found, key=lambda verdict: ORDER.index(verdict.equation))
+
+
+def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
+    """Yield the verdicts on one level by itself."""
+    yield from _of_cycle(level, rack.tick_ns)
+    yield from _of_planner(level, rack.context_switch_ns, rack.small_share)
+
+
+def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield the verdicts on the system's response; with a goal for it, also on every cycle of its chains."""
+    goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
+    cycles_ns = {name: board.every * rack.tick_ns for name, board in rack.boards.items()}
+    for names in rack.chains:
+        subject = SYSTEM if len(rack.chains) == 1 else f"{SYSTEM}, {names[-1]}"
+        yield from _of_chain(subject, [cycles_ns[name] for name in names], rack.tick_ns, goal_ns)
+    if goal_ns is not None:
+        for name in dict.fromkeys(chain(*rack.chains)):
+            relation = Relation(cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns))
+            yield EquationVerdict.of("3.1", name, relation, "R_i <= R_max = R_s / n")
+
+
+def _of_chain(subject: str, cycles_ns: Sequence[int], tick_ns: int, goal_ns: float | None) -> Iterator[EquationVerdict]:
+    bound, limit = goal_ns, "timing.response_ms"
+    if bound is None:
+        bound, limit = equations.system_response_bound_ns(cycles_ns), "n R_max"
+    total = equations.system_response_ns((), cycles_ns)
+    yield EquationVerdict.of("3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}")
+    for way, order in (("command", 1), ("status", -1)):
+        ticks = response_ticks([cycle // tick_ns for cycle in cycles_ns[::order]])
+        relation = Relation(ticks * tick_ns, "<=", bound)
+        yield EquationVerdict.of("3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {limit}")
+
+
+def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
+    executes, communicates, cycle = level.execution_ns, level.communication_ns, level.cycle_ns
+    relations = {
+        "3.1": (equations.fits_cycle(executes, communicates, cycle), "t_proc + t_c <= R_i"),
+        "3.4": (equations.executes_in_time(executes, level.longest_cycle_ns), "t_exec < R_max"),
+        "3.5": (equations.parts_make_cycle(executes, communicates, cycle), "t_exec + t_comm + t_residual = R_i"),
+        "3.6": (equations.residual_is_left(level.residual_ns), "0 < t_residual <= alpha"),
+        "3.7": (equations.cycle_is_on_grid(cycle, tick_ns), "R_i = k c, k whole"),
+    }
+    for equation, (relation, meaning) in relations.items():
+        yield EquationVerdict.of(equation, level.board, relation, meaning)
+
+
+def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
+    if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
+        return
+    board, cycle = level.board, level.cycle_ns
+    if level.plan_within_ns is not None:
+        relation = Relation(level.slice_ns, "<=", level.plan_within_ns)
+        yield EquationVerdict.of(PLAN_WITHIN, board, relation, "d R_i <= budget.plan_within_ms")
+    if level.coupling == "loose":
+        fits = equations.plan_fits_loose(level.planning_ns, level.within_cycles, cycle)
+        yield EquationVerdict.of(LOOSE_PLAN, board, fits, "t_plan <= d R_i")
+        return
+    fits = equations.plan_fits_tight(level.planning_ns, level.within_cycles, level.residual_ns, switch_ns)
+    yield EquationVerdict.of("3.8", board, fits, "t_plan / d < t_residual - 2 t_cs")
+    communicates = equations.communication_ns(level.interlevel_ns, level.executor_planner_ns)
+    leaves = equations.leaves_time_to_plan(level.execution_ns, communicates, switch_ns, cycle)
+    yield EquationVerdict.of("3.9", board, leaves, "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)")
+    share = equations.coupling_may_be_tight(level.executor_planner_ns, cycle, small)
+    yield EquationVerdict.of("3.10", board, share, "t_executor-planner / R_i, small", "1")
+
+
+def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
+    periods = {task.name: task.period_ns for task in rack.tasks}
+    for name, found in response_times(rack.tasks, rack.context_switch_ns).items():
+        relation = Relation(inf if found is None else found, "<=", periods[name])
+        yield EquationVerdict.of(RESPONSE_TIME, name, relation, "worst-case response <= deadline")
+
+
+def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
+    for core, load in rack.loads.items():
+        relation = Relation(load, "<=", 1.0)
+        yield EquationVerdict.of(LOAD, f"core {core}", relation, "share of its time that its tasks compute", "1")

@@ -1,0 +1,95 @@
+"""The response to an operator, measured to the tick."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.boards.operating.config import CommandConfig
+from rack.tools.answer import Failure
+from rack.tools.bench.response import run_commands
+from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
+from tests.boards.told_racks import TOLD
+
+MakeConfig = Callable[..., RackConfig]
+
+
+@pytest.fixture
+def config(rack_name: str, tmp_path: Path) -> MakeConfig:
+    path = tmp_path / "told.toml"
+    path.write_text(TOLD)
+    return lambda *settings: load(path, [f"name={rack_name}", *settings])
+
+
+def measured(config: RackConfig, folder: Path, *given: CommandConfig) -> OperatorResponse:
+    response = response_of(run_commands(config, given, folder, 1.0))
+    assert response is not None
+    return response
+
+
+@pytest.fixture(scope="module")
+def response(tmp_path_factory: pytest.TempPathFactory) -> OperatorResponse:
+    """The response of a run with three commands that are all acted on."""
+    folder = tmp_path_factory.mktemp("responses")
+    (folder / "told.toml").write_text(TOLD)
+    given = [("upper", "hold", 101), ("upper", "resume", 176), ("lower", "hold", 250)]
+    commands = [CommandConfig(level=level, what=what, tick=tick) for level, what, tick in given]
+    return measured(load(folder / "told.toml", [f"name=test-response-{os.getpid()}"]), folder / "run", *commands)
+
+
+def test_every_command_of_a_run_comes_at_its_predicted_tick(response: OperatorResponse, tmp_path: Path) -> None:
+    assert [(c.given, c.sampled, c.predicted, c.acts) for c in response.commands] == [
+        (101, 104, 112, 112),
+        (176, 184, 192, 192),
+        (250, 251, 251, 251),
+    ]
+    assert response.held
+    assert "0 " in response.text().splitlines()[-1]
+    pictures = plot(response, tmp_path)
+    assert [picture.suffix for picture in pictures] == [".png", ".svg"]
+    assert all(picture.stat().st_size > 1000 for picture in pictures)
+
+
+def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Path) -> None:
+    given = [
+        CommandConfig(level="upper", what="goto", home=True, tick=50),
+        CommandConfig(level="upper", what="hold", tick=101),
+        # It overtakes the one before on its way down.
+        CommandConfig(level="lower", what="hold", tick=105),
+        CommandConfig(level="upper", what="resume", tick=398),
+    ]
+    response = measured(config(), tmp_path / "run", *given)
+    assert [command.fate for command in response.commands] == ["refused", "overtaken", "acted on", "run over"]
+    assert len(response.measured) == 1
+    assert "not measured: 1 to upper (refused), 2 to upper (overtaken), 4 to upper (run over)" in response.text()
+
+
+def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorResponse) -> None:
+    late = replace(response.commands[0], acts=113)
+    assert not replace(response, commands=(late,)).held
+    assert replace(response, commands=(late,)).off == [late]
+    assert replace(response, commands=(late,)).beyond == []
+    lost = replace(response.commands[0], acts=101 + 40)
+    assert replace(response, commands=(lost,), lockstep=False).beyond == [lost]
+
+
+def test_a_run_without_commands_has_no_response(config: MakeConfig, tmp_path: Path) -> None:
+    recording = run_commands(config(), (), tmp_path / "run", 0.5)
+    assert response_of(recording) is None
+    with pytest.raises(Failure, match="no operator commanded a level"):
+        show(recording, tmp_path, as_json=False)
+
+
+def test_a_run_in_real_time_has_responses_by_the_wall_clock(config: MakeConfig, tmp_path: Path) -> None:
+    given = [CommandConfig(level="upper", what="hold", tick=101)]
+    response = measured(config("clock.mode=realtime"), tmp_path / "run", *given)
+    (command,) = response.commands
+    assert command.wall_ms is not None
+    # Given at tick 101, its cycle begins at 112 or later.
+    assert command.wall_ms > 10 * 2.5

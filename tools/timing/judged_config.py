@@ -1,0 +1,184 @@
+"""A config judged by the timing model, and a change of one of its boards, judged on the whole rack."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+from rack.backplane.layout import Layout, Protocol
+from rack.boards.config import RackConfig, loads, rack_timing, wire
+from rack.boards.config.cores import obtained_core
+from rack.boards.errors import ConfigError
+from rack.levels.timing.rack import RackTiming
+from rack.levels.timing.system_response import predict
+from rack.levels.timing.tasks import Budget
+from rack.levels.timing.verdicts import LOAD, EquationVerdict, level_verdicts, system_verdicts, verdicts
+
+Settings = Mapping[str, Any]
+"""Keys of a board's table with their new values; None removes a key."""
+CHANGEABLE = (
+    "priority",
+    "planner_priority",
+    "within_cycles",
+    "coupling",
+    "planner_slot",
+    "planner_core",
+    "core",
+    "every",
+    "rate_hz",
+)
+"""Keys of a board's table that a change may set."""
+
+
+@dataclass(frozen=True)
+class JudgedConfig:
+    """A config that loads, as the timing model sees it, with the verdicts on it."""
+
+    config: RackConfig
+    layout: Layout
+    timing: RackTiming
+    verdicts: tuple[EquationVerdict, ...]
+
+    @classmethod
+    def of(cls, config: RackConfig, budgets: Mapping[str, Budget] | None = None) -> JudgedConfig:
+        """Wire a config and judge it by `budgets`, or by its own. Raises `ConfigError`."""
+        layout = wire(config)
+        timing = rack_timing(config, layout, budgets)
+        return cls(config, layout, timing, tuple(verdicts(timing)))
+
+    @property
+    def budgets(self) -> dict[str, Budget]:
+        """The known budgets, by board."""
+        return {name: board.budget for name, board in self.timing.boards.items() if board.budget is not None}
+
+    def changed(
+        self, board: str, settings: Settings, mailboxes: Mapping[str, Protocol] | None = None
+    ) -> JudgedConfig | None:
+        """Return the config with other settings of a board, loaded anew and judged; None if it is invalid.
+
+        `mailboxes` are those that get another protocol.
+        """
+        config = self.config
+        boards = {**config.board, board: config.board[board].model_copy(update=dict(settings))}
+        update: dict[str, Any] = {"board": boards}
+        if mailboxes:
+            protocols = {**config.protocol.mailbox, **mailboxes}
+            update["protocol"] = config.protocol.model_copy(update={"mailbox": protocols})
+        try:
+            # Copying validates nothing: only the loader finds mistakes.
+            return JudgedConfig.of(loads(config.model_copy(update=update).text()), self.budgets)
+        except ConfigError:
+            return None
+
+    @property
+    def failing(self) -> tuple[EquationVerdict, ...]:
+        """The verdicts that fail."""
+        return tuple(verdict for verdict in self.verdicts if not verdict.holds)
+
+    def failing_of(self, board: str) -> set[tuple[str, str, str]]:
+        """Return the keys of the failures of a board's own tasks; without any, of overloads of its cores."""
+        names = {board, f"{board}.planner"}
+        own = {verdict.key for verdict in self.failing if verdict.subject in names}
+        cores = {f"core {core}" for core in self.timing.cores_of(board)}
+        return own or {v.key for v in self.failing if v.equation == LOAD and v.subject in cores}
+
+    def cures(self, board: str, before: JudgedConfig) -> bool:
+        """Say whether all failures of the board in `before` are gone, and no new ones have appeared."""
+        failing = {verdict.key for verdict in self.failing}
+        old = {verdict.key for verdict in before.failing}
+        return failing < old and not failing & before.failing_of(board)
+
+    def is_sound(self, changed: RackTiming, board: str) -> bool:
+        """Say whether one changed board satisfies its own equations and lets the system respond as before.
+
+        This is a quick check; it leaves out the effect on other tasks on the core.
+        """
+        old = {verdict.key for verdict in self.failing}
+        system = (verdict for verdict in system_verdicts(changed) if verdict.key not in old)
+        return all(verdict.holds for verdict in chain(level_verdicts(changed, changed.level(board)), system))
+
+
+@dataclass(frozen=True)
+class Change:
+    """Other settings for a board: the rack `before` and `after`."""
+
+    board: str
+    before: JudgedConfig
+    after: JudgedConfig
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The keys of the board's table that change, with their new values; None: the key is removed."""
+        old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
+        return {key: getattr(new, key) for key in CHANGEABLE if getattr(old, key) != getattr(new, key)}
+
+    @property
+    def cost(self) -> tuple[bool, float, int, int]:
+        """The cost, for comparison: a core that this machine lacks, the slowdown, new cores and slots, then keys.
+
+        A longer cycle makes a level slower and its plans older: both factors count.
+        """
+        cores = set(self.after.timing.cores.values()) - set(self.before.timing.cores.values())
+        lacking = any(obtained_core(core) != core for core in cores)
+        old, new = self.before.timing.level(self.board), self.after.timing.level(self.board)
+        factor = new.cycle_ns / old.cycle_ns
+        if old.slice_ns is not None and new.slice_ns is not None:
+            factor *= max(new.slice_ns / old.slice_ns, 1.0)
+        return lacking, factor, 2 * len(cores) + ("planner_slot" in self.settings), len(self.settings)
+
+    @property
+    def text(self) -> str:
+        """The change in one line, with its numbers."""
+        return f"board '{self.board}': {', '.join(self._parts())}"
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return {"board": self.board, "text": self.text, "settings": self.settings, "protocols": self._protocols()}
+
+    def _parts(self) -> Iterator[str]:
+        old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
+        changed = self.settings
+        for key in ("priority", "planner_priority"):
+            if key in changed:
+                yield f"{key} {getattr(old, key)} -> {changed[key]}"
+        if "coupling" in changed:
+            yield f"coupling {new.coupling}, planner_slot {new.planner_slot}"
+        if "planner_core" in changed and new.planner_core is not None:
+            was = "" if old.planner_core is None else f"{old.planner_core} -> "
+            yield f"planner_core {was}{new.planner_core} ({self._sharing(new.planner_core)})"
+        if "core" in changed:
+            yield f"core {old.core} -> {new.core} ({self._sharing(new.core)})"
+        yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self._protocols().items())
+        if "every" in changed or "within_cycles" in changed:
+            yield from self._cycles()
+        if changed.get("coupling") == "loose" and not self.after.timing.level(self.board).exchange_ns:
+            yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
+
+    def _cycles(self) -> Iterator[str]:
+        old, new = (rack.timing.level(self.board) for rack in (self.before, self.after))
+        ticks = [rack.timing.boards[self.board].every for rack in (self.before, self.after)]
+        if new.cycle_ns != old.cycle_ns:
+            cycles = f"cycle {old.cycle_ns * 1e-6:g} -> {new.cycle_ns * 1e-6:g} ms"
+            yield f"every {ticks[0]} -> {ticks[1]} ({cycles}{self._response()})"
+        if new.slice_ns is not None:
+            age = f"a plan every {new.slice_ns * 1e-6:g} ms"
+            same = new.within_cycles == old.within_cycles
+            yield age if same else f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
+
+    def _response(self) -> str:
+        """Return the change of the system's response time, as text."""
+        old, new = (predict(rack.timing).command_ms for rack in (self.before, self.after))
+        return f"; R_s {old:g} -> {new:g} ms" if new != old else ""
+
+    def _sharing(self, core: int) -> str:
+        """Return which other tasks are on a core, and whether this machine has it."""
+        own = (self.board, f"{self.board}.planner")
+        others = [name for name, place in self.after.timing.cores.items() if place == core and name not in own]
+        sharing, obtained = f"shared with {', '.join(others)}" if others else "not shared", obtained_core(core)
+        return sharing if obtained == core else f"{sharing}; this machine has no core {core}, uses core {obtained}"
+
+    def _protocols(self) -> dict[str, str]:
+        old, new = (rack.config.protocol.mailbox for rack in (self.before, self.after))
+        return {mailbox: protocol for mailbox, protocol in new.items() if old.get(mailbox) != protocol}

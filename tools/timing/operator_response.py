@@ -1,0 +1,274 @@
+"""The response of a recorded run to its operator: from giving a command to the torque that rests on it.
+
+Causality is measured, not inferred: every command and status carries the serial of the newest operator command that it
+rests on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from rack.boards.config import rack_timing
+from rack.levels.operator import Answer, What
+from rack.levels.timing.system_response import CommandPath, command_paths, lowest_level
+from rack.tools.answer import Failure, print_json
+from rack.tools.live_table import print_wrapped, terminal_width
+from rack.tools.recording import Recording
+from rack.tools.text_table import table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Fate = Literal["acted on", "refused", "overtaken", "run over"]
+MEASURED, GRID, SUM, BOUND = "#0072b2", "#009e73", "#e69f00", "#d55e00"
+"""Colours of Okabe and Ito's palette, distinguishable to colour-blind readers."""
+BINS = 20
+"""Bars of a histogram up to the longest response on the grid."""
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class AnsweredCommand:
+    """One command, in ticks. `predicted` and `acts` are releases of the cycle whose torque rests on it.
+
+    `acts` is None if no cycle rests on this very command: it was refused, a newer one overtook it, or the run ended
+    first. `wall_ms` is the response by the wall clock, from giving the command to writing the status of that cycle.
+    """
+
+    serial: int
+    level: str
+    what: str
+    given: int
+    sampled: int
+    predicted: int
+    acts: int | None
+    fate: Fate
+    wall_ms: float | None = None
+
+
+@dataclass(frozen=True)
+class OperatorResponse:
+    """The response of a run. `tick_ms` is simulated time; `paths` are by level, for every level that was commanded."""
+
+    tick_ms: float
+    lockstep: bool
+    paths: dict[str, CommandPath]
+    commands: tuple[AnsweredCommand, ...]
+
+    @property
+    def measured(self) -> list[AnsweredCommand]:
+        """The commands that some torque rests on."""
+        return [command for command in self.commands if command.acts is not None]
+
+    def ticks(self, command: AnsweredCommand) -> int:
+        """Return the measured response of one of `measured`, ticks."""
+        assert command.acts is not None, "it was acted on"
+        return self.paths[command.level].response(command.given, command.acts)
+
+    @property
+    def beyond(self) -> list[AnsweredCommand]:
+        """The commands whose response exceeded a bound: the longest on the grid, or eq. 3.2 from the release on."""
+        return [command for command in self.measured if self._is_beyond(command)]
+
+    def _is_beyond(self, command: AnsweredCommand) -> bool:
+        path, ticks = self.paths[command.level], self.ticks(command)
+        # R_s of eq. 3.2 begins with the release that reads the command.
+        return ticks > path.longest or ticks - (command.sampled - command.given) > path.bound_eq_3_2
+
+    @property
+    def off(self) -> list[AnsweredCommand]:
+        """The commands acted on at another tick than predicted; only exact paths predict a tick."""
+        exact = [c for c in self.measured if self.paths[c.level].is_exact]
+        return [command for command in exact if command.acts != command.predicted]
+
+    @property
+    def held(self) -> bool:
+        """Whether no response exceeded a bound and, in lockstep, each came at the predicted tick."""
+        return not self.beyond and not (self.lockstep and self.off)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the figures of every level that was commanded, ms of simulated time, as plain data."""
+        return [self._row(level, path) for level, path in self.paths.items()]
+
+    def _row(self, level: str, path: CommandPath) -> dict[str, Any]:
+        own = [c for c in self.measured if c.level == level]
+        ms = np.array([self.ticks(c) for c in own]) * self.tick_ms
+        reading_ms = np.array([self.ticks(c) + c.given - c.sampled for c in own]) * self.tick_ms
+        return {
+            "level": level,
+            "commands": len(own),
+            "min_ms": _figure(ms, np.min),
+            "median_ms": _figure(ms, np.median),
+            "max_ms": _figure(ms, np.max),
+            "max_from_reading_ms": _figure(reading_ms, np.max),
+            "longest_ms": path.longest * self.tick_ms,
+            "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
+            "bound_eq_3_2_ms": path.bound_eq_3_2 * self.tick_ms,
+            "beyond": sum(c.level == level for c in self.beyond),
+            "off_prediction": sum(c.level == level for c in self.off),
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        commands = [asdict(c) | {"ticks": self.ticks(c) if c.acts is not None else None} for c in self.commands]
+        head = {"lockstep": self.lockstep, "tick_ms": self.tick_ms, "commands": len(self.commands)}
+        figures = {"measured": len(self.measured), "beyond": len(self.beyond), "off_prediction": len(self.off)}
+        return {**head, **figures, "levels": self.rows(), "each": commands}
+
+    def text(self, width: int | None = None) -> str:
+        """Return the figures as text for people, the table fitted to `width`."""
+        return "\n".join(self._lines(width))
+
+    def _lines(self, width: int | None) -> Iterator[str]:
+        yield f"response to {len(self.measured)} operator commands, ms of simulated time: from giving a command, and"
+        yield "from the release that reads it, to the end of the cycle whose torque rests on it"
+        head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
+        head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
+        yield from table(head, [[*self._cells(row)] for row in self.rows()], width, ("min", "sum, eq. 3.3", "median"))
+        if others := [command for command in self.commands if command.acts is None]:
+            yield f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
+        for command in self.off:
+            late = (command.acts or 0) - command.predicted
+            yield f"command {command.serial} to {command.level}, given at tick {command.given}: {late:+d} ticks"
+
+    def _cells(self, row: dict[str, Any]) -> Iterator[str]:
+        yield from (row["level"], str(row["commands"]))
+        names = ["min", "median", "max", "longest", "max_from_reading", "sum_eq_3_3", "bound_eq_3_2"]
+        yield from ("-" if row[f"{name}_ms"] is None else f"{row[f'{name}_ms']:.1f}" for name in names)
+        yield from (str(row["beyond"]), str(row["off_prediction"]))
+
+
+def response_of(recording: Recording) -> OperatorResponse | None:
+    """Return the response of a run; None if no operator commanded a level of its hierarchy."""
+    config, layout = recording.rack_config, recording.layout
+    found = command_paths(rack_timing(config, layout), layout)
+    paths = {level: path for level, path in found.items() if f"{level}.operator" in recording.mailboxes}
+    if not paths:
+        return None
+    lowest = f"{lowest_level(paths)}.status"
+    statuses = _Statuses(*(recording.signal(lowest, name) for name in ("operator", "tick", "stamp_ns")))
+    commands = [one for level, path in paths.items() for one in _commands(recording, level, path)]
+    answered = [_follow(command, given_ns, statuses) for command, given_ns in commands]
+    lockstep = config.clock.mode == "lockstep"
+    if lockstep:
+        answered = [replace(command, wall_ms=None) for command in answered]
+    answered.sort(key=lambda command: command.serial)
+    return OperatorResponse(layout.clock_ns * 1e-6, lockstep, paths, tuple(answered))
+
+
+def _commands(recording: Recording, level: str, path: CommandPath) -> Iterator[tuple[AnsweredCommand, int]]:
+    """Yield the commands given to a level, each with its time stamp, ns."""
+    box, status = f"{level}.operator", f"{level}.status"
+    # A clock that died while giving a command has given it twice: the first one counts.
+    serials, at = np.unique(recording.signal(box, "id"), return_index=True)
+    whats, given, visible, stamps = (recording.signal(box, n)[at] for n in ("what", "tick", "visible_at", "stamp_ns"))
+    orders, answers = recording.signal(status, "order"), recording.signal(status, "answer")
+    refused = set(orders[answers == Answer.REFUSED].tolist())
+    for serial, what, tick, seen, stamp in zip(serials, whats, given, visible, stamps, strict=True):
+        command = AnsweredCommand(
+            serial=int(serial),
+            level=level,
+            what=What(int(what)).name.lower(),
+            given=int(tick),
+            sampled=path.samples_at(int(seen)),
+            predicted=path.acts_at(int(seen)),
+            acts=None,
+            fate="refused" if int(serial) in refused else "run over",
+        )
+        yield command, int(stamp)
+
+
+class _Statuses(NamedTuple):
+    """Statuses of the lowest level, each array of shape (n,): the command that each rests on, its tick, its stamp."""
+
+    serial: np.ndarray
+    tick: np.ndarray
+    stamp_ns: np.ndarray
+
+
+def _follow(command: AnsweredCommand, given_ns: int, statuses: _Statuses) -> AnsweredCommand:
+    """Return the command with the first cycle of the lowest level that rests on it, or on a newer one."""
+    serial = statuses.serial
+    if command.fate == "refused" or not len(serial) or serial.max() < command.serial:
+        return command
+    first = int(np.argmax(serial >= command.serial))
+    if serial[first] != command.serial:
+        return replace(command, fate="overtaken")
+    wall_ms = round((int(statuses.stamp_ns[first]) - given_ns) * 1e-6, 6)
+    return replace(command, acts=int(statuses.tick[first]), fate="acted on", wall_ms=wall_ms)
+
+
+def _figure(values: np.ndarray, of: Callable[[np.ndarray], Any]) -> float | None:
+    return float(of(values)) if len(values) else None
+
+
+def show(recording: Recording, folder: Path, as_json: bool) -> bool:
+    """Print the response of a run and write response.json and its pictures into `folder`; return whether it held.
+
+    Raises `Failure` if no operator commanded a level.
+    """
+    response = response_of(recording)
+    if response is None:
+        why = "no operator commanded a level of its hierarchy"
+        raise Failure(f"{recording.folder}: {why}; see 'rack command', [[command]] and 'rack bench response'", 2)
+    folder.mkdir(parents=True, exist_ok=True)
+    document = response.document()
+    (folder / "response.json").write_text(json.dumps(document, indent=2) + "\n")
+    paths = plot(response, folder)
+    if as_json:
+        print_json(document)
+    else:
+        files = f"{folder}/response.json, {', '.join(path.name for path in paths)}"
+        print_wrapped(f"{response.text(terminal_width())}\n\n{files}")
+    return response.held
+
+
+def plot(response: OperatorResponse, folder: Path) -> list[Path]:
+    """Write response.png and response.svg, a histogram per level with its bounds, into `folder`; return their paths."""
+    from matplotlib.figure import Figure  # takes a second to load
+
+    levels = [level for level in response.paths if any(c.level == level for c in response.measured)]
+    figure = Figure(figsize=(8.0, 0.8 + 1.7 * len(levels)), layout="constrained")
+    axes = figure.subplots(len(levels), 1, squeeze=False)
+    for axis, level in zip(axes[:, 0], levels, strict=True):
+        _plot_level(axis, response, level)
+    time = "simulated time" if response.lockstep else "the wall clock"
+    axes[-1, 0].set_xlabel(f"from giving a command to the torque that rests on it, ms of {time}")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize="small")
+    paths = [folder / f"response.{kind}" for kind in ("png", "svg")]
+    for path in paths:
+        figure.savefig(path, dpi=150)
+    return paths
+
+
+def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    path, tick_ms = response.paths[level], response.tick_ms
+    own = [command for command in response.measured if command.level == level]
+    wait = path.delay + path.cycles[0] - 1
+    lines = (
+        ((wait + path.sum_eq_3_3) * tick_ms, SUM, "-.", "longest wait to be read + sum, eq. 3.3"),
+        (path.longest * tick_ms, GRID, "--", "longest on the grid"),
+        ((wait + path.bound_eq_3_2) * tick_ms, BOUND, "-", "longest wait to be read + bound, eq. 3.2"),
+    )
+    values = [response.ticks(c) * tick_ms if c.wall_ms is None else c.wall_ms for c in own]
+    end = max(lines[2][0], *values)
+    # A value equal to the longest is drawn left of that line, despite rounding.
+    width = path.longest * tick_ms / BINS
+    edges = np.arange(0.0, end + width, width) * (1.0 + ROUNDING)
+    axis.hist(values, bins=edges.tolist(), color=MEASURED, label="measured")
+    for at, colour, style, label in lines:
+        axis.axvline(at, color=colour, linestyle=style, label=label)
+    axis.set_xlim(0.0, 1.04 * end)
+    axis.set_ylabel("commands")
+    axis.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.set_title(f"{' > '.join(path.levels)}: {len(own)} commands", fontsize="small", loc="left")
+    axis.spines[["top", "right"]].set_visible(False)
