@@ -147,7 +147,10 @@ def main() -> int:
         core = cores.get()
         wrong = examined(mutant, core)
         cores.put(core)
-        print(f"{mutant.detector if mutant else 'no mutation'}: {wrong or 'as it must be'}", flush=True)
+        print(
+            f"{mutant.detector if mutant else 'no mutation'}: {wrong or ('noticed' if mutant else 'passed')}",
+            flush=True,
+        )
         return not wrong
 
     wanted = sys.argv[1:]

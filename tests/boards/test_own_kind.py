@@ -13,7 +13,7 @@ import pytest
 from rack.boards.config import wire
 from rack.boards.config.faults import injections
 from rack.boards.errors import ConfigError
-from rack.boards.faults import KINDS, Kind
+from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults.bounds import cycles
 from rack.boards.rack import Rack
 from rack.tools.inject import kinds_text
@@ -101,3 +101,13 @@ def test_a_campaign_draws_and_judges_a_kind_of_a_users_own(tmp_path: Path) -> No
 def test_two_kinds_of_one_name_are_refused() -> None:
     with pytest.raises(ValueError, match="kind 'kill': there is one already: 'kill'"):
         KINDS.add(Kind("kill", "process", "", (), cycles(1)))
+
+
+def test_a_kind_has_no_more_parameters_than_an_entry_of_the_fault_table_holds() -> None:
+    nine = tuple(Parameter(f"p{at}", "1", "a number", 0, 0, 1) for at in range(9))
+    with pytest.raises(ValueError, match="kind 'many': 9 parameters; at most 8"):
+        KINDS.add(Kind("many", "process", "", (), cycles(1), parameters=nine))
+
+
+def test_a_kind_that_this_process_has_not_imported_is_an_unknown_fault() -> None:
+    assert KINDS[1].name == "unknown fault"

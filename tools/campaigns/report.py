@@ -153,7 +153,7 @@ def _lines(report: Report) -> Iterator[str]:
         yield from table(KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()])
         yield from (
             "",
-            "At least: the smallest share of detected, in bound and recovered, the lower end of Wilson's 95 % interval."
+            "At least: the smallest lower end of Wilson's 95 % interval among detected, in bound and recovered."
             " Ticks are the clock's.",
         )
     yield from _faultless(report["faultless"])
@@ -175,13 +175,13 @@ def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
     yield "left behind", f"{summary['left_behind']} (processes, segments)"
     hours = f"{summary['simulated_s'] / 3600.0:.2f} simulated hours"
     yield "false detections", f"{summary['unexplained']} in {hours}: {_rate(summary['unexplained_per_hour'])}"
-    yield "misses in real time that no fault explains", summary["stray_misses"]
     if summary["faultless_s"]:
         rate = _rate(summary["false_trips_per_hour"])
         yield (
             "of these without faults, in real time",
             f"{summary['false_trips']} in {summary['faultless_s']:g} s: {rate}",
         )
+    yield "unexplained misses in real time", summary["stray_misses"]
 
 
 def _rate(found: Report | None) -> str:
