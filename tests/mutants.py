@@ -147,10 +147,8 @@ def main() -> int:
         core = cores.get()
         wrong = examined(mutant, core)
         cores.put(core)
-        print(
-            f"{mutant.detector if mutant else 'no mutation'}: {wrong or ('noticed' if mutant else 'passed')}",
-            flush=True,
-        )
+        name, good = ("no mutation", "passed") if mutant is None else (mutant.detector, "noticed")
+        print(f"{name}: {wrong or good}", flush=True)
         return not wrong
 
     wanted = sys.argv[1:]
