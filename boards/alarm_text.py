@@ -74,7 +74,7 @@ def event_of(
     """Return the event that an alarm makes: a row of `rack.backplane.alarms.RECORD` from the ring of the task `owner`.
 
     `geom` names a geom of the cell. An event's board is who found it; of a fault it is who has it, of a return it is
-    who is back. Of an operator's command the event is `rack.boards.operating.text.command_event`'s.
+    who is back. An operator's command is an event of `AlarmWatch`.
     """
     alarm, number, value = Alarm(row["code"]), int(row["subject"]), float(row["value"])
     kind, code, board, fault = KIND_OF.get(alarm, "detection"), alarm.name.lower(), owner, -1

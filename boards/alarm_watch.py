@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -9,13 +10,14 @@ import numpy as np
 from rack.backplane.address_map import CLOCK
 from rack.backplane.alarms import Alarm, alarm_ring
 from rack.backplane.fault_table import FaultTable
-from rack.backplane.operator_table import OperatorTable
+from rack.backplane.operator_table import OperatorTable, RequestEntry
 from rack.backplane.segment import Segment
 from rack.boards.alarm_text import event_of
 from rack.boards.config.cell import geom_name
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
-from rack.boards.operating.text import command_event
+from rack.boards.operating.command import describe, level_of, message_of
+from rack.levels.operator import Operation
 
 
 class Heard(NamedTuple):
@@ -49,8 +51,15 @@ class AlarmWatch:
 
     def _event(self, row: np.void, owner: str) -> Event:
         if row["code"] == Alarm.COMMANDED:
-            return command_event(row, self._operator.entries[int(row["subject"])], self._layout)
+            return self._command(row, self._operator.entries[int(row["subject"])])
         return event_of(row, owner, self._layout, self._faults, self._joints, self._geom)
+
+    def _command(self, row: np.void, entry: RequestEntry) -> Event:
+        """Return the event of a command that was given."""
+        level, message, serial = level_of(entry, self._layout), message_of(entry, self._layout), int(row["value"])
+        text, code = f"{describe(message)} (command {serial})", Operation(message.what).name.lower()
+        realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
+        return Event(realtime_ns, int(row["tick"]), "command", level, text, code, subject=level, value=serial)
 
     def _geom(self, geom: int) -> str:
         """Return the name of a geom of the cell, which is built for the first collision."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
 import traceback
@@ -12,13 +11,13 @@ from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
+from rack.boards.classes import find_class
 from rack.boards.clock_board import run_clock
-from rack.boards.clock_wiring import ClockWiring
 from rack.boards.executor_task import ExecutorTask
 from rack.boards.planner_task import PlannerTask
 from rack.boards.processor import die_with_parent, name_process, set_priority, take_processor
 from rack.boards.task import Task
-from rack.boards.wiring import TaskWiring
+from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor, Planner
 
@@ -62,7 +61,9 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
     spec, block = segment.layout.task(wiring.task), segment.block(wiring.task)
-    level = load(wiring.target)(wiring.context)
+    kind: type[Executor] | type[Planner]
+    kind = find_class(wiring.target, Executor) if spec.role == "executor" else find_class(wiring.target, Planner)
+    level = kind(wiring.context)
     try:
         level.self_test()
         if wiring.fails_self_test:
@@ -93,10 +94,3 @@ def _task(segment: Segment, wiring: TaskWiring, level: Executor | Planner, atten
     if isinstance(level, Executor):
         return ExecutorTask(segment, wiring, level, attention)
     return PlannerTask(segment, wiring, level, attention)
-
-
-def load(target: str) -> type[Executor] | type[Planner]:
-    """Return the class that "package.module:Class" names; the config has checked that it is there."""
-    module, _, name = target.partition(":")
-    found: type[Executor] | type[Planner] = getattr(importlib.import_module(module), name)
-    return found

@@ -15,8 +15,8 @@ from rack.backplane.protocols import open_observer
 from rack.backplane.realtime_driver import RealtimeDriver
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.clock_wiring import ClockWiring
 from rack.boards.system_controller import SystemController
+from rack.boards.wiring import ClockWiring
 
 HEAD_START_NS = 20_000_000
 """From the start of the clock board to tick 0: its own start-up is not a late tick."""

@@ -25,11 +25,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.board import enter, run_clock_board, run_task_board
 from rack.boards.channel import Channel
-from rack.boards.clock_wiring import ClockWiring
 from rack.boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
 from rack.boards.faults.tasks import hog
 from rack.boards.processor import set_priority
-from rack.boards.wiring import TaskWiring
+from rack.boards.wiring import ClockWiring, TaskWiring
 
 LEAVE_S = 0.5
 """Time that boards get to end by themselves when the launcher is gone."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rack.boards.clock_wiring import ClockWiring
-from rack.boards.wiring import TaskWiring
+from rack.boards.wiring import ClockWiring, TaskWiring
 
 
 @dataclass(frozen=True)

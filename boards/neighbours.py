@@ -15,7 +15,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import SegmentError
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import Block, Run, System
-from rack.boards.config.cores import obtained_core
+from rack.boards.config.layout import obtained_core
 from rack.boards.config.schema import RackConfig
 
 

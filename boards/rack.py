@@ -25,18 +25,18 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.alarm_watch import AlarmWatch, Heard
 from rack.boards.clean import remove_dead, remove_own
-from rack.boards.config import load
+from rack.boards.config.commands import asked, request
+from rack.boards.config.resolved import load, modules, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate_line import CrateLine
 from rack.boards.crate_messages import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
+from rack.boards.ending import Ending
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.events import Event
 from rack.boards.faults.kind import KINDS
 from rack.boards.heartbeat import Heartbeat
 from rack.boards.journal import Journal
-from rack.boards.launch import Launch, modules
 from rack.boards.neighbours import conflicts, holders, placed
-from rack.boards.operating.request import asked, request, requests
 from rack.boards.outcome import Cause, Outcome
 from rack.boards.recovery import Recovery
 from rack.boards.supervision import Supervision
@@ -111,7 +111,7 @@ class Rack:
         self._crate = crate = CrateLine()
         # The crate imports while the config is being wired: on two cores that is half a second saved.
         crate.send(Preload(modules(self.config), tuple(sys.path)))
-        self._plan = plan = Launch.of(self.config)
+        self._plan = plan = resolve(self.config)
         remove_dead(self.config.name)
         self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
         self._set_words()
@@ -153,12 +153,13 @@ class Rack:
             if KINDS[injection.kind].where == "core":
                 self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
-        for wanted in requests(self.config, self._plan.layout):
+        for wanted in self._plan.commands:
             desk.add(wanted)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock: the run begins. It lasts `seconds` of simulated time, or until the task ends."""
         clock = self._plan.clock(seconds)
+        self._ending = Ending(self.segment, clock.ends_run, clock.silent)
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
         supervision = Supervision(self.config, self._plan.layout)
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
@@ -293,11 +294,11 @@ class Rack:
             self._journal.keep(heard.event)
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
-        state, reason = self._plan.final_state(self.segment)
+        state, reason = self._ending.final_state()
         # A stop may also be requested from outside, by a word in the segment.
-        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._plan.cause_of(self.segment))
+        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._ending.cause())
         if cause in ("task done", "time over"):
-            self._faults += self._plan.latched(self.segment)
+            self._faults += self._ending.latched()
         self._let_go()
         self.outcome = Outcome(cause, stop, state, reason, digest(self.segment, stop), tuple(self._faults))
         self._journal.tell("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from rack.backplane.address_map import CLOCK
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
-from rack.boards.clock_wiring import ClockWiring
 from rack.boards.crate_line import CrateLine
 from rack.boards.crate_messages import PowerOff, PowerOn
 from rack.boards.supervision import Restart, Supervision
-from rack.boards.wiring import TaskWiring
+from rack.boards.wiring import ClockWiring, TaskWiring
 
 
 class Recovery:

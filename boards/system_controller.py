@@ -11,9 +11,9 @@ from rack.backplane.clock_driver import ClockDriver
 from rack.backplane.released_task import ReleasedTask
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, System
-from rack.boards.clock_wiring import ClockWiring
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.operating.desk import OperatorDesk
+from rack.boards.wiring import ClockWiring
 
 # Plain integers for the hot path.
 _LOSSES, _EMERGENCY = int(System.LOSSES), int(System.EMERGENCY_STOP)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from time import process_time_ns
 from typing import ParamSpec, TypeVar
 
@@ -11,16 +10,6 @@ from rack.backplane.process import compute_until
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """Processor time that each kind of access takes at least, ns; see `rack.boards.config.schema.TransferConfig`."""
-
-    read_ns: int = 0
-    write_ns: int = 0
-    exchange_ns: int = 0
-    update_ns: int = 0
 
 
 def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:

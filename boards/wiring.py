@@ -1,20 +1,30 @@
-"""What one task needs to run: its class and the mailboxes behind its ports. Plain data, sent to the crate."""
+"""Plain data that the Rack sends to the crate: all that one process needs to run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rack.boards.transfer import Transfer
+from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
 
 @dataclass(frozen=True)
-class TaskWiring:
-    """One task: `target` is "package.module:Class"; `inputs` and `outputs` map ports to mailboxes.
+class BusTimes:
+    """A slower bus: processor time that each kind of access takes at least, ns; see `[board.<name>.transfer]`."""
 
-    `critical_priority` is the SCHED_FIFO priority that a tight planner takes for its plan update. `guards_clock`: the
-    task, one of the fastest, looks after the clock. `fails_self_test` is a fault of the config.
+    read_ns: int = 0
+    write_ns: int = 0
+    exchange_ns: int = 0
+    update_ns: int = 0
+
+
+@dataclass(frozen=True)
+class TaskWiring:
+    """One task: its class `target`, as "package.module:Class", and a mailbox for each port.
+
+    `critical_priority`: SCHED_FIFO priority that a tight planner takes for its plan update. `guards_clock`: the task,
+    one of the fastest, watches the clock. `fails_self_test`: a fault of the config.
     """
 
     task: str
@@ -26,4 +36,27 @@ class TaskWiring:
     critical_priority: int = 0
     guards_clock: bool = False
     fails_self_test: bool = False
-    transfer: Transfer = field(default_factory=Transfer)
+    transfer: BusTimes = field(default_factory=BusTimes)
+
+
+@dataclass(frozen=True)
+class ClockWiring:
+    """The clock's board: how a run proceeds in time. `period_ns` is wall-clock time, so it includes the speed factor.
+
+    All other times are ticks. The run ends at `stop_tick` (0: never), or `linger` after the status mailbox `ends_run`
+    says done or error, or after its writer, not lost, has written nothing for `silent`. In lockstep the clock is never
+    more than `history` ahead of a recorder, and a lost board rejoins `restart_ticks` after its loss. `on_loss`: what
+    the loss of a task demands of the arm.
+    """
+
+    lockstep: bool
+    period_ns: int
+    stop_tick: int
+    ends_run: str | None
+    linger: int
+    silent: int
+    history: int
+    core: int
+    priority: int
+    restart_ticks: int
+    on_loss: Mapping[str, Demand]

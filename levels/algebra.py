@@ -2,7 +2,7 @@
 
 A lockstep run repeats bit for bit, on another machine too. Numpy does not promise that: its BLAS (`@`, `np.dot`,
 `np.linalg`) sums in an order that depends on the processor's vector unit, and many of its functions (`tanh`, `exp`,
-`arctan2`, `arccos`, `**` with exponents other than 2) have a variant of their own for each. Levels use these instead:
+`arctan2`, `arccos`, `**` with exponents other than 2) have a variant for each. Levels use these instead:
 
 - products, solutions and lengths from MuJoCo: compiled once, no choice at run time, and about as fast as BLAS for a
   handful of joints;

@@ -1,10 +1,10 @@
-"""The exception tree of the levels, and where each one shows.
+"""The exceptions of the levels, with an example of each.
 
 `LevelError` is the root.
 
-- `RobotError`: an MJCF file that is missing or malformed, joints or sites that the model lacks.
-- `ProgramError`: a task program that names an unknown object, verb or place.
-- `Refused`: a command that cannot be carried out; a planner turns it into a status with its code and reason.
+- `RobotError`: an MJCF file is missing or malformed; the model lacks a joint or a site.
+- `ProgramError`: a task program names an unknown object, verb or place.
+- `Refused`: a command cannot be carried out; a planner turns it into a status with its code and reason.
 """
 
 from __future__ import annotations

@@ -1,13 +1,56 @@
-"""A level: an executor every cycle and a planner in the background (fig. 1).
+"""A level: an executor every cycle and a planner in the background (fig. 1), and what its author must know.
 
-The author of a level writes `process` and `plan`; pinning, timing, tracing, mailboxes and faults
-stay outside, in the board that runs it.
+The author writes `process` and `plan`. Pinning, timing, tracing, mailboxes and injected faults belong to the board that
+runs the level. The other duties, each with its reason:
+
+Every level
+- `process` takes bounded time: it never waits, logs or prints. The cycle has a deadline.
+- An exception ends the board, which is restarted as a new process with a new object. Whatever must outlive that, read
+  back from your own mailboxes (`Input(STATUS, "own.status")`): they survive.
+- `tick` may advance by more than `context.every`: cycles are skipped after a miss. Compute elapsed time from it; never
+  read a clock, and take randomness from `context.seed` and `tick`. Otherwise lockstep runs differ.
+- Use `rack.levels.algebra` in place of `@`, `np.linalg`, `exp`, `arctan2` and the like: those differ in the last bit
+  between processors.
+- Every output is written at the end of every cycle, with the values that it holds then, the last cycle's if unchanged.
+- A `Reading` before the first message is all zeros (`is_there` is False); later it repeats the newest (`is_new` is
+  False). `is_lost`: its writer is dead or silent. A level that moves the arm then holds, and gives the reason.
+
+Messages
+- A command (`rack.backplane.message.command`) has an `id` that rises with every new command; 0: nothing is commanded.
+- A status (`status`), written to the port "status", echoes the command's `id` and shows `state` in every cycle: the
+  board with `ends_run` ends the run by DONE or ERROR; HOLDING (kept from its work) and ERROR need a `reason` of one
+  line, for a user sees it as the reason of a stall. A status whose `error` is not 0 at the end fails the run.
+- Symbolic sizes of fields ("joints", "bodies", "state") follow from `[robot]` and `[scene]`, see `context.sizes`.
+  Reader and writer of a mailbox must name the same message type and version.
+
+Operator: a level that takes commands reads `Input(OPERATOR_COMMAND, "own.operator")`, lists them in `commands`, follows
+with `rack.levels.operator.Orders`, has `*ANSWER` in its status (`orders.report`) and `RESTS_ON` in its command
+(`command.operator = orders.rests_on(...)`). A level that takes none passes `operator` on, down and into its status:
+without it the response of the system to an operator cannot be measured.
+
+Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check` then reports every
+mistake before the launch. Executor and planner of a board share one table. A level that reads a program from `[task]`
+declares `program = MyProgram`, a `Program`, likewise.
+
+A servo level of your own
+- reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0` until the first set
+  point (while `command.due` is 0), and again when set points stop: the primitive level waits for this, and motion
+  begins at that `target`. Four primitive cycles after set points began, `holding` must be 0; else it starts over.
+- reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the primitive level waits.
+- writes a status in every primitive cycle, with `position` near `target`: the primitive level holds motion when
+  statuses are missing, or when a joint is farther off than its `following`.
+- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm through nothing else.
+- lets the arm's time pass, saves its state, and shows its scene, without which the world model is stale and motion
+  holds: `rack.levels.arm.arm` says how.
+
+A primitive level of your own writes set points due two of its cycles later (`due = tick + 2 * every`): one brings them
+to the servo, over the second the servo interpolates. It reports `done`, `current`, `resting` and `blocked` of segments.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
@@ -17,8 +60,7 @@ from rack.backplane.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
 from rack.backplane.words import Demand
 from rack.levels.operator import Commands
-from rack.levels.robot import RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import RobotConfig, SceneConfig, Table
 
 __all__ = [
     "Demand",
@@ -30,20 +72,19 @@ __all__ = [
     "Pace",
     "Planner",
     "Ports",
+    "Program",
     "Reading",
     "Verdict",
 ]
 
 
 class Input(NamedTuple):
-    """A port that a level reads.
-
-    `source` is a mailbox ("world.model"), or is relative to the level: "above.command",
-    "below.status", "own.plan". A config may wire the port elsewhere.
-    """
+    """A port that a level reads."""
 
     type: MessageType
     source: str
+    """A mailbox ("world.model"), or relative to the level: "above.command", "below.status", "own.plan". A config may
+    wire the port elsewhere."""
 
 
 class Ports(SimpleNamespace):
@@ -53,53 +94,54 @@ class Ports(SimpleNamespace):
         raise AttributeError(f"no port '{name}'; ports: {', '.join(sorted(self.__dict__))}")
 
 
-class Pace(NamedTuple):
-    """How often a level cycles, in ticks, and how many of its cycles one of its plans may take."""
+class Program(Table):
+    """Base of the record of a level that reads a program from `[task]`."""
 
-    every: int
-    within_cycles: int
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
+        """Yield key, value and reason of all that does not fit the arm or the scene, as in "action[0].object"."""
+        return ()
+
+
+class Pace(NamedTuple):
+    """The rhythm of a level."""
+
+    every: int  # ticks from cycle to cycle
+    within_cycles: int  # cycles that one plan may take
 
 
 class Fault(NamedTuple):
-    """A fault that is injected into what a level drives: its kind, as in "sensor-nan", and the kind's parameters.
+    """A fault injected into the arm, or whatever else a level drives."""
 
-    `seed` makes everything random in it repeatable; `since` is the tick at which it began. `step` is what acts, of one
-    of the classes that the level names in `faults`.
-    """
-
-    kind: str
-    parameters: Mapping[str, float]
-    seed: int
-    since: int
-    step: object
+    kind: str  # as in "sensor-nan"
+    parameters: Mapping[str, float]  # of the kind, by name
+    seed: int  # makes everything random in it repeatable
+    since: int  # tick at which it began
+    step: object  # acts the fault; of one of the classes that the level names in `faults`
 
 
 class Finding(NamedTuple):
-    """What a level has found wrong, for its board to ring: see `rack.backplane.alarms.Alarm` for subject and value."""
+    """A fault that a level has found; its board raises the alarm. See `rack.backplane.alarms.Alarm`."""
 
     alarm: Alarm
-    subject: int = -1
-    value: float = 0.0
+    subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular
+    value: float = 0.0  # measured, in the unit of the alarm
 
 
 @dataclass(frozen=True)
 class LevelContext:
-    """What a level knows of its rack, from the config. Times are ticks of the system clock.
+    """The rack as a level knows it, from the config. Times are ticks of the system clock."""
 
-    `below` is the pace of the level below; None for a level that has none.
-    """
-
-    board: str
-    every: int
-    within_cycles: int
-    clock_ns: int
-    seed: int
-    robot: RobotConfig
+    board: str  # name of the board, and of the level
+    every: int  # ticks from cycle to cycle
+    within_cycles: int  # cycles that one plan may take
+    clock_ns: int  # one tick, ns of simulated time
+    seed: int  # of everything random
+    robot: RobotConfig  # a rack without an arm has levels that do not ask for it
     scene: SceneConfig
-    task: Mapping[str, Any]
-    sizes: Mapping[str, int]
-    below: Pace | None
-    params: Mapping[str, Any] = field(default_factory=dict)
+    task: Mapping[str, Any]  # `[task]`
+    sizes: Mapping[str, int]  # symbolic sizes of messages by name
+    below: Pace | None  # pace of the level below; None: there is none
+    params: Mapping[str, Any] = field(default_factory=dict)  # `[board.<name>.params]`, as given
 
     @property
     def period_s(self) -> float:
@@ -115,7 +157,7 @@ class LevelContext:
 class Executor(ABC):
     """The foreground of a level: runs every cycle, at high priority, in bounded time.
 
-    Subclasses name their ports and write `process`. Output messages keep their values from cycle to
+    Subclasses declare their ports and write `process`. Output messages keep their values from cycle to
     cycle; each is written to its mailbox `<board>.<port>` at the end of every cycle.
     """
 
@@ -124,21 +166,25 @@ class Executor(ABC):
     faults: ClassVar[tuple[type, ...]] = ()
     """Classes of steps by which faults can strike what the level drives: see `rack.levels.faults`."""
     commands: ClassVar[Commands] = {}
-    """What an operator may tell the level, and how goals are given: of one that reads "own.operator"."""
+    """An operator's commands to the level, with the forms of their goals; for a level that reads "own.operator"."""
     params: ClassVar[type[Table] | None] = None
-    """What `[board.<name>.params]` may hold, checked before the launch; None: whatever the level reads by itself."""
+    """Keys of `[board.<name>.params]`, checked before the launch; None: unchecked, the level reads them by itself."""
+    program: ClassVar[type[Program] | None] = None
+    """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it by itself."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
-        self.demand = Demand.NONE  # what the safety of the rack asks of the arm in this cycle; set by the board
-        self.findings: list[Finding] = []  # filled in `process`; the board rings and clears them
-        self.acted: list[int] = []  # places, in what was injected, of the faults that acted in this cycle; likewise
+        # In addition to the ports, these pass between board and level. The board sets `demand` before each `process`,
+        # and reports and clears `findings` and `acted` after it. It calls `inject` when the active faults change.
+        self.demand = Demand.NONE  # stop that the rack's safety demands of the arm in this cycle
+        self.findings: list[Finding] = []  # faults found in this cycle, once an episode: the board raises an alarm each
+        self.acted: list[int] = []  # indices, in the injected sequence, of the faults that acted in this cycle
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Take over the faults that are injected from now on, all that are active; empty: none is."""
+        """Replace the injected faults by `faults`, all that are active from now on."""
 
     def self_test(self) -> None:
-        """Raise `LevelError` when the level must not start; the board then holds SYSFAIL."""
+        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
 
     @abstractmethod
     def process(self, read: Ports, write: Ports, tick: int) -> None:
@@ -151,22 +197,25 @@ class Executor(ABC):
 class Planner(ABC):
     """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
 
-    A planner has one output, `plan`, its mailbox `<board>.plan`.
+    It runs in a separate process and shares nothing with the executor but mailboxes. Its one
+    output is its mailbox `<board>.plan`.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     output: ClassVar[MessageType]
     params: ClassVar[type[Table] | None] = None
-    """As the executor's: one table is for both."""
+    """As the executor's: both share one table."""
+    program: ClassVar[type[Program] | None] = None
+    """As the executor's."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
 
     def self_test(self) -> None:
-        """Raise `LevelError` when the level must not start; the board then holds SYSFAIL."""
+        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Say, in well under a cycle, whether a plan is wanted now. Default: a command is new."""
+        """Return, in well under a cycle, whether a plan is wanted now. Default: a command is new."""
         return bool(read.command.is_new)
 
     @abstractmethod

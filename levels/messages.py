@@ -1,8 +1,7 @@
 """The messages of the default rack: commands go down, statuses come up, plans stay within a level.
 
-Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (MuJoCo's
-integration state). Quaternions are w, x, y, z. Poses are of the world frame.
-Simulated time is tick times the clock's period.
+Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (MuJoCo's integration state).
+Quaternions are w, x, y, z. Poses are in the world frame. Simulated time is tick times the clock's period.
 """
 
 from __future__ import annotations
@@ -14,17 +13,17 @@ from rack.backplane.words import Demand
 from rack.levels.operator import ANSWER, RESTS_ON
 
 WINDOW = 8
-"""Elemental moves that the task level hands down at once: the next level never waits for a cycle above it."""
+"""Elemental moves in one task command: the level below never waits for a cycle of the task level."""
 SEGMENTS = 2
-"""Segments that the elemental move level hands down at once."""
+"""Segments in one move command."""
 WAYPOINTS = 24
-"""Joint-space points of one path, at most."""
+"""Most joint-space points of one path."""
 MOVES = 96
-"""Elemental moves of one task program, at most."""
+"""Most elemental moves of one task program."""
 SECTIONS_A_LINE = 8
-"""Sections of constant jerk for one line of a path and the corner behind it: seven change speed, one keeps it."""
+"""Sections of constant jerk for one line of a path and the corner after it: seven change speed, one keeps it."""
 SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
-"""Sections of constant jerk of one trajectory, at most."""
+"""Most sections of constant jerk of one trajectory."""
 
 
 class Error(IntEnum):
@@ -41,27 +40,27 @@ class Error(IntEnum):
     SIMULATION = 8
     BELOW = 9
     TOUCHED = 10
-    SENSORS = 11  # a sensor that did not come back within its bound
-    BLOCKED = 12  # something stays in the way: as often replanned as permitted
+    SENSORS = 11  # a sensor did not recover within its bound
+    BLOCKED = 12  # something stays in the way, after as many replans as permitted
     OVERLOAD = 13  # more than motors or gripper can carry
     STALLED = 14  # nothing has moved for the time that the task permits
-    MOTORS = 15  # a motor that did not give its torque however often it was tried
+    MOTORS = 15  # a motor did not give its torque, however often it was retried
 
 
 class Verb(IntEnum):
-    """What an elemental move does."""
+    """Kinds of elemental moves."""
 
     NONE = 0
     MOVE = 1  # free motion of the tool to a pose
     MOVE_JOINTS = 2  # free motion to joint positions
-    APPROACH = 3  # straight motion; what is held or is about to be grasped may touch its support
+    APPROACH = 3  # straight motion; the object held or to be grasped may touch its support
     GRASP = 4  # close the gripper on an object
     DEPART = 5  # straight motion away; the same contacts are permitted
     RELEASE = 6  # open the gripper
 
 
 class SegmentKind(IntEnum):
-    """What the primitive level is asked for."""
+    """Kinds of segments."""
 
     NONE = 0
     PATH = 1
@@ -80,7 +79,7 @@ ELEMENTAL_MOVE = MessageType(
         Field("quaternion", "f8", "1", "tool orientation at the end", (4,)),
         Field("joints", "f8", "rad", "where MOVE_JOINTS ends; with `posture`, near the end", ("joints",)),
         Field("posture", "u1", "1", "1: of the configurations at the pose, the one nearest to `joints` is wanted"),
-        Field("by", "f8", "s", "simulated time by which it must be done; 0: no such time"),
+        Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
     ),
 )
 
@@ -89,7 +88,7 @@ TASK_PLAN = MessageType(
     1,
     (
         Field("id", "u4", "1", "serial of the plan"),
-        Field("error", "u2", Error, "why the program is refused; 0: it is not"),
+        Field("error", "u2", Error, "why the program is refused; 0: it is not refused"),
         Field("reason", "S120", "ASCII", "the refusal, readable"),
         Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
         Field("count", "u2", "1", "moves that follow"),
@@ -115,7 +114,7 @@ TASK_STATUS = status(
     Field("moves_done", "u2", "1", "elemental moves done"),
     Field("moves", "u2", "1", "elemental moves of the plan; 0 before there is one"),
     Field("first", "u4", "1", "id under which the plan's first move is handed down"),
-    Field("detour", "u4", "1", "id of the move that an operator wants, in place of those; 0: none"),
+    Field("detour", "u4", "1", "id of the move that an operator wants instead; 0: none"),
 )
 
 OPERATED = Field("operated", "u1", "1", "1: an operator keeps this level, or one below it, from its own work")
@@ -129,13 +128,13 @@ MOVE_STATUS = status(
     Field("progress", "f8", "1", "part of its path done, 0 to 1"),
     Field("verb", "u1", Verb, "of the move under way"),
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
-    Field("planned", "u4", "1", "newest elemental move whose path is at hand; 0: none yet"),
+    Field("planned", "u4", "1", "newest elemental move whose path is ready; 0: none yet"),
     Field("end", "f8", "rad", "joint positions at the end of that path", ("joints",)),
     Field("replan", "u4", "1", "open request to plan the current move anew from `start`; 0: none is open"),
     Field("start", "f8", "rad", "joint positions where that motion holds", ("joints",)),
     Field("replans", "u4", "1", "plans made anew because something was in the way"),
     OPERATED,
-    Field("resting", "u1", "1", "1: the arm rests, and whoever moves it has heard the newest command of an operator"),
+    Field("resting", "u1", "1", "1: the arm rests, and the level that moves it has the operator's newest command"),
 )
 
 MOVE_PLAN = MessageType(
@@ -165,7 +164,7 @@ SEGMENT = MessageType(
         Field("count", "u2", "1", "waypoints that follow"),
         Field("waypoints", "f8", "rad", "path in joint space, from where the motion starts", (WAYPOINTS, "joints")),
         Field("blend", "f8", "rad", "length over which corner k is rounded", (WAYPOINTS,)),
-        Field("by", "f8", "s", "simulated time by which it must be done; 0: no such time"),
+        Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
         Field("opening", "f8", "m", "gripper joint position to go to, for GRIPPER"),
         Field("force", "f8", "N", "largest gripper force on the way and afterwards"),
     ),
@@ -223,6 +222,7 @@ JOINT_SET_POINT = command(
     Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point yet, hold"),
     Field("position", "f8", "rad", "joint positions", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    # For a servo level that feeds acceleration forward; the default one derives it from positions and velocities.
     Field("acceleration", "f8", "rad/s2", "joint accelerations", ("joints",)),
     Field("opening", "f8", "m", "gripper joint position to go to"),
     Field("force", "f8", "N", "largest gripper force"),
@@ -233,7 +233,7 @@ SERVO_PLAN = MessageType(
     "servo_plan",
     1,
     (
-        Field("inertia", "f8", "kg m2", "joint-space inertia, what is held included", ("joints", "joints")),
+        Field("inertia", "f8", "kg m2", "joint-space inertia, the object held included", ("joints", "joints")),
         Field("held", "i2", "1", "object included; -1: none"),
         Field("payload_mass", "f8", "kg", "mass in the gripper"),
         Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
@@ -244,7 +244,7 @@ SERVO_STATUS = status(
     "servo_status",
     4,
     *ANSWER,
-    Field("position", "f8", "rad", "joint positions, measured; while sensors lie, as far as known", ("joints",)),
+    Field("position", "f8", "rad", "joint positions, measured; estimated for suspect sensors", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
     Field("torque", "f8", "N m", "torque given to the arm in this cycle, after the limit gate", ("joints",)),
     Field("target", "f8", "rad", "set point interpolated for this cycle", ("joints",)),
@@ -255,11 +255,11 @@ SERVO_STATUS = status(
     Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
     Field("stopped", "u1", "1", "1: set points are not followed: a demand, an operator, a fault, or brakes"),
     Field("braked", "u1", "1", "1: the brakes are engaged"),
-    Field("demand", "u1", Demand, "what the safety of the rack asks of the arm in this cycle"),
+    Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
     Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),
-    Field("touches", "u4", "1", "contacts that no task means, counted at every substep"),
+    Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
     Field("violations", "u4", "1", "substeps in which the arm drove a position, velocity or torque beyond its limit"),
-    Field("pushed", "u4", "1", "substeps in which what struck the arm pushed a joint beyond a limit"),
+    Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
 )
 
 ARM_STATE = MessageType(
@@ -268,18 +268,23 @@ ARM_STATE = MessageType(
     (
         Field("tick", "i8", "tick", "tick that the state belongs to"),
         Field("clipped", "u4", "1", "cycles in which the limit gate cut a command"),
-        Field("touches", "u4", "1", "contacts that no task means"),
+        Field("touches", "u4", "1", "unintended contacts"),
         Field("violations", "u4", "1", "substeps in which the arm broke a limit"),
-        Field("pushed", "u4", "1", "substeps in which what struck the arm pushed a joint beyond a limit"),
-        Field("struck", "i4", "tick", "ticks for which the arm still moves on from what struck it"),
+        Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
+        Field("struck", "i4", "tick", "ticks for which the motion is still that of a blow"),
         Field("waited", "i4", "tick", "ticks since the last command"),
         Field("braked", "u1", "1", "1: the brakes are engaged"),
         Field("rest", "f8", "rad", "where engaged brakes hold the joints", ("joints",)),
-        Field("position", "f8", "rad", "joint positions as the servo level trusts them", ("joints",)),
+        Field("position", "f8", "rad", "joint positions as the servo level estimates them", ("joints",)),
         Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
-        Field("doubt", "f8", "rad", "how far from the truth those positions may be", ("joints",)),
-        Field("kept", "i8", "tick", "ticks for which faults have kept the arm from its set points, see ServoParams"),
-        Field("error", "u2", Error, "fault that is latched; 0: none is"),
+        Field("doubt", "f8", "rad", "largest error of those positions", ("joints",)),
+        Field(
+            "kept",
+            "i8",
+            "tick",
+            "ticks for which faults have kept the arm from its set points: see ServoParams.patience",
+        ),
+        Field("error", "u2", Error, "latched fault; 0: none"),
         Field("reason", "S120", "ASCII", "that fault, readable"),
         Field("state", "f8", "", "mjSTATE_INTEGRATION of the simulated cell", ("state",)),
     ),
@@ -304,6 +309,6 @@ WORLD_MODEL = MessageType(
         Field("position", "f8", "m", "body origins", ("bodies", 3)),
         Field("quaternion", "f8", "1", "body orientations", ("bodies", 4)),
         Field("velocity", "f8", "m/s", "body velocities, estimated", ("bodies", 3)),
-        Field("sensed", "i8", "tick", "cycle of the world model that last took over a new scene"),
+        Field("sensed", "i8", "tick", "cycle in which the newest scene was taken over"),
     ),
 )

@@ -1,34 +1,38 @@
-"""What an operator may tell any level, beside or instead of the level above it: the words and the messages of it.
+"""An operator's commands to any level: words, messages, and how a level follows them.
 
-A level that can be commanded reads "own.operator", says in `commands` what it takes, follows it with
-`rack.levels.orders`, and has `ANSWER` among the fields of its status. `RESTS_ON` goes down with every command, so that
-the lowest status tells which command of an operator its torque rests on: the response of the system is measured, not
-guessed.
+An operator may command every level that reads "own.operator" and declares `commands`, in addition to the level above it
+or in its place. The level follows with `Orders` and has `ANSWER` among the fields of its status. `RESTS_ON` goes down
+with every command, so the lowest status says which command its torque rests on: the response of the system is measured,
+not guessed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 
-from rack.backplane.message import REASON_BYTES, Field, command
+import numpy as np
+from numpy.typing import NDArray
 
-MOST_JOINTS = 16
-"""Joints of an arm, at most: an operator's mailbox is the same in every rack."""
+from rack.backplane.mailbox import Reading
+from rack.backplane.message import REASON_BYTES, Field, Message, command
+
+MAX_JOINTS = 16
+"""Most joints of an arm: an operator's mailbox is the same in every rack."""
 
 
-class What(IntEnum):
-    """What an operator says."""
+class Operation(IntEnum):
+    """Commands of an operator."""
 
     NONE = 0
     HOLD = 1  # come to rest, and stay until RESUME
-    RESUME = 2  # go on with your own work
+    RESUME = 2  # return to the level's own work
     SETPOINT = 3  # bring the joints to positions, and stay until RESUME
-    GOTO = 4  # move to a goal by your own planning, and stay until RESUME
+    GOTO = 4  # move to a goal by the level's own planning, and stay until RESUME
 
 
 class Goal(IntEnum):
-    """How the goal of a command is given."""
+    """Forms in which a command gives its goal."""
 
     NONE = 0
     JOINTS = 1  # joint positions
@@ -38,21 +42,21 @@ class Goal(IntEnum):
 
 
 class Answer(IntEnum):
-    """What has become of an operator's newest command."""
+    """A level's answer to its operator's newest command."""
 
     NONE = 0  # there was none
-    TAKEN = 1  # the level does it
+    TAKEN = 1  # the level is doing it
     DONE = 2
-    REFUSED = 3  # it goes on as before
+    REFUSED = 3  # the level continues as before
 
 
 OPERATOR_COMMAND = command(
     "operator_command",
     1,
-    Field("what", "u1", What, "what to do"),
-    Field("goal", "u1", Goal, "how the goal is given"),
+    Field("what", "u1", Operation, "what to do"),
+    Field("goal", "u1", Goal, "form of the goal"),
     Field("count", "u1", "1", "joints that follow"),
-    Field("joints", "f8", "rad", "joint positions, for goal joints", (MOST_JOINTS,)),
+    Field("joints", "f8", "rad", "joint positions, for goal joints", (MAX_JOINTS,)),
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
     Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
     Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
@@ -62,17 +66,24 @@ RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or 
 ANSWER = (
     RESTS_ON,
     Field("order", "u4", "1", "newest command that an operator gave to this level; 0: none yet"),
-    Field("answer", "u1", Answer, "what has become of it"),
-    Field("standing", "u1", What, "what an operator has the level do; 0: its own work"),
+    Field("answer", "u1", Answer, "this level's answer to it"),
+    Field("standing", "u1", Operation, "operator's command in force; 0: none, the level does its own work"),
     Field("objection", f"S{REASON_BYTES}", "ASCII", "why it was refused, readable"),
 )
 """Fields of a status that answer an operator."""
 
-Commands = Mapping[What, Sequence[Goal]]
+Commands = Mapping[Operation, Sequence[Goal]]
+
+EFFECTS = {Operation.HOLD: "held", Operation.SETPOINT: "kept at a set point", Operation.GOTO: "diverted"}
+"""Effects of a standing command on a level, in words."""
+HELD_FROM_ABOVE = "held by the level above"
+"""Reason of a level that is held from above. The level above knows, and does not pass it on."""
+ABOVE_LOST = "no command from the level above: held until its board is back"
+BELOW_LOST = "no status from the level below: waiting for its board"
 
 
 def listed(commands: Commands) -> str:
-    """Return what a level can be told, for people: "hold, resume, goto joints|pose"."""
+    """Return a level's commands for people: "hold, resume, goto joints|pose"."""
     return ", ".join(f"{what.name.lower()} {goal_names(goals)}".rstrip() for what, goals in commands.items())
 
 
@@ -81,10 +92,115 @@ def goal_names(goals: Sequence[Goal]) -> str:
     return "|".join(goal.name.lower() for goal in goals)
 
 
-def told(what: int, goal: int) -> str:
+def described(what: int, goal: int) -> str:
     """Return a command in words, whatever its numbers: "goto pose"."""
     names = [
         kind(number).name.lower() if number in set(kind) else str(number)
-        for kind, number in ((What, what), (Goal, goal))
+        for kind, number in ((Operation, what), (Goal, goal))
     ]
     return " ".join(names[: 1 + (goal != Goal.NONE)])
+
+
+class Orders:
+    """The operator's commands to one level.
+
+    A refused command leaves the one before it in force, also on a restarted board: that takes up every command again,
+    in their order.
+    """
+
+    def __init__(self, commands: Commands) -> None:
+        self._commands = commands
+        self.standing = Operation.NONE  # in force: HOLD, SETPOINT or GOTO; NONE: the level does its own work
+        self.serial = 0  # of the newest command; 0: none yet
+        self.basis = 0  # of the newest command that was not refused; 0: none yet
+        self.answer = Answer.NONE
+        self._objection = ""
+        self._before = 0, Operation.NONE
+        self._is_reported = False
+
+    def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
+        """Read the mailbox; return True in the cycle that takes up a command.
+
+        `judge` is called with each command taken up: a level with objections of its own refuses the command there.
+        """
+        if not operator.is_new:
+            return False
+        taken = False
+        for message in (*operator.earlier, operator.value):
+            if self._take_up(message):
+                taken = True
+                if judge is not None:
+                    judge(message)
+        return taken
+
+    def _take_up(self, message: Message) -> bool:
+        # Once only: a clock board restarted while giving a command gives it again.
+        if message.id <= self.serial:
+            return False
+        self._before = self.basis, self.standing
+        self.serial, self._objection, self._is_reported = message.id, "", False
+        what, goal = message.what, message.goal
+        if what not in self._commands or goal not in (self._commands[Operation(what)] or (Goal.NONE,)):
+            self.refuse(f"{described(what, goal)} is not a command of this level; permitted: {listed(self._commands)}")
+            return False
+        resumes = what == Operation.RESUME
+        self.basis = self.serial
+        self.standing = Operation.NONE if resumes else Operation(what)
+        self.answer = Answer.DONE if resumes else Answer.TAKEN
+        return True
+
+    def refuse(self, why: str) -> None:
+        """Refuse the command just taken up: the one before it is in force again."""
+        self.basis, self.standing = self._before
+        self._answer(Answer.REFUSED, why)
+
+    def fail(self, why: str) -> None:
+        """Give up the command taken up: the level holds instead."""
+        self.standing = Operation.HOLD
+        self._answer(Answer.REFUSED, why)
+
+    def under_way(self) -> None:
+        """Report that a RESUME takes time."""
+        self._answer(Answer.TAKEN)
+
+    def done(self) -> None:
+        """Report that the command is done; it remains in force."""
+        if self.answer is Answer.TAKEN:
+            self._answer(Answer.DONE)
+
+    def keeps(self, board: str) -> str:
+        """Return why an operator keeps level `board` from its own work; empty: none does."""
+        if self.answer is Answer.REFUSED and self.basis == self.serial:
+            return f"{board} held, `resume` releases it: {self._objection}"
+        effect = EFFECTS.get(self.standing)
+        return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
+
+    def _answer(self, answer: Answer, why: str = "") -> None:
+        self.answer, self._objection, self._is_reported = answer, why, False
+
+    def rests_on(self, above: int) -> int:
+        """Return the newest command that this cycle rests on; `above` is that of the command from above."""
+        return max(self.basis, above)
+
+    def report(self, status: Message, above: int = 0) -> None:
+        """Fill the fields of `ANSWER`."""
+        status.operator = max(self.basis, above)
+        if not self._is_reported:
+            status.order, status.answer, status.standing = self.serial, self.answer, self.standing
+            status.objection = self._objection
+            self._is_reported = True
+
+
+def joints_of(message: Message, names: Sequence[str], ranges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the joint positions, (joints,), rad, of an `OPERATOR_COMMAND`; `ranges` (joints, 2) are permitted.
+
+    Raises `ValueError` with the joint, its value and the range.
+    """
+    if message.count != len(names):
+        raise ValueError(f"{message.count} joint positions; the arm has {len(names)} joints")
+    joints = np.array(message.joints[: message.count])
+    for name, value, (low, high) in zip(names, joints, ranges, strict=True):
+        # Written so that NaN is outside.
+        if not low <= value <= high:
+            raise ValueError(f"joint '{name}' at {value:g} rad; permitted: {low:g} to {high:g}")
+    return joints

@@ -1,4 +1,4 @@
-"""The world model: global memory of objects and obstacles, updated from sensing and read by every planner."""
+"""The world model: global memory of objects and obstacles, updated from sensing, read by every planner."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import each
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import SCENE, WORLD_MODEL
-from rack.levels.params import read_params
-from rack.levels.robot import Positive, Table
+from rack.levels.tables import Positive, Table, read_params
 
 Array = NDArray[np.float64]
 
@@ -30,8 +29,8 @@ class WorldParams(Table):
 class WorldModel(Executor):
     """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body starts or stops moving.
 
-    The revision is the tick behind the last such change, so it rises across a restart of this board too. Until it has
-    seen a scene, a restarted board shows what it knew, with the age of that.
+    The revision is the tick after the last such change, so it also rises across a restart of this board. Until it has
+    seen a scene, a restarted board shows its last model, with its age.
     """
 
     inputs = {"scene": Input(SCENE, "servo.scene"), "last": Input(WORLD_MODEL, "own.model")}
@@ -50,7 +49,7 @@ class WorldModel(Executor):
         self._started = False
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take over a new scene; without one, poses stay and velocities are zero."""
+        """Update from a new scene; without one, poses stay and velocities are zero."""
         if not self._started:
             self._started = True
             write.model.copy_from(read.last.value)
@@ -69,7 +68,7 @@ class WorldModel(Executor):
         write.model.sensed = self._seen_tick = tick
 
     def _follow(self, scene: Message, model: Message, elapsed_s: float, tick: int) -> None:
-        """Estimate velocities, and see who starts and who stops."""
+        """Estimate velocities, and find the bodies that start and stop."""
         params = self._params
         velocity = (scene.position - self._position) / elapsed_s
         slow = np.linalg.norm(velocity, axis=1) < params.slow

@@ -82,14 +82,14 @@ MUTANTS = (
     Mutant(
         "limit gate",
         "command-limit",
-        (first(ARM, "def _wrong(self, torque: Array) -> Finding | None:", "return None"),),
+        (first("levels/arm/arm.py", "def refused(self, torque: Array) -> Finding | None:", "return None"),),
     ),
     Mutant("brake", "sensor-nan", (first(ARM, "def brake(self) -> None:", "return"),)),
     Mutant("restart", "kill", (("boards/supervision.py", "if len(recent) >= most:", "if True:"),)),
     Mutant(
         "violation counter",
         "violation counter",
-        (("levels/arm/limit_monitor.py", "self.count += int(steps.sum())", "self.count += 0"),),
+        (("levels/arm/monitors.py", "self.count += int(steps.sum())", "self.count += 0"),),
     ),
 )
 KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation counter"))

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
+import pydantic
+
 from rack.backplane.message import Field, Message, MessageType, command, status
-from rack.levels.level import Executor, Input, Planner, Ports
+from rack.levels.level import Executor, Input, Planner, Ports, Program
+from rack.levels.tables import RobotConfig, SceneConfig
 
 COUNT_COMMAND = command("count_command", 1, Field("goal", "i8", "1", "count to reach"))
 COUNT_STATUS = status("count_status", 1, Field("count", "i8", "1", "count reached"))
@@ -20,6 +26,24 @@ class Upper(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Ask for one more."""
         write.command.goal = read.status.value.count + 1
+
+
+class CountProgram(Program):
+    """A program: how far to count."""
+
+    count: tuple[int, ...] = pydantic.Field((), description="counts to reach, one after the other")
+
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
+        """Refuse negative counts, for a reason that depends on the scene."""
+        for at, count in enumerate(self.count):
+            if count < 0:
+                yield f"count[{at}]", count, f"nothing to count; objects: {', '.join(scene.objects) or 'none'}"
+
+
+class Programmed(Upper):
+    """Reads a program of its own from `[task]`."""
+
+    program = CountProgram
 
 
 class Unfinished(Executor):

@@ -37,6 +37,8 @@ def commands() -> typer.Typer:
     from rack.tools.replay import replay
     from rack.tools.report import report
     from rack.tools.run import run
+    from rack.tools.schema import EXAMPLES as SCHEMA_EXAMPLES
+    from rack.tools.schema import schema
     from rack.tools.status import status
     from rack.tools.stop import stop
 
@@ -49,6 +51,7 @@ def commands() -> typer.Typer:
     )
     app.command()(run)
     app.command()(check)
+    app.command(epilog=SCHEMA_EXAMPLES)(schema)
     app.command("list")(list_racks)
     app.command()(status)
     app.command()(stop)

@@ -15,8 +15,8 @@ from rack.backplane.ring import mailbox_ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.events import Event
-from rack.boards.operating.text import describe
-from rack.levels.operator import Answer, What
+from rack.boards.operating.command import describe
+from rack.levels.operator import Answer, Operation
 from rack.tools.faults.ending import arm_of
 
 STILL_S = 5.0
@@ -96,7 +96,7 @@ class Holds:
         told = status.value
         if level in self._operated and told.standing:
             since, what = self._standing(level, told)
-            is_hold = told.standing == What.HOLD
+            is_hold = told.standing == Operation.HOLD
             done = ", done" if told.answer == Answer.DONE and not is_hold else ""
             why = f"{'held' if is_hold else 'diverted'} by the operator ({what}{done})"
             yield self._hold(level, since, why, resume_command(self._segment.rack, level))
@@ -114,7 +114,7 @@ class Holds:
         if status.answer == Answer.REFUSED and len(mine) > 1:
             mine = [row for row in mine if row["message"]["id"] != status.order]
         if not mine:
-            return self._segment.block(level)[Block.LEVEL_SINCE], What(status.standing).name.lower()
+            return self._segment.block(level)[Block.LEVEL_SINCE], Operation(status.standing).name.lower()
         message = Message(rows["message"].dtype)
         message.raw[:] = mine[-1]["message"].tobytes()
         return int(mine[-1]["tick"]), describe(message)

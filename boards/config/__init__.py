@@ -1,29 +1,32 @@
-"""Configs: found, merged, validated, and wired into the layout of a rack."""
+"""Configs: from TOML to a rack.
 
-from rack.boards.config.context import context
-from rack.boards.config.cores import shared_out
+- `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a `RackConfig`.
+- `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults, commands.
+- `wire(config)`: the layout alone.
+- `shared_out(config)`: the cores that the machine lacks.
+- `names()`, `CONFIGS`, `FAULTS`: the bundled configs and fault scripts.
+- `budgets(config)`, `rack_timing(config, layout)`: the config in terms of the timing model.
+
+Everything wrong with a config is a `ConfigError`, which reports all mistakes at once.
+"""
+
 from rack.boards.config.files import CONFIGS, FAULTS, names
-from rack.boards.config.loading import load, loads
-from rack.boards.config.ports import TaskPorts, task_ports
-from rack.boards.config.schema import CLOCK_SLOT, BoardConfig, ClockConfig, RackConfig
+from rack.boards.config.layout import shared_out
+from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
+from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import budgets, rack_timing
-from rack.boards.config.wiring import wire
 
 __all__ = [
-    "CLOCK_SLOT",
     "CONFIGS",
     "FAULTS",
-    "BoardConfig",
-    "ClockConfig",
     "RackConfig",
-    "TaskPorts",
+    "Resolved",
     "budgets",
-    "context",
     "load",
     "loads",
     "names",
     "rack_timing",
+    "resolve",
     "shared_out",
-    "task_ports",
     "wire",
 ]

@@ -1,20 +1,25 @@
-"""The sizes of messages that follow from the arm and its cell, built once in a process."""
+"""What follows from the arm and its cell, built once per process.
+
+Importing MuJoCo takes half a second, so functions import it: only racks with an arm pay.
+"""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake
 from rack.levels.errors import RobotError
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import RobotConfig, SceneConfig
 
 
 def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = True) -> dict[str, int]:
-    """Return the symbolic sizes by name, none without an arm; add what is wrong with the cell to `mistakes`.
+    """Return the symbolic sizes by name, none without an arm; add everything wrong with the cell to `mistakes`.
 
-    Of a cell that is not whole, as [robot] or [scene] have mistakes of their own, only names are looked up.
+    If the cell is not whole, as [robot] or [scene] has mistakes of its own, only names are looked up.
     """
     if config.robot is None:
         return {}
@@ -32,8 +37,8 @@ def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = Tru
 
 
 def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
-    """Return a line for every name that the model does not have; none of a model that cannot be read."""
-    from rack.levels.cell_index import unknown_names
+    """Return a line for every name that the model does not have; none if the model cannot be read."""
+    from rack.levels.robot.lookup import unknown_names
 
     try:
         return tuple(unknown_names(robot, scene))
@@ -43,7 +48,7 @@ def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
 
 @lru_cache(maxsize=4)
 def _sizes(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[tuple[str, int], ...]:
-    from rack.levels.cell import build_cell, sizes  # MuJoCo takes half a second to import: only who has an arm pays
+    from rack.levels.robot.cell import build_cell, sizes
 
     return tuple(sizes(build_cell(robot, scene, clock_ns)).items())
 
@@ -55,8 +60,16 @@ def geom_name(robot: RobotConfig, scene: SceneConfig, clock_ns: int, geom: int) 
 
 @lru_cache(maxsize=4)
 def _geom_names(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[str, ...]:
-    from rack.levels import touches
-    from rack.levels.cell import build_cell  # likewise
+    from rack.levels.robot import lookup
+    from rack.levels.robot.cell import build_cell
 
     model = build_cell(robot, scene, clock_ns).model
-    return tuple(touches.geom_name(model, geom) for geom in range(model.ngeom))
+    return tuple(lookup.geom_name(model, geom) for geom in range(model.ngeom))
+
+
+@lru_cache(maxsize=4)
+def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
+    """Return the positions that joints may be commanded to, (joints, 2), rad. Raises `RobotError`."""
+    from rack.levels.robot.cell import build_cell
+
+    return build_cell(robot, scene, clock_ns).limits.position

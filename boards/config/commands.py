@@ -1,74 +1,101 @@
-"""What an operator's commands must agree on with the rack that they are for: every mistake of every one, at once."""
+"""An operator's commands: checked against the rack they are for, and made into requests for the operator table."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
-from rack.boards.config.classes import find_class
+from rack.backplane.layout import Layout
+from rack.backplane.message import Message
+from rack.backplane.operator_table import Request
+from rack.backplane.slots import message_dtype
+from rack.boards.classes import find_class
+from rack.boards.config.cell import joint_ranges
+from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import Mistake
-from rack.boards.operating.config import CommandConfig
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.operating.command import CommandConfig
+from rack.levels.algebra import norm
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor
 from rack.levels.operator import Commands, Goal, goal_names, listed
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
 
 OWN_OPERATOR = "own.operator"
+DOWN = (0.0, 0.0, -1.0)
 
 
 def commandable(config: RackConfig) -> dict[str, Commands]:
-    """Return what an operator may tell each level, by board; levels that take no commands are left out."""
+    """Return the commands that each level takes from an operator, by board; other levels are left out."""
     found = {}
     for name, board in config.board.items():
         try:
             executor = find_class(board.executor, Executor)
         except LookupError:
-            # That there is no such class is a mistake of its own, and told.
-            continue
+            continue  # a mistake of its own, reported elsewhere
         if any(port.source == OWN_OPERATOR for port in executor.inputs.values()):
             found[name] = executor.commands
     return found
 
 
+def asked(given: Mapping[str, Any]) -> CommandConfig:
+    """Return the command in a mapping, as in a `[[command]]` table. Raises `ConfigError` with every mistake."""
+    try:
+        return CommandConfig.model_validate(given)
+    except ValidationError as error:
+        raise ConfigError(mistakes_of(error, CommandConfig, given)) from None
+
+
+def request(command: CommandConfig, config: RackConfig, layout: Layout) -> Request:
+    """Return the request of one command. Raises `ConfigError` with every mistake."""
+    if mistakes := command_mistakes([("", command)], config):
+        raise ConfigError(mistakes)
+    return _request(command, layout)
+
+
+def requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
+    """Return the requests of a config whose commands have been checked."""
+    return tuple(_request(command, layout) for command in config.command)
+
+
+def _request(command: CommandConfig, layout: Layout) -> Request:
+    name = f"{command.level}.operator"
+    index, spec = next((at, box) for at, box in enumerate(layout.mailboxes) if box.name == name)
+    message = Message(message_dtype(spec.fields, spec.size))
+    message.what, message.goal = command.said, (command.goals or [Goal.NONE])[0]
+    if command.joints is not None:
+        message.count = len(command.joints)
+        message.joints[: message.count] = command.joints
+    if command.position is not None:
+        message.position[:] = command.position
+        message.direction[:] = command.direction or DOWN
+    if command.quaternion is not None:
+        message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
+    return Request(index, bytes(message.raw), _tick(command, layout.clock_ns))
+
+
+def _tick(command: CommandConfig, clock_ns: int) -> int:
+    if command.at is not None:
+        return round(command.at * 1e9 / clock_ns)
+    return -1 if command.tick is None else command.tick
+
+
 def command_mistakes(
-    commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, untold: frozenset[str] = frozenset()
+    commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, broken: frozenset[str] = frozenset()
 ) -> list[Mistake]:
-    """Return everything wrong with commands, given with their places in a config; empty for one given live.
+    """Return everything wrong with commands, given with their places in a config; the place of a live one is empty.
 
-    `untold` are boards whose own mistakes are told already.
+    `broken` are boards with mistakes of their own: commands for them are not checked.
     """
-    told = list(commands)
-    known = [(place, command) for place, command in told if command.level not in untold]
-    found = [mistake for place, command in known for mistake in _mistakes(place, command, config)]
-    if len(told) > OPERATOR_ENTRIES:
-        found.append(Mistake("command", len(told), f"more than can wait at once; permitted: {OPERATOR_ENTRIES}"))
+    given = list(commands)
+    checked = [(place, command) for place, command in given if command.level not in broken]
+    found = [mistake for place, command in checked for mistake in _mistakes(place, command, config)]
+    if len(given) > OPERATOR_ENTRIES:
+        found.append(Mistake("command", len(given), f"too many to wait at once; permitted: {OPERATOR_ENTRIES}"))
     return found
-
-
-def command_places(config: RackConfig) -> list[tuple[str, CommandConfig]]:
-    """Return the commands of a config with their places in it."""
-    return [(f"command[{at}]", command) for at, command in enumerate(config.command)]
-
-
-def joint_ranges(config: RackConfig) -> NDArray[np.float64] | None:
-    """Return the positions that joints may be sent to, (joints, 2), rad; None for a rack without an arm.
-
-    Raises `RobotError` when the arm or its cell cannot be built.
-    """
-    return None if config.robot is None else _ranges(config.robot, config.scene, config.clock_ns)
-
-
-@lru_cache(maxsize=4)
-def _ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
-    from rack.levels.cell import build_cell  # MuJoCo takes half a second to import: only who sends joints pays
-
-    return build_cell(robot, scene, clock_ns).limits.position
 
 
 def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
@@ -76,40 +103,42 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         return f"{place}.{key}" if place else key
 
     if command.tick is not None and command.at is not None:
-        yield Mistake(at("at"), command.at, "tick is given as well; permitted: one of tick, at")
+        yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
     levels = commandable(config)
     if command.level not in levels:
-        why = f"no level that can be commanded; levels: {', '.join(levels) or 'none'}"
+        why = f"no such level takes commands; levels: {', '.join(levels) or 'none'}"
         yield Mistake(at("level"), command.level, why)
         return
     known = levels[command.level]
     if command.said not in known:
-        yield Mistake(at("what"), command.what, f"'{command.level}' takes no {command.what}; it takes: {listed(known)}")
+        why = f"'{command.level}' does not take {command.what}; it takes: {listed(known)}"
+        yield Mistake(at("what"), command.what, why)
         return
     yield from _goal(at, command, known)
     if command.joints is not None and Goal.JOINTS in known[command.said]:
         yield from _joints(at("joints"), command.joints, config)
     for key in ("quaternion", "direction"):
         if getattr(command, key) is not None and not any(getattr(command, key)):
-            yield Mistake(at(key), list(getattr(command, key)), "is all zero; its length must not be zero")
+            yield Mistake(at(key), list(getattr(command, key)), "all zero; its length must not be zero")
 
 
 def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Iterator[Mistake]:
-    """Whether there is one goal, of a form that the level takes."""
+    """Check that there is one goal, of a form that the level takes."""
     wanted, given = known[command.said], command.goals
     what = f"{command.what} of '{command.level}'"
     if not wanted:
         for goal in given:
-            yield Mistake(at(_key(goal)), None, f"{command.what} has no goal; leave it out")
+            yield Mistake(at(_key(goal)), None, f"{command.what} takes no goal; remove it")
     elif len(given) != 1:
-        why = "missing" if not given else f"{goal_names(given)} are given"
-        yield Mistake(at("goal"), None, f"{why}; {what} has one of: {goal_names(wanted)}")
+        why = "missing" if not given else f"several given: {goal_names(given)}"
+        yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(wanted)}")
     elif given[0] not in wanted:
-        yield Mistake(at(_key(given[0])), None, f"no goal for {what}; permitted: {goal_names(wanted)}")
+        yield Mistake(at(_key(given[0])), None, f"not a goal for {what}; permitted: {goal_names(wanted)}")
     elif command.position is None and given[0] in (Goal.POSE, Goal.DIRECTION):
-        yield Mistake(at("position"), None, "missing; where the tool is to be, m")
+        yield Mistake(at("position"), None, "missing; tool position, m")
     elif command.quaternion is not None and command.direction is not None:
-        yield Mistake(at("direction"), list(command.direction), "quaternion is given as well; permitted: one of both")
+        why = "quaternion is also given; permitted: one of quaternion, direction"
+        yield Mistake(at("direction"), list(command.direction), why)
 
 
 def _key(goal: Goal) -> str:
@@ -117,17 +146,18 @@ def _key(goal: Goal) -> str:
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:
-    try:
-        robot, ranges = config.robot, joint_ranges(config)
-    except RobotError:
-        # That the cell cannot be built is a mistake of its own, and told.
-        return
-    if robot is None or ranges is None:
+    robot = config.robot
+    if robot is None:
         yield Mistake(place, list(joints), "the rack has no arm")
-    elif len(joints) != len(robot.joints):
-        why = f"{len(joints)} values; one a joint makes {len(robot.joints)}: {', '.join(robot.joints)}"
+        return
+    if len(joints) != len(robot.joints):
+        why = f"{len(joints)} values; permitted: {len(robot.joints)}, one per joint: {', '.join(robot.joints)}"
         yield Mistake(place, list(joints), why)
-    else:
-        for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
-            if not low <= value <= high:
-                yield Mistake(place, value, f"joint '{name}' cannot be there; permitted: {low:g} to {high:g} rad")
+        return
+    try:
+        ranges = joint_ranges(robot, config.scene, config.clock_ns)
+    except RobotError:
+        return  # a mistake of its own, reported elsewhere
+    for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
+        if not low <= value <= high:
+            yield Mistake(place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad")

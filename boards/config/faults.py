@@ -9,7 +9,7 @@ from zlib import crc32
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout, Role
-from rack.boards.config.classes import find_class
+from rack.boards.classes import find_class
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.bounds import cycle_ticks

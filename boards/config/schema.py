@@ -1,22 +1,25 @@
-"""The tables of a rack's config: every field with its unit, range and meaning.
+"""The tables of a rack's config: every key with its unit, range and meaning.
 
-`[robot]` and `[scene]` are of `rack.levels.robot` and `rack.levels.scene`; `[task]` is the task level's.
+`[robot]` and `[scene]` are declared in `rack.levels.robot` and `rack.levels.scene`; what `[task]` and
+`[board.<name>.params]` may hold is declared by the classes of the levels. A description names the unit after a comma:
+`rack schema` shows it in a column of its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, StringConstraints
 
 from rack.backplane.clock import ticks_of
-from rack.backplane.layout import Protocol
-from rack.boards.config.text import portable, to_toml
+from rack.backplane.layout import Protocol, Role
+from rack.boards.config.files import portable
+from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
-from rack.boards.operating.config import CommandConfig
-from rack.levels.robot import Positive, RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.boards.operating.command import CommandConfig
+from rack.levels.tables import Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
@@ -31,100 +34,97 @@ OnLoss = Literal["hold", "stop", "brake"]
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
-Slot = Annotated[int, Field(gt=CLOCK_SLOT, le=LAST_SLOT)]
+Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
-"""One tick, in real time and in simulated time, at least."""
+"""Shortest tick, in real time and in simulated time."""
 LONGEST_EVERY = 1_000_000
-"""Ticks from one cycle of a board to the next, at most."""
+"""Longest cycle of a board, ticks."""
 
 
 class ClockConfig(Table):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
-    period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False, description="one tick, ms, in whole ns")
-    mode: Mode = Field("realtime", description="ticks by time, or lockstep: as soon as every task has finished")
+    period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False, description="one tick, ms; in whole ns")
+    mode: Mode = Field("realtime", description="realtime: ticks by time; lockstep: as soon as every task has finished")
     speed: float = Field(
-        1.0,
-        ge=0.001,
-        le=1000,
-        allow_inf_nan=False,
-        description="real time runs this many times faster than simulated time",
+        1.0, ge=0.001, le=1000, allow_inf_nan=False, description="simulated time per real time; 2 runs twice as fast"
     )
-    wake: Wake = Field("signal", description="how boards wait for their cycle: a semaphore each, or busy-waiting")
+    wake: Wake = Field("signal", description="how boards wait for their cycle: on a semaphore each, or by busy-waiting")
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
     on_no_realtime: OnNoRealtime = Field(
-        "warn", description="where a SCHED_FIFO priority is not obtained: go on with a warning, or refuse the launch"
+        "warn", description="if a SCHED_FIFO priority is refused: continue with a warning, or refuse the launch"
     )
 
 
 class TimingConfig(Table):
-    """`[timing]`: what the timing model is told of the processors."""
+    """`[timing]`: assumptions of the timing model about the processors."""
 
-    context_switch_ms: Milliseconds = Field(0.1, description="one switch between tasks, t_cs, ms; 0.1 is the paper's")
+    context_switch_ms: Milliseconds = Field(0.1, description="one switch between tasks (t_cs), ms; 0.1 is the paper's")
     response_ms: float | None = Field(
         None,
         ge=SHORTEST_MS,
         le=1e9,
-        description="goal: the system responds within R_s (eqs 3.2, 3.3), simulated ms; R_max is then R_s / n",
+        description="goal: the system responds within R_s of simulated time (eqs 3.2, 3.3), ms; R_max is R_s / n",
     )
     clock_ms: Milliseconds = Field(0.0, description="processor time of the system clock's board in one tick, ms")
     small_share: float = Field(
-        0.1, gt=0, le=1, description="part of a cycle that counts as much smaller than it (eq. 3.10)"
+        0.1, gt=0, le=1, description="fraction of a cycle that counts as much smaller than it (eq. 3.10)"
     )
 
 
 class BudgetConfig(Table):
-    """`[board.<name>.budget]`: what the level may take in the worst case, as processor time in ms."""
+    """`[board.<name>.budget]`: the level's worst-case processor times, for the timing model."""
 
-    read_ms: Milliseconds = Field(0.0, description="R: reading commands and statuses, a cycle")
-    process_ms: Milliseconds = Field(0.0, description="X: the executor's processing, a cycle")
-    write_ms: Milliseconds = Field(0.0, description="W: writing commands and statuses, a cycle")
-    exchange_ms: Milliseconds = Field(0.0, description="C: reading the plan, a cycle")
-    plan_ms: Milliseconds = Field(0.0, description="P: the planner, a plan")
-    update_ms: Milliseconds = Field(0.0, description="U: writing the plan, a plan")
+    read_ms: Milliseconds = Field(0.0, description="R: read commands and statuses, per cycle, ms")
+    process_ms: Milliseconds = Field(0.0, description="X: process, per cycle, ms")
+    write_ms: Milliseconds = Field(0.0, description="W: write commands and statuses, per cycle, ms")
+    exchange_ms: Milliseconds = Field(0.0, description="C: read the plan, per cycle, ms")
+    plan_ms: Milliseconds = Field(0.0, description="P: plan, per plan, ms")
+    update_ms: Milliseconds = Field(0.0, description="U: write the plan, per plan, ms")
     plan_within_ms: float | None = Field(
-        None, gt=0, le=1e7, description="a new plan is wanted within this time, ms: what within_cycles may come to"
+        None, gt=0, le=1e7, description="longest acceptable time for a new plan, ms; the upper limit of within_cycles"
     )
 
 
 class TransferConfig(Table):
-    """`[board.<name>.transfer]`: a slower bus: processor time that accesses are made to take, ms."""
+    """`[board.<name>.transfer]`: emulates a slower bus: minimum processor times of accesses."""
 
-    read_ms: Milliseconds = Field(0.0, description="R: the executor reads commands and statuses, a cycle")
-    write_ms: Milliseconds = Field(0.0, description="W: it writes commands and statuses, a cycle")
-    exchange_ms: Milliseconds = Field(0.0, description="C: it reads the plan, a cycle")
-    update_ms: Milliseconds = Field(0.0, description="U: the planner writes its plan")
+    read_ms: Milliseconds = Field(0.0, description="R: the executor reads commands and statuses, per cycle, ms")
+    write_ms: Milliseconds = Field(0.0, description="W: the executor writes commands and statuses, per cycle, ms")
+    exchange_ms: Milliseconds = Field(0.0, description="C: the executor reads the plan, per cycle, ms")
+    update_ms: Milliseconds = Field(0.0, description="U: the planner writes its plan, ms")
 
 
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
-    default: Protocol = Field("time-slice", description="protocol of every mailbox not named below")
+    default: Protocol = Field("time-slice", description="protocol of every mailbox not listed in mailbox")
     mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
 
 
 class SupervisionConfig(Table):
-    """`[supervision]`: boards that die or hang are restarted. When restarts are used up, the arm is braked for good."""
+    """`[supervision]`: boards that die or hang are restarted. Once restarts are used up, the arm stays braked."""
 
-    restarts: Restarts = Field(5, description="restarts of one task within within_s, at most; 0: never")
-    within_s: Positive = Field(10.0, description="time over which restarts are counted, simulated s")
+    restarts: Restarts = Field(5, description="most restarts of one task within within_s; 0: never")
+    within_s: Positive = Field(10.0, description="window of simulated time in which restarts are counted, s")
     lockstep_restart_s: Positive = Field(
-        0.5,
-        description="in lockstep, simulated time from a task's loss to its return, s; real time takes its own",
+        0.5, description="in lockstep, simulated time from a task's loss to its return, s; real time takes as it takes"
     )
 
 
 class BoardConfig(Table):
-    """`[board.<name>]`: one processor of the rack, its level, and how that is wired."""
+    """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
 
-    slot: Slot = Field(description="slot in the crate, 2 to 21; slot 1 is the clock's")
-    core: Core = Field(0, description="core that the board is pinned to; cores the machine lacks are shared out")
-    rate_hz: Positive | None = Field(None, ge=1e-6, description="rate of the executor, Hz; must divide the clock's")
+    slot: Slot = Field(description="slot in the crate; slot 1 is the clock's")
+    core: Core = Field(0, description="core of the board; cores that the machine lacks are shared out")
+    rate_hz: Positive | None = Field(
+        None, ge=1e-6, description="rate of the executor, Hz; must divide the clock's; exactly one of rate_hz and every"
+    )
     every: int | None = Field(
         None, ge=1, le=LONGEST_EVERY, description="instead of rate_hz: period of the executor, ticks"
     )
@@ -134,43 +134,57 @@ class BoardConfig(Table):
     below: str | None = Field(None, description="board of the level below, whose status is read")
     executor: ClassName = Field(description="class of the executor, package.module:Class")
     planner: ClassName | None = Field(None, description="class of the planner, package.module:Class")
-    coupling: Coupling = Field("none", description="planner on this board (tight), on its own (loose), or none")
-    within_cycles: int = Field(1, ge=1, le=10_000, description="cycles that one plan may take")
-    planner_slot: Slot | None = Field(None, description="slot of a loosely coupled planner, 2 to 21")
-    planner_core: Core | None = Field(None, description="core of a loosely coupled planner")
+    coupling: Coupling = Field("none", description="planner on this board (tight), on its own board (loose), or none")
+    within_cycles: int = Field(1, ge=1, le=10_000, description="time that one plan may take, cycles")
+    planner_slot: Slot | None = Field(None, description="slot of a loosely coupled planner")
+    planner_core: Core | None = Field(None, description="core of a loosely coupled planner; default: the board's")
     planner_priority: Priority = Field(0, description="SCHED_FIFO priority of the planner; 0: ordinary scheduling")
-    reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the executor, where not the level's own")
-    planner_reads: dict[str, MailboxName] = Field({}, description="the same for the planner")
-    params: dict[str, Any] = Field({}, description="parameters of the level, by name")
-    budget: BudgetConfig | None = Field(None, description="what the level may take, for the timing model")
+    reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the executor; overrides the level's own")
+    planner_reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the planner, likewise")
+    params: dict[str, Any] = Field({}, description="parameters of the level, declared by its class")
+    budget: BudgetConfig | None = Field(None, description="worst-case processor times, for the timing model")
     transfer: TransferConfig = Field(TransferConfig(), description="a slower bus for this board")
-    ends_run: bool = Field(False, description="the run ends when this level's status says done or error")
-    restarts: Restarts | None = Field(None, description="as in supervision, for this board's tasks; 0: never")
-    restarts_within_s: Positive | None = Field(None, description="as supervision.within_s, for this board's tasks, s")
+    ends_run: bool = Field(False, description="the run ends when this level's status is done or error")
+    restarts: Restarts | None = Field(None, description="for this board's tasks, overrides supervision.restarts")
+    restarts_within_s: Positive | None = Field(
+        None, description="for this board's tasks, overrides supervision.within_s, s"
+    )
     on_loss: OnLoss = Field(
         "hold",
-        description="while this board is lost: the level below holds, or the arm ramps to rest and brakes, or brakes",
+        description="while this board is lost: hold: the level below holds; stop: the arm ramps to rest and brakes; "
+        "brake: it brakes at once",
     )
+
+
+class TaskPlace(NamedTuple):
+    """Where a config puts a task: slot, core as asked for, and SCHED_FIFO priority."""
+
+    name: str
+    board: str
+    role: Role
+    slot: int
+    core: int
+    priority: int
 
 
 class RackConfig(Table):
-    """A rack, resolved: everything that a run depends on."""
+    """A rack: everything that a run depends on."""
 
     name: RackName = Field(description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40")
-    seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of everything random")
+    seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of all random numbers")
     python_path: tuple[Annotated[Path, Field(strict=False)], ...] = Field(
-        (), description="folders of your own levels, for import; relative to the file"
+        (), description="folders of your own levels, added to the import path; relative to the file"
     )
     clock: ClockConfig = Field(description="the system clock")
     protocol: ProtocolConfig = Field(ProtocolConfig(), description="how mailboxes are shared")
-    timing: TimingConfig = Field(TimingConfig(), description="what the timing model is told of the processors")
-    robot: RobotConfig | None = Field(None, description="the arm; a rack without one has levels that need none")
-    scene: SceneConfig = Field(SceneConfig(), description="what stands in the cell besides the arm")
-    task: dict[str, Any] = Field({}, description="program of the task level")
+    timing: TimingConfig = Field(TimingConfig(), description="assumptions of the timing model about the processors")
+    robot: RobotConfig | None = Field(None, description="the arm; only levels that need no arm run without one")
+    scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
+    task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")
     board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
     supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of boards")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
-    command: tuple[CommandConfig, ...] = Field((), description="commands of an operator, given at their ticks")
+    command: tuple[CommandConfig, ...] = Field((), description="an operator's commands, each at its tick")
 
     @property
     def clock_ns(self) -> int:
@@ -184,9 +198,20 @@ class RackConfig(Table):
             return config.every
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
+    def tasks(self) -> Iterator[TaskPlace]:
+        """Yield every task in its order: each board's executor, then its planner."""
+        for name, board in self.board.items():
+            yield TaskPlace(name, name, "executor", board.slot, board.core, board.priority)
+            if board.planner is not None:
+                slot = board.slot if board.planner_slot is None else board.planner_slot
+                core = board.core if board.planner_core is None else board.planner_core
+                yield TaskPlace(f"{name}.planner", name, "planner", slot, core, board.planner_priority)
+
     def text(self) -> str:
         """Return the config as TOML that loads again with the same meaning, by itself."""
-        tables = self.model_dump(mode="json", exclude_none=True, by_alias=True)
+        # Not in JSON's mode, which knows no infinity and no NaN: a level's parameters may be such numbers.
+        tables = self.model_dump(exclude_none=True, by_alias=True)
+        tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:
             tables["robot"]["model"] = portable(self.robot.model)
         return to_toml(tables)

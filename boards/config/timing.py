@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout
-from rack.boards.config.rules import PLANNER_BUDGET
+from rack.boards.config.mistakes import PLANNER_BUDGET
 from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
 from rack.levels.timing.rack import BoardTiming, RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
-from rack.levels.robot import LAST_TICK, Finite, Table
+from rack.levels.tables import LAST_TICK, Finite, Table
 
 CONDITION = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
 DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s)\s*")

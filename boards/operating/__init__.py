@@ -1,1 +1,1 @@
-"""Commands of an operator: asked for in a config, by `Rack.command` or `rack command`, and given by the clock."""
+"""Commands of an operator: as a table, as a message, and given by the clock's board."""

@@ -1,4 +1,4 @@
-"""The operator's desk at the clock's board: gives every command at its tick, into the mailbox of its level."""
+"""The operator's desk, part of the clock's board: writes each command into its level's mailbox at its tick."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class OperatorDesk:
         return not self._waiting and self._words[_REQUESTED] == self._requested
 
     def advance(self, tick: int) -> None:
-        """Give what is due at `tick`."""
+        """Give all commands due at `tick`."""
         if self._words[_REQUESTED] != self._requested:
             self._requested = self._words[_REQUESTED]
             self._waiting = self._table.waiting()
         for entry in [entry for entry in self._waiting if entry[RequestWord.TICK] <= tick]:
             self._waiting.remove(entry)
-            # First the word, then the look: whoever withdraws it does the same the other way round.
+            # Mark it first, then check that it still waits: a client that withdraws it does so in the opposite order.
             entry.words[RequestWord.GIVEN_TICK] = tick
             if self._table.is_waiting(entry):
                 self._give(entry, tick)
@@ -47,7 +47,7 @@ class OperatorDesk:
     def _give(self, entry: RequestEntry, tick: int) -> None:
         words, writer = entry.words, self._writers[entry[RequestWord.MAILBOX]]
         if not words[RequestWord.SERIAL]:
-            # A clock that dies from here on gives it again when it is back, under the same serial.
+            # A clock that dies after this line gives the command again on its return, under the same serial.
             self._words[_COMMANDED] += 1
             words[RequestWord.SERIAL] = self._words[_COMMANDED]
         message = writer.message

@@ -1,113 +1,177 @@
-"""What the servo level needs of an arm: sense, drive, brake, and let time pass."""
+"""The seam between the servo level and an arm: sense, drive, brake, and let time pass.
+
+The servo level drives whatever class `[board.servo.params] arm = "package.module:Class"` names: the simulated arm by
+default, your own hardware or simulation otherwise. In every cycle it calls, in this order, `step` (the ticks since the
+last cycle), `sense`, then either `drive` or `brake` or neither (the last command stays in force), `save` and `look`.
+All calls come from the executor's process, within its cycle: none may block. An exception ends the board, which is
+restarted as after any crash; report a broken arm in `fault` instead.
+"""
 
 from __future__ import annotations
 
+import importlib
+from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
 from rack.levels.level import Finding
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import SceneConfig
 
 Array = NDArray[np.float64]
 
+PATIENCE_CYCLES = 2
+"""Torque cycles for which motors keep the last command when none comes; then the brakes engage."""
+TORQUE_MARGIN = 1.001
+"""Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits itself."""
+
 
 class Sensed(NamedTuple):
-    """What the arm's sensors say: joints (joints,), rad and rad/s; gripper, m and m/s, 0 without one.
+    """One sample of the arm's sensors; joints are as coarse and noisy as their encoders."""
 
-    Of the joints it is as coarse and noisy as their encoders. `tick` is that of the sample.
-    """
-
-    position: Array
-    velocity: Array
-    opening: float
-    opening_velocity: float
-    tick: int
+    position: Array  # (joints,), rad
+    velocity: Array  # (joints,), rad/s
+    opening: float  # gripper joint, m; 0 without a gripper
+    opening_velocity: float  # m/s
+    tick: int  # of the sample: an older one than that of the cycle counts as no new sample
 
 
 class Link(Protocol):
-    """What lies between the servo level and an arm: samples come up, torques go down."""
+    """The path between the servo level and an arm: samples come up, torques go down."""
 
     def sense(self) -> Sensed:
         """Return the newest sample. The arrays are valid until the next call."""
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Open the brakes and give torques (joints,), N m, and the gripper's force, N, through the limit gate.
+        """Release the brakes and apply torques, (joints,), N m, and the gripper's force, N, for one torque cycle.
 
-        They hold for the coming tick. What no servo level may ask for is not given: the brakes close, and what was
-        wrong is returned.
+        A command that no servo level gives (see `Arm.refused`) is not applied: the brakes engage, and the finding is
+        returned.
         """
 
 
-class Arm(Link, Protocol):
-    """An arm with torque-driven joints that have brakes, and a force-driven gripper.
+class Arm(ABC):
+    """An arm with torque-driven joints that have brakes, and a force-driven gripper. Implements `Link`.
 
-    `tick` is the tick that its state belongs to. `torque` (joints,), N m, and `grip_force`, N, are what its motors were
-    told last, behind the limit gate; `clipped` counts the cycles in which the gate cut a command. `waited` counts the
-    ticks since the last command. `fault` is empty, or says why the arm has stopped for good.
+    Subclasses write `sense`, `drive`, `brake` and `step`, and keep the attributes below up to date. All else has a
+    default that suits an arm without contact sensors, whose state outlives its board.
     """
 
-    tick: int
-    torque: Array
-    grip_force: float
-    clipped: int
-    waited: int
-    fault: str
+    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+        """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is for random noise."""
+        self.cell = cell
+        self.patience = PATIENCE_CYCLES * every  # ticks without a command after which the brakes must engage
+        self.tick = 0  # tick of the arm's state
+        self.waited = self.patience  # ticks since the last command
+        self.braked = True  # the brakes are engaged
+        self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: as given to the motors last
+        self.grip_force = 0.0  # N: as given to the gripper last
+        self.fault = ""  # why the arm has stopped for good; empty: it has not
+        self.clipped = 0  # cycles in which a command was refused or cut
+        self.contact: tuple[int, int] | None = None  # geoms of an unintended contact of arm or load in the last `step`
+        self.touches = 0  # unintended contacts so far
+        self.first_touch = ""  # the first of them, readable: which geoms, and when
+        self.violations = 0  # times that the drives broke a limit of position, velocity or torque
+        self.pushed = 0  # times that a blow pushed a joint beyond a limit of position or velocity
+        self.first_violation = ""  # the first violation, readable: which limit, by how much, and when
+        self._data = cell.start()
+        self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
-    @property
-    def braked(self) -> bool:
-        """Whether the brakes are closed."""
+    @abstractmethod
+    def sense(self) -> Sensed:
+        """Return the newest sample, see `Link.sense`."""
 
-    @property
-    def contact(self) -> tuple[int, int] | None:
-        """The geoms of an unintended contact of the arm, or of what it holds, since the last `step` began."""
+    @abstractmethod
+    def drive(self, torque: Array, grip_force: float) -> Finding | None:
+        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets `waited` to 0."""
+
+    @abstractmethod
+    def brake(self) -> None:
+        """Engage the brakes: they stop and hold the joints, motors give no torque, the gripper keeps its force."""
+
+    @abstractmethod
+    def step(self, ticks: int) -> None:
+        """Let `ticks` ticks pass: advance `tick` and `waited` (hardware: no more), and keep to `patience`.
+
+        `ticks` exceeds the level's cycle after missed cycles, and is 0 for none.
+        """
+
+    def refused(self, torque: Array) -> Finding | None:
+        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit; None: it may."""
+        if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
+            return None
+        if np.isfinite(torque).all():
+            joint = int((np.abs(torque) / self._permitted).argmax())
+            return Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint]))
+        return Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax()))
 
     @property
     def holds(self) -> bool:
-        """Whether the gripper touches a part."""
+        """Whether the gripper touches a part. Default: False."""
+        return False
 
     @property
     def leans(self) -> bool:
-        """Whether the arm, or what it holds, touches anything else."""
+        """Whether the arm, or its load, touches anything else. Default: False."""
+        return False
 
     def named(self, contact: tuple[int, int]) -> str:
-        """Return what touches what."""
-
-    @property
-    def touches(self) -> int:
-        """Contacts that no task means."""
-
-    @property
-    def first_touch(self) -> str:
-        """The first of them: what touched what, and when; empty: there was none."""
-
-    @property
-    def violations(self) -> int:
-        """Steps of the simulation in which the arm's own drives broke a limit."""
-
-    @property
-    def pushed(self) -> int:
-        """Steps in which what struck the arm pushed a joint beyond a limit of position or velocity."""
-
-    @property
-    def first_violation(self) -> str:
-        """The first of them: which limit, by how much, and when; empty: there was none."""
-
-    def brake(self) -> None:
-        """Close the brakes: they stop and hold the joints, the motors give nothing. The gripper keeps its force."""
+        """Return a `contact` in words. Default: the numbers of the geoms."""
+        return f"geom {contact[0]} touches geom {contact[1]}"
 
     def weaken(self, most: Array | None) -> None:
-        """Let the motors give no more than `most` (joints,), N m, whatever they are told; None: they are sound."""
+        """Limit the motors to `most`, (joints,), N m, whatever they are given; None: they are sound.
 
-    def step(self, ticks: int) -> None:
-        """Let `ticks` ticks pass."""
+        Injected faults of motors act through this. Default: they have no effect.
+        """
 
     def look(self, scene: Message) -> None:
-        """Fill a `rack.levels.messages.SCENE` with the poses of bodies and tool as sensed."""
+        """Fill a `SCENE` with the poses of bodies and tool. Default: bodies as at the start, the tool as sensed."""
+        self._data.qpos[self.cell.qpos] = self.sense().position
+        self._show(scene)
+
+    def _show(self, scene: Message) -> None:
+        """Fill a `SCENE` from `_data`."""
+        m, d, cell = self.cell.model, self._data, self.cell
+        mujoco.mj_kinematics(m, d)  # after a step, poses are those before it
+        rows = len(cell.bodies)
+        scene.position[:rows] = d.xpos[cell.bodies]
+        scene.quaternion[:rows] = d.xquat[cell.bodies]
+        scene.tool_position = d.site_xpos[cell.tool]
+        mujoco.mju_mat2Quat(scene.tool_quaternion, d.site_xmat[cell.tool])
 
     def save(self, state: Message) -> None:
-        """Fill in a `rack.levels.messages.ARM_STATE` all that the arm's future depends on."""
+        """Fill an `ARM_STATE` with all that a restarted board must know. Default: the attributes.
+
+        A simulation adds its state: `state.state` has room for MuJoCo's integration state of the cell.
+        """
+        state.tick, state.waited, state.braked = self.tick, self.waited, self.braked
+        state.clipped, state.touches = self.clipped, self.touches
+        state.violations, state.pushed = self.violations, self.pushed
 
     def restore(self, state: Message) -> None:
-        """Go on from a `rack.levels.messages.ARM_STATE`."""
+        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted board."""
+        self.tick, self.waited, self.braked = state.tick, state.waited, bool(state.braked)
+        self.clipped, self.touches = state.clipped, state.touches
+        self.violations, self.pushed = state.violations, state.pushed
+
+
+def find_arm(reference: str) -> type[Arm]:
+    """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing or no whole `Arm`."""
+    module, _, name = reference.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except (Exception, SystemExit) as error:  # importing a user's module may raise anything
+        raise ValueError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
+    if found is None:
+        raise ValueError(f"module '{module}' has no class '{name}'")
+    if not (isinstance(found, type) and issubclass(found, Arm)):
+        raise ValueError(f"'{name}' is not a subclass of rack.levels.arm.Arm")
+    if missing := sorted(found.__abstractmethods__):
+        raise ValueError(f"class '{name}' lacks: {', '.join(missing)}")
+    return found

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.arm.arm import Arm, Sensed
-from rack.levels.cell import Cell
-from rack.levels.dynamics import FRICTION_SPEED
 from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
-from rack.levels.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import FRICTION_SPEED
+from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class FaultyLink:
         # Friction that helped may now resist: it hides twice its value.
         self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
         # A push that carried may now press.
-        self._pressed = 2.0 * PRESSING * limits
+        self._pressed = 2.0 * MAX_CONTACT_PART * limits
         self._sensors: list[tuple[SensorStep, ActiveFault]] = []
         self._motors: list[tuple[float, ActiveFault]] = []  # with the part of its torque limit that a motor still gives
         self._commands: list[tuple[CommandStep, ActiveFault]] = []
@@ -95,7 +95,7 @@ class FaultyLink:
         if self._arm.leans:
             return self._pressed
         turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNS_FROM)
-        return RESTING * self._limits if self._arm.holds and turning < TURNING_JOINTS else 0.0
+        return MAX_RESTING_CONTACT_PART * self._limits if self._arm.holds and turning < MIN_TURNING_JOINTS else 0.0
 
     def _corrupt(self, torque: Array) -> Array:
         corrupt = self._torque

@@ -22,9 +22,8 @@ from rack.levels.messages import (
     SegmentKind,
     Verb,
 )
-from rack.levels.operator import OPERATOR_COMMAND, Commands, What
-from rack.levels.orders import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, Orders
-from rack.levels.params import read_params
+from rack.levels.operator import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Commands, Operation, Orders
+from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
@@ -44,7 +43,7 @@ class ElementalMoveExecutor(Executor):
     }
     # The status first: killed between the two, the board finds a window whose done moves it only takes out again.
     outputs: ClassVar[Mapping[str, MessageType]] = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
-    commands: ClassVar[Commands] = {What.HOLD: (), What.RESUME: ()}
+    commands: ClassVar[Commands] = {Operation.HOLD: (), Operation.RESUME: ()}
     params = ElementalMoveParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -226,7 +225,7 @@ class ElementalMoveExecutor(Executor):
         if kept_from:
             report.state = State.HOLDING
         report.error, report.reason = self._error, self._reason if self._error else kept_from
-        report.operated = status.operated or self._orders.standing is not What.NONE
+        report.operated = status.operated or self._orders.standing is not Operation.NONE
         self._report_work(command.value, status, segments, report)
 
     def _report_work(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
@@ -256,7 +255,7 @@ class ElementalMoveExecutor(Executor):
 
     def _is_told_to(self, read: Ports) -> bool:
         """Say whether the level above, or an operator here, says hold."""
-        return bool(read.command.value.hold) or self._orders.standing is What.HOLD
+        return bool(read.command.value.hold) or self._orders.standing is Operation.HOLD
 
     def _answer(self, read: Ports, write: Ports) -> None:
         """Answer the operator, and hand down what this cycle rests on."""
@@ -270,7 +269,7 @@ class ElementalMoveExecutor(Executor):
 
     def _kept_from(self, command: Reading, below: Reading) -> str:
         """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
-        if self._orders.standing is not What.NONE:
+        if self._orders.standing is not Operation.NONE:
             return self._orders.keeps(self.context.board)
         if command.is_lost:
             return ABOVE_LOST

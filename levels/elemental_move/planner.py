@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message, MessageType
-from rack.levels.cell import build_cell
 from rack.levels.elemental_move.lookahead import Job, Published, Refusal, end_handed_down, next_move, situation_before
 from rack.levels.elemental_move.params import ElementalMoveParams
 from rack.levels.errors import Refused
@@ -26,11 +25,12 @@ from rack.levels.messages import (
     SegmentKind,
     Verb,
 )
-from rack.levels.params import read_params
 from rack.levels.planning.move import Move, read_window
 from rack.levels.planning.path import Path
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.planning.situation import Situation
+from rack.levels.robot.cell import build_cell
+from rack.levels.tables import read_params
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rack.levels.algebra import mat_vec
-from rack.levels.cell import Cell
-from rack.levels.scene import SceneConfig
-from rack.levels.touches import geom_name
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.lookup import geom_name
+from rack.levels.tables import SceneConfig
 
 Array = NDArray[np.float64]
 

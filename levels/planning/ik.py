@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import gram, norm, transposed_mat_vec
-from rack.levels.cell import Cell
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.planning.reach import sampling_range
+from rack.levels.robot.cell import Cell
 
 Array = NDArray[np.float64]
 

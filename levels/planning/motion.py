@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.cell import Cell
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
 from rack.levels.planning.collision import CollisionChecker
@@ -18,7 +17,8 @@ from rack.levels.planning.payload import Payloads
 from rack.levels.planning.pose import Pose
 from rack.levels.planning.situation import Situation
 from rack.levels.primitive.path import BlendedPath
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import SceneConfig
 
 Array = NDArray[np.float64]
 

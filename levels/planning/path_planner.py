@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import norm
-from rack.levels.cell import Cell
 from rack.levels.messages import WAYPOINTS
 from rack.levels.planning.path import Path
 from rack.levels.planning.reach import lever_arms
 from rack.levels.planning.sampling import SampledSearch
 from rack.levels.primitive.path import BlendedPath
 from rack.levels.primitive.trajectory import duration
+from rack.levels.robot.cell import Cell
 
 Array = NDArray[np.float64]
 Free = Callable[[Array], bool]

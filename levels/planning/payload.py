@@ -13,11 +13,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.cell import Cell
-from rack.levels.dynamics import Dynamics, Payload
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose, pose
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Dynamics, Payload
 
 Array = NDArray[np.float64]
 

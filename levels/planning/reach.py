@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.cell import Cell
-from rack.levels.touches import below, geoms_of
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.lookup import below, geoms_of
 
 SAMPLES = 64
 """Random configurations over which the largest lever is taken."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.levels.cell import build_cell
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import (
     JOINT_SET_POINT,
@@ -17,9 +16,7 @@ from rack.levels.messages import (
     Error,
     SegmentKind,
 )
-from rack.levels.operator import OPERATOR_COMMAND, What
-from rack.levels.orders import ABOVE_LOST, HELD_FROM_ABOVE, Orders
-from rack.levels.params import read_params
+from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Operation, Orders
 from rack.levels.primitive.fault import Fault
 from rack.levels.primitive.gripper_work import GripperWork
 from rack.levels.primitive.guard import Guard
@@ -31,6 +28,8 @@ from rack.levels.primitive.plans import Plans
 from rack.levels.primitive.segment import Segment, read_segment, window
 from rack.levels.primitive.sight import Sight
 from rack.levels.primitive.tracking import Straying, Tracking, awaited
+from rack.levels.robot.cell import build_cell
+from rack.levels.tables import read_params
 
 Work = PathWork | GripperWork
 
@@ -59,7 +58,7 @@ class PrimitiveExecutor(Executor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": JOINT_SET_POINT, "status": PRIMITIVE_STATUS}
-    commands = {What.HOLD: (), What.RESUME: ()}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -128,7 +127,7 @@ class PrimitiveExecutor(Executor):
 
     def _go_on(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish it, drop it, begin it, step it."""
-        hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.standing is What.HOLD
+        hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.standing is Operation.HOLD
         if read.status.is_new:
             self._finish(read.status.value, tick)
             self._straying.update(read.status.value)
@@ -246,7 +245,7 @@ class PrimitiveExecutor(Executor):
         status.position[:] = self._position
         path_work = work if isinstance(work, PathWork) else None
         status.progress = path_work.progress if path_work is not None else memory.progress * bool(interrupted)
-        status.operated = self._orders.standing is not What.NONE or read.status.value.standing > 0
+        status.operated = self._orders.standing is not Operation.NONE or read.status.value.standing > 0
         # Out of step it is not for the world that motion holds.
         status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
         status.resting = path_work is None or path_work.motion.resting
@@ -260,7 +259,7 @@ class PrimitiveExecutor(Executor):
             return awaited(read.status.value, self._tracking.silent_cycles)
         if isinstance(work, GripperWork):
             return ""
-        if self._orders.standing is not What.NONE:
+        if self._orders.standing is not Operation.NONE:
             return self._orders.keeps(self.context.board)
         if work is not None:
             blocked = f"blocked: {work.obstacle}" if work.blocked else ""

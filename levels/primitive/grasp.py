@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.cell import Cell
+from rack.levels.robot.cell import Cell
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from rack.levels.primitive.fault import Fault
 from rack.levels.primitive.path_work import WorkRules
 from rack.levels.primitive.segment import Segment
 from rack.levels.primitive.tracking import HANDOVER_CYCLES
-from rack.levels.robot import GripperConfig
+from rack.levels.tables import GripperConfig
 
 
 class GripperWork:

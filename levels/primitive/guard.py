@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.cell import Cell
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.primitive.grasp import GraspFrame
 from rack.levels.primitive.path import BlendedPath
 from rack.levels.primitive.segment import Segment
 from rack.levels.primitive.trajectory import Trajectory
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import SceneConfig
 
 Array = NDArray[np.float64]
 

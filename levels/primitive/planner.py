@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.levels.cell import build_cell
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import MOVE_COMMAND, PRIMITIVE_STATUS, TRAJECTORY, Error
-from rack.levels.params import read_params
 from rack.levels.primitive.fault import Fault
 from rack.levels.primitive.params import PrimitiveParams
 from rack.levels.primitive.path import BlendedPath
 from rack.levels.primitive.path_work import WorkRules, too_late
 from rack.levels.primitive.segment import Segment, read_segment, window
 from rack.levels.primitive.trajectory import Trajectory, make_trajectory
+from rack.levels.robot.cell import build_cell
+from rack.levels.tables import read_params
 
 
 class PrimitivePlanner(Planner):

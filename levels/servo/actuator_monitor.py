@@ -1,4 +1,4 @@
-"""Judges whether the motors do what they are told, from how the arm moves."""
+"""Judges from the arm's motion whether its motors give the torques commanded."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ from numpy.typing import NDArray
 
 from rack.backplane.alarms import Alarm
 from rack.levels.algebra import each, mat_vec
-from rack.levels.cell import Cell
-from rack.levels.dynamics import FRICTION_SPEED, Terms
 from rack.levels.level import Finding
-from rack.levels.limits import PRESSING, RESTING, TURNING_JOINTS
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
+from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
 Array = NDArray[np.float64]
 
-NOISE = 0.005
-"""Part of a torque limit that the equation of motion leaves unexplained; ten times what faultless runs show."""
-LACKING = 0.02
+NOISE_PART = 0.005
+"""Part of a torque limit that the equation of motion may leave unexplained; ten times that of faultless runs."""
+LACKING_PART = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
 SURE_CYCLES = 4
-"""Cycles that tell a motor that does not do more when it is told more from a load that hangs on the arm."""
-FOLLOWS = 0.3
-"""Part of a rise in torque that a sound motor gives at least."""
-DEAD = 0.5
+"""Cycles needed to tell a motor that does not give more when commanded more from a load on the arm."""
+RISE_PART = 0.3
+"""Least part of a rise in torque that a sound motor gives."""
+DEAD_PART = 0.5
 """Part of its torque that a motor must lack to be dead where dry friction hides how much it gives."""
-TOO_FAST = 0.99
-"""Part of a velocity limit; a joint that may come to it while motors lack torque leaves no time to be sure."""
+URGENT_SPEED_PART = 0.99
+"""Part of a velocity limit; a joint that may reach it while motors lack torque leaves no time to be sure."""
 TURNING = np.array([[-2.0], [2.0]])
 """Velocities, in `FRICTION_SPEED`, between which dry friction may be anything up to its full value."""
 
 
 class ActuatorMonitor:
-    """Holds the torques that a motion took against the torques that were given for it.
+    """Compares the torques that a motion took with the torques commanded for it.
 
-    What is left over is explained by motors that gave less than they were told, or it is not: then something outside
-    pushes, until nothing is left over, and only a motor that lacks more than `PRESSING` is at fault. A load that pulls
-    looks like a motor that lacks torque for a cycle or two; but with a load a motor that is told more gives more.
-    An arm that strays from its set points by more than `following`, rad, has a motor too few as well.
+    A difference is explained by motors that gave less than commanded, or by something outside that pushes: then, until
+    the difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` has failed. A pulling load looks like a
+    motor that lacks torque for a cycle or two; but under load, a motor commanded more gives more. A motor has failed,
+    too, when the arm strays from its set points by more than `following`, rad.
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
         self._limits, self._dry = cell.bounds.torque, np.array(cell.model.dof_frictionloss[cell.dof])
         self._following, self._period_s = following, period_s
-        # Simulated friction slows a joint as a damper of that time constant does: where the joint brakes harder, the
-        # friction turns round before the velocity does.
+        # Simulated friction slows a joint as a damper of that time constant does: if the joint brakes harder, the
+        # friction changes sign before the velocity does.
         model, dof = cell.model, cell.dof
         self._early = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
-        self._fastest = TOO_FAST * cell.bounds.velocity
-        self._least, self._speed_off = NOISE * self._limits, cell.encoders.speed_off
+        self._fastest = URGENT_SPEED_PART * cell.bounds.velocity
+        self._least, self._speed_off = NOISE_PART * self._limits, cell.encoders.speed_off
         self._exact, self._off = cell.encoders.exact, cell.encoders.off
         self._noise = self._least
         joints = len(self._dry)
@@ -57,10 +57,10 @@ class ActuatorMonitor:
         self._bias, self._velocity, self._torque = np.zeros((3, joints))
         self._friction = np.zeros((2, joints))
         self._begun = False
-        self._pushed = False  # what was left over is not explained by motors
-        self._cycles, self._joint = 0, -1
-        self._told = self._gave = self._most = 0.0
-        self._alone = True  # it is the one motor that lacks torque
+        self._pushed = False  # motors do not explain the difference
+        self._cycles, self._joint = 0, -1  # for which a motor has lacked torque, and which
+        self._commanded = self._given = self._most = 0.0  # N m: commanded and given at first, most given since
+        self._alone = True  # it is the only motor that lacks torque
 
     def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
         """Take the arm's state, rad/s, N m, at the beginning of a cycle, and the torques that it was given."""
@@ -71,7 +71,7 @@ class ActuatorMonitor:
         self._begun = True
 
     def drop(self) -> None:
-        """Forget the cycle that was begun: brakes, missed cycles or wrong samples came in between."""
+        """Forget the cycle that was begun: brakes, missed cycles or wrong samples intervened."""
         self._begun = self._pushed = False
         self._cycles = 0
 
@@ -88,7 +88,7 @@ class ActuatorMonitor:
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
         left = self._left_over(velocity, terms)
         if not self._exact:
-            # What encoders may make of a gain in velocity that there is not.
+            # A change in velocity that encoders may show without one.
             self._noise = self._least + mat_vec(np.abs(terms.inertia), 2.0 * self._speed_off / self._period_s)
         if not np.count_nonzero(np.abs(left) > self._noise):
             self._cycles, self._pushed = 0, False
@@ -96,7 +96,7 @@ class ActuatorMonitor:
         return self._lacking(left, velocity, holds)
 
     def _left_over(self, velocity: Array, terms: Terms) -> Array:
-        """Return the torques, N m, that neither the motion nor any dry friction took."""
+        """Return the torques, N m, taken neither by the motion nor by dry friction."""
         gain = velocity - self._velocity
         gain *= 0.5 / self._period_s
         np.add(self._inertia, terms.inertia, out=self._twice_inertia)
@@ -116,16 +116,16 @@ class ActuatorMonitor:
         return np.asarray(left - np.minimum(np.maximum(left, friction[0]), friction[1]))
 
     def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
-        """Follow cycles in which motors that lack torque explain what is left over, until it is sure."""
-        told = np.abs(self._torque)
+        """Follow cycles in which motors that lack torque explain the difference, until it is certain."""
+        commanded = np.abs(self._torque)
         lacks = left * np.sign(self._torque)
-        explained = (lacks >= -self._noise) & (lacks <= told + self._noise)
+        explained = (lacks >= -self._noise) & (lacks <= commanded + self._noise)
         if not self._pushed and not explained.all():
             self._pushed, self._cycles = True, 0
         share = np.where(explained, lacks / self._limits, 0.0)
-        # Where a joint turns its dry friction is known, and any push shows.
-        rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < TURNING_JOINTS
-        part = PRESSING if self._pushed else RESTING if rests and holds else LACKING
+        # While a joint turns, its dry friction is known, and any push shows.
+        rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < MIN_TURNING_JOINTS
+        part = MAX_CONTACT_PART if self._pushed else MAX_RESTING_CONTACT_PART if rests and holds else LACKING_PART
         least = np.maximum(part, self._noise / self._limits)
         joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
         if share[joint] <= least[joint]:
@@ -133,26 +133,27 @@ class ActuatorMonitor:
             return None
         if self._cycles == 0 or joint != self._joint:
             self._joint, self._cycles = joint, 0
-            self._told, self._gave, self._most, self._alone = told[joint], told[joint] - lacks[joint], 0.0, True
+            self._commanded, self._given = commanded[joint], commanded[joint] - lacks[joint]
+            self._most, self._alone = 0.0, True
         self._cycles += 1
-        self._most = max(self._most, abs(told[joint] - lacks[joint]))
+        self._most = max(self._most, abs(commanded[joint] - lacks[joint]))
         self._alone &= not rests and np.count_nonzero(np.abs(left) > self._noise) == 1
         ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
-        if (ahead > self._fastest).any() or self._sure(joint, told[joint], lacks[joint]):
+        if (ahead > self._fastest).any() or self._sure(joint, commanded[joint], lacks[joint]):
             self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
         return None
 
-    def _sure(self, joint: int, told: float, lacks: float) -> bool:
-        """Say whether the motor gives nothing, or no more though it is told more; or less than what pushes may take.
+    def _sure(self, joint: int, commanded: float, lacks: float) -> bool:
+        """Return whether the motor surely gives nothing, or no more when commanded more, or less than a push may take.
 
-        One that gives nothing may seem to give what dry friction does: twice its value, where that turns round.
+        A dead motor may seem to give what dry friction does: twice its value, where that changes sign.
         """
         if self._cycles < SURE_CYCLES:
             return False
         if self._pushed:
             return True
-        more, rise = told - self._told, told - lacks - self._gave
+        more, rise = commanded - self._commanded, commanded - lacks - self._given
         certain = 2.0 * self._noise[joint]
-        hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD * told else 0.0
-        return bool(self._most <= certain + hidden or (more > certain and rise < FOLLOWS * more))
+        hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD_PART * commanded else 0.0
+        return bool(self._most <= certain + hidden or (more > certain and rise < RISE_PART * more))

@@ -49,10 +49,10 @@ class Hermite:
 
 
 class Ramp:
-    """From a velocity to rest, all joints at the same time, so that they stay on that velocity's line; then rest."""
+    """From a velocity to rest, all joints at the same time, so that they stay on a straight line; then rest."""
 
     def __init__(self, start: Array, velocity: Array, acceleration: Array) -> None:
-        """Brake no joint harder than its `acceleration`, rad/s2."""
+        """Decelerate no joint harder than its `acceleration`, rad/s2."""
         self.duration_s = float(np.max(np.abs(velocity) / acceleration))
         self._start, self._velocity = start, velocity
         self._end = start + 0.5 * velocity * self.duration_s
@@ -68,10 +68,10 @@ class Ramp:
 
 
 class Decay:
-    """A difference in position and velocity that vanishes: the quintic that ends with all derivatives zero; then 0."""
+    """A difference in position and velocity that decays: a quintic that ends with all derivatives zero; then 0."""
 
     def __init__(self, position: Array, velocity: Array, fastest: Array, hardest: Array) -> None:
-        """Take as long as is needed to add no more than about `fastest`, rad/s, and `hardest`, rad/s2, to a motion."""
+        """Last as long as it takes to add at most about `fastest`, rad/s, and `hardest`, rad/s2, to a motion."""
         # Peaks of the quintic over a time T: 1.875 p / T in velocity; 5.774 p / T^2 + 3.94 v / T in acceleration.
         linear = 3.94 * np.abs(velocity)
         by_acceleration = (linear + np.sqrt(linear**2 + 4.0 * 5.774 * hardest * np.abs(position))) / (2.0 * hardest)
@@ -81,7 +81,7 @@ class Decay:
         self._zero = np.zeros_like(position)
 
     def at(self, time_s: float) -> Motion:
-        """Return what is left of the difference at `time_s` from 0 on."""
+        """Return the rest of the difference at `time_s` from 0 on."""
         if time_s >= self.duration_s:
             return Motion(self._zero, self._zero, self._zero)
         c0, c1, c3, c4, c5 = self._coefficients
@@ -92,10 +92,10 @@ class Decay:
 
 
 class Passage:
-    """From rest at one place to rest at another, all joints at the same time, straight in joint space; then rest."""
+    """From rest to rest at another place, all joints at the same time, straight in joint space; then rest."""
 
     def __init__(self, start: Array, end: Array, fastest: Array, hardest: Array) -> None:
-        """Take as long as no joint needs more than `fastest`, rad/s, and `hardest`, rad/s2, for."""
+        """Last as long as it takes to keep every joint within `fastest`, rad/s, and `hardest`, rad/s2."""
         self._end = end
         self._left = Decay(start - end, np.zeros_like(start), fastest, hardest)
 

@@ -1,4 +1,4 @@
-"""The executor of the servo level: one cycle of computed torque, or of a stop."""
+"""The executor of the servo level: in every cycle torques for the arm, or a stop."""
 
 from __future__ import annotations
 
@@ -8,23 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
-from rack.levels.arm import Arm, FaultyLink, Link, Sensed, SimulatedArm
+from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm
 from rack.levels.arm.faulty import STEPS
-from rack.levels.cell import build_cell
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
-from rack.levels.operator import OPERATOR_COMMAND, Goal, What
-from rack.levels.params import read_params
+from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.robot.cell import build_cell
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
-from rack.levels.servo.brake_log import BrakeLog
-from rack.levels.servo.computed_torque import ComputedTorque
+from rack.levels.servo.control import ComputedTorque, Grip, ServoParams
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.grip import Grip
-from rack.levels.servo.params import ServoParams
+from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.servo.sensor_monitor import SensorMonitor
-from rack.levels.servo.standing import Standing
-from rack.levels.servo.stopping import Reaction, Stopping
+from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
+from rack.levels.tables import read_params
 
 Array = NDArray[np.float64]
 
@@ -32,9 +29,9 @@ Array = NDArray[np.float64]
 class ServoExecutor(Executor):
     """Follows joint set points with torques, and lets the arm's time pass.
 
-    A cycle first simulates the ticks since the last one: the arm's time is the clock's also when cycles are missed.
-    On a demand, and while sensors or motors are at fault, the arm holds, stops or is braked instead; afterwards it is
-    taken over where it stands. Next to that comes what an operator says, and then the level above.
+    A cycle first lets the ticks since the last one pass: the arm's time is the clock's, even if cycles were missed.
+    Safety comes first: on a demand, and while sensors or motors are at fault, the arm holds, stops or is braked, and
+    motion resumes afterwards from where it stands. An operator's command comes second, the level above third.
     """
 
     inputs = {
@@ -45,45 +42,41 @@ class ServoExecutor(Executor):
     }
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
     faults = STEPS
-    commands = {What.HOLD: (), What.RESUME: (), What.SETPOINT: (Goal.JOINTS,)}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
     params = ServoParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         params, every = read_params(ServoParams, context.params), context.every
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self.arm: Arm = SimulatedArm(cell, context.scene, context.clock_ns, every, context.seed)
+        self.arm: Arm = find_arm(params.arm)(cell, context.scene, context.clock_ns, every, context.seed)
         self._faulty = FaultyLink(self.arm, cell, every, self.acted)
-        self._link: Link = self.arm
-        self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
+        self._link: Link = self.arm  # the path to the arm; through `_faulty` while faults are injected
+        self.reference = Reference(cell.bounds, cell.limits, context.tick_s)  # set points, interpolated
         self._loop = ComputedTorque(cell, params)
-        braking = cell.limits.acceleration
-        retry_cycles = round(params.retry / context.period_s)
-        self.sensors = SensorMonitor(
-            cell.bounds, cell.encoders, braking, cell.home, context.tick_s, every, params.good_cycles, retry_cycles
-        )
+        self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
-        self.standing = Standing(self.commands, context.robot.joints, cell.limits.position)
+        self.operator = OperatorControl(self.commands, context.robot.joints, cell.limits.position)
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
-        self._rest = np.zeros(len(cell.home))
-        self._wanted = Motion(cell.home, self._rest, self._rest)
-        self._started = False
-        self._left = False  # the set points in the last cycle: the arm was braked
+        self._rest = np.zeros(len(cell.home))  # (joints,), always zero: velocity and acceleration at rest
+        self._wanted = Motion(cell.home, self._rest, self._rest)  # of the last cycle: rad, rad/s, rad/s2
+        self._started = False  # the first cycle has begun
+        self._abandoned = False  # set points were given up in the last cycle: the arm was braked
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Take over the faults between this level and the arm."""
+        """Replace the faults between this level and the arm."""
         self._faulty.inject(faults)
         self._link = self._faulty if faults else self.arm
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Let time pass to `tick`, sense, interpolate, drive; report."""
+        """Let time pass up to `tick`, sense, interpolate, drive; report."""
         missed = self._catch_up(read.before.value if read.before.is_there else None, tick)
         sensed, sensors = self._link.sense(), self.sensors
         contact = self.arm.contact
-        sensors.look(sensed, tick, None if missed or self._left else self._wanted.velocity, contact is not None)
-        self.standing.take(read.operator)
+        sensors.look(sensed, tick, None if missed or self._abandoned else self._wanted.velocity, contact is not None)
+        self.operator.take(read.operator)
         if contact is not None:
             self.stopping.struck(contact, self.arm.named(contact), tick)
         reaction = self.stopping.decide(self.demand, sensors, tick)
@@ -93,17 +86,17 @@ class ServoExecutor(Executor):
         elif sensors.fresh:
             self._drive(read, sensed, reaction, missed, tick)
         else:
-            self.motors.drop()  # without a new sample the arm goes on with its last torque
+            self.motors.drop()  # without a new sample the arm keeps its last torque
         self._brakes.after_cycle(tick, self.findings)
         self._report(write.status, read.command.value, sensed, reaction)
-        self.standing.orders.report(write.status, read.command.value.operator)
+        self.operator.orders.report(write.status, read.command.value.operator)
         self.arm.save(write.state)
         sensors.remember(write.state)
         self.stopping.remember(write.state)
         self.arm.look(write.scene)
 
     def _catch_up(self, before: Message | None, tick: int) -> bool:
-        """Simulate up to `tick`; return whether cycles were missed. A restarted board finds the arm as it was left."""
+        """Let time pass up to `tick`; return whether cycles were missed. A restarted board first restores the arm."""
         if not self._started:
             self._start(before, tick)
             return False
@@ -126,7 +119,7 @@ class ServoExecutor(Executor):
             self._brakes.start(self.arm.tick)
         self.arm.step(tick - self.arm.tick)
         self._brakes.after_waiting(tick, self.findings)
-        self._started = self._left = True
+        self._started = self._abandoned = True
 
     def _take_findings(self) -> None:
         for findings in (self.sensors.findings, self.stopping.findings):
@@ -135,14 +128,14 @@ class ServoExecutor(Executor):
                 findings.clear()
 
     def _brake(self) -> None:
-        """Brake, and let the set points go."""
+        """Brake, and abandon the set points."""
         self.arm.brake()
         self.motors.drop()
         self._wanted = Motion(self.sensors.position, self.sensors.velocity, self._rest)
-        self._left = True
+        self._abandoned = True
 
     def _drive(self, read: Ports, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
-        """Do one cycle with torques; where that goes wrong, or a stop has come to rest, brake."""
+        """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop has come to rest."""
         command: Message = read.command.value
         plan: Message | None = read.plan.value if read.plan.is_there else None
         position, velocity = self.sensors.position, self.sensors.velocity
@@ -152,26 +145,26 @@ class ServoExecutor(Executor):
         failed = self.motors.look(velocity, terms, wanted.position - position, holds)
         if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
             return self._brake()
-        if reaction is Reaction.STOP and (self._left or not wanted.velocity.any()):
+        if reaction is Reaction.STOP and (self._abandoned or not wanted.velocity.any()):
             return self._brake()
         torque = self._loop.torque(wanted, position, velocity, terms, plan)
         grip_force = 0.0 if self._grip is None else self._grip.force(command, sensed.opening, sensed.opening_velocity)
         refused = self._link.drive(torque, grip_force)
         if refused is not None:
             return self._refuse(refused, tick)
-        self._wanted, self._left, self.stopping.refused = wanted, False, None
+        self._wanted, self._abandoned, self.stopping.refused = wanted, False, None
         return self.motors.begin(velocity, terms, self.arm.torque)
 
     def _next_motion(self, command: Message, reaction: Reaction, missed: bool, tick: int) -> Motion:
-        """Return the motion wanted; an arm that was braked is taken over where it stands."""
+        """Return the motion wanted; after braking it begins where the arm stands."""
         sensors, reference = self.sensors, self.reference
-        if self._left:
+        if self._abandoned:
             reference.start(sensors.position, sensors.velocity, tick)
         elif missed:
             reference.meet(sensors.position, sensors.velocity, tick)
         if reaction is not Reaction.NONE:
             return reference.rest(tick)
-        return self.standing.wanted(reference, tick) if self.standing.stands else reference.at(command, tick)
+        return self.operator.wanted(reference, tick) if self.operator.stands else reference.at(command, tick)
 
     def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
         if not self.stopping.trying:
@@ -179,7 +172,7 @@ class ServoExecutor(Executor):
         return self.stopping.motor_fails(finding.subject, finding.value, tick)
 
     def _refuse(self, finding: Finding, tick: int) -> None:
-        """Take in that the arm did not let a torque through and has closed its brakes."""
+        """React to an arm that refused a torque and engaged its brakes."""
         refused = self.stopping.refused
         if refused is None or finding.alarm is not refused.alarm:
             self.findings.append(finding)
@@ -188,18 +181,18 @@ class ServoExecutor(Executor):
 
     def _report(self, status: Message, command: Message, sensed: Sensed, reaction: Reaction) -> None:
         arm, sensors, wanted = self.arm, self.sensors, self._wanted
-        holding = self._left or self.reference.holding
+        holding = self._abandoned or self.reference.holding
         status.echo = command.id
         status.position, status.velocity, status.torque = sensors.position, sensors.velocity, arm.torque
         status.target, status.target_velocity = wanted.position, wanted.velocity
         status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
         status.grip_force = arm.grip_force
         status.holding, status.braked = holding, arm.braked
-        status.stopped = self._left or reaction is not Reaction.NONE or self.standing.stands
+        status.stopped = self._abandoned or reaction is not Reaction.NONE or self.operator.stands
         status.demand = self.demand
         status.clipped = arm.clipped + self.reference.refused + self._loop.cut
         status.touches, status.violations, status.pushed = arm.touches, arm.violations, arm.pushed
-        kept = self.stopping.reason or self.standing.reason
+        kept = self.stopping.reason or self.operator.reason
         if arm.fault:
             status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, arm.fault
         elif self.stopping.error:

@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.algebra import mat_vec, transposed_mat_vec
-from rack.levels.cell import build_cell
-from rack.levels.dynamics import Dynamics, Payload
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Dynamics, Payload
 
 Array = NDArray[np.float64]
 
 
 class ServoPlanner(Planner):
-    """Plans the inertia at the set point that is due next, with what the gripper holds, every time it is released."""
+    """Plans the inertia at the set point due next, with the object held, at every release."""
 
     inputs = {
         "command": Input(JOINT_SET_POINT, "above.command"),
@@ -38,7 +38,7 @@ class ServoPlanner(Planner):
         self._rest = np.zeros(len(cell.home))
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Always: the arm is always somewhere else."""
+        """Return True: the arm is always somewhere else."""
         return True
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:

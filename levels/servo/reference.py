@@ -1,8 +1,8 @@
 """The set point of every servo cycle, between the set points that come from above.
 
-A set point is to be reached at its `due` tick; the next one is there by then. In between the motion is the cubic
-Hermite curve through positions and velocities, so it is C1. When none came in time the motion ramps to rest; when they
-come again it joins them smoothly.
+A set point is to be reached at its `due` tick; the next one has arrived by then. In between the motion is the cubic
+Hermite curve through positions and velocities, so it is C1. When none comes in time the motion ramps to rest; when set
+points resume it joins them smoothly.
 """
 
 from __future__ import annotations
@@ -13,51 +13,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.cell import Bounds, Limits
+from rack.levels.robot.limits import Bounds, Limits
 from rack.levels.servo.curves import Curve, Decay, Hermite, Motion, Passage, Ramp
 
 Array = NDArray[np.float64]
 
-HARDEST = 2.0
-"""Multiple of the acceleration limits up to which one curve may join two set points: planned motion, interpolated,
+MAX_ACCELERATION = 2.0
+"""Multiple of the acceleration limits that the curve between two set points may need: planned motion, interpolated,
 needs a little more than 1."""
-JOINING_SPEED = 0.25
+JOINING_SPEED_PART = 0.25
 """Part of the velocity limits that joining may add to a motion."""
 ASTRAY_RAD = 0.005
-"""Distance from the reference beyond which an arm that was left alone is not pulled back at once."""
-
-FURTHEST_S = 2.0
-"""How far ahead a set point may be due: one beyond that is a broken command, not a slow level."""
+"""Distance from the reference beyond which an arm is not pulled back at once after missed cycles."""
+MAX_AHEAD_S = 2.0
+"""Time ahead at which a set point may be due: beyond that it is a broken command, not a slow level."""
 
 
 class SetPoint(NamedTuple):
-    """Positions, rad, and velocities, rad/s, (joints,) each, to be reached at tick `due`."""
+    """Joint positions and velocities to be reached at a tick."""
 
-    due: int
-    position: Array
-    velocity: Array
+    due: int  # tick
+    position: Array  # (joints,), rad
+    velocity: Array  # (joints,), rad/s
 
 
 class Reference:
-    """Interpolates set points. Tick by tick: `at(command, tick)` gives the motion wanted at that tick.
-
-    `holding`: no fresh set point. `goal`: where it goes by `to`, or has rested since; None: nowhere. `refused`: set
-    points that were cut at the bounds, and cycles that saw one which is no motion.
-    """
+    """Interpolates set points: tick by tick, `at(command, tick)` gives the motion wanted at that tick."""
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
         self._bounds, self._limits, self._tick_s = bounds, limits, tick_s
         joints = len(limits.velocity)
         self._nothing = Decay(np.zeros(joints), np.zeros(joints), limits.velocity, limits.acceleration)
-        self._due = 0
-        self._next: SetPoint | None = None
-        self.goal: Array | None = None
-        self.holding = True
-        self.refused = 0
+        self._due = 0  # tick at which the present curve ends
+        self._next: SetPoint | None = None  # waits until then
+        self.goal: Array | None = None  # (joints,), rad: goal of `to`, until another motion begins; None: none
+        self.holding = True  # no fresh set point
+        self.refused = 0  # set points cut at the bounds, and cycles that saw one that is NaN or too far ahead
         self.start(np.zeros(joints), np.zeros(joints), 0)
 
     def start(self, position: Array, velocity: Array, tick: int) -> None:
-        """Go on from a motion at `tick`, rad, rad/s: ramp to rest and hold."""
+        """Start from a motion at `tick`, rad, rad/s: ramp to rest and hold."""
         self._curve: Curve = Ramp(position.copy(), velocity.copy(), self._limits.acceleration)
         self._from = tick
         self._difference, self._differs_from = self._nothing, tick
@@ -65,7 +60,7 @@ class Reference:
         self.holding = True
 
     def meet(self, position: Array, velocity: Array, tick: int) -> None:
-        """Take the arm as it is found after missed cycles, if it has strayed: from there back to the set points."""
+        """Start from where the arm is after missed cycles, if it has strayed, and lead it back to the set points."""
         now = self._motion(tick)
         if np.max(np.abs(now.position - position)) < ASTRAY_RAD:
             return
@@ -76,18 +71,18 @@ class Reference:
 
     def at(self, command: Message, tick: int) -> Motion:
         """Return the motion wanted at `tick`, given the newest `JOINT_SET_POINT`; its acceleration is mid-cycle."""
-        self._turn(tick)
+        self._advance(tick)
         due, waiting = command.due, self._next
         if tick < due != self._due and (waiting is None or due != waiting.due):
             self._receive(command, due, tick)
-            self._turn(tick)
+            self._advance(tick)
         if not self.holding and tick >= self._due:
             last = self._motion(self._due)
             self.start(last.position, last.velocity, self._due)
         return self._motion(tick)
 
     def rest(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, whatever comes from above: ramp to rest and hold."""
+        """Return the motion wanted at `tick`, ignoring the level above: ramp to rest and hold."""
         self._next = None
         if not self.holding or self.goal is not None:
             now = self._motion(tick)
@@ -95,9 +90,9 @@ class Reference:
         return self._motion(tick)
 
     def to(self, goal: Array, tick: int) -> Motion:
-        """Return the motion wanted at `tick` on the way to `goal` (joints,), rad, whatever comes from above.
+        """Return the motion wanted at `tick` on the way to `goal` (joints,), rad, ignoring the level above.
 
-        First it ramps to rest; from there it goes straight, from rest to rest, within the limits of every joint.
+        It ramps to rest, then goes straight, from rest to rest, within the limits of every joint.
         """
         if self.goal is goal:
             return self._motion(tick)
@@ -110,9 +105,9 @@ class Reference:
         return self._motion(tick)
 
     def _receive(self, command: Message, due: int, tick: int) -> None:
-        """Take a copy of a set point. It waits until the one before it is due: not every protocol is as punctual."""
+        """Copy a set point. It waits until the one before it is due: some protocols deliver early."""
         finite = bool(np.isfinite(command.position).all() and np.isfinite(command.velocity).all())
-        if not finite or (due - tick) * self._tick_s > FURTHEST_S:
+        if not finite or (due - tick) * self._tick_s > MAX_AHEAD_S:
             self.refused += 1
             return
         position = np.clip(command.position, self._bounds.position[:, 0], self._bounds.position[:, 1])
@@ -120,8 +115,8 @@ class Reference:
         self.refused += not (np.array_equal(position, command.position) and np.array_equal(velocity, command.velocity))
         self._next = SetPoint(due, position, velocity)
 
-    def _turn(self, tick: int) -> None:
-        """Turn to the waiting set point when its time has come."""
+    def _advance(self, tick: int) -> None:
+        """Begin the curve to the waiting set point when its time has come."""
         if self._next is None or (not self.holding and tick < self._due):
             return
         (due, position, velocity), self._next = self._next, None
@@ -130,7 +125,7 @@ class Reference:
         now = self._motion(tick)
         begin = tick if self.holding else self._due
         curve = self._bridge(begin, position, velocity, due)
-        joined = not self.holding and bool((curve.hardest() <= HARDEST * self._limits.acceleration).all())
+        joined = not self.holding and bool((curve.hardest() <= MAX_ACCELERATION * self._limits.acceleration).all())
         self._due, self.holding = due, False
         if joined:
             self._curve, self._from = curve, begin
@@ -145,9 +140,9 @@ class Reference:
         return Hermite(start.position, start.velocity, position, velocity, (due - begin) * self._tick_s)
 
     def _join(self, position: Array, velocity: Array, tick: int) -> None:
-        """Let the difference between a motion at `tick` and the curve vanish."""
+        """Let the difference between a motion at `tick` and the curve decay."""
         curve = self._curve.at((tick - self._from) * self._tick_s)
-        fastest = JOINING_SPEED * self._limits.velocity
+        fastest = JOINING_SPEED_PART * self._limits.velocity
         self._difference = Decay(
             position - curve.position, velocity - curve.velocity, fastest, self._limits.acceleration
         )

@@ -1,4 +1,4 @@
-"""Judges what the sensors say, and knows where the arm is while they lie."""
+"""Checks the joints' sensors, and estimates where the arm is while they are wrong."""
 
 from __future__ import annotations
 
@@ -8,122 +8,117 @@ from numpy.typing import NDArray
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
 from rack.levels.arm import Sensed
-from rack.levels.cell import Bounds
 from rack.levels.level import Finding
-from rack.levels.limits import Encoders
+from rack.levels.robot.cell import Cell
+from rack.levels.servo.control import ServoParams
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-ROOM_RAD = 5e-5
-"""What positions may differ from what velocities lead to: 20 times what faultless runs show, contacts included."""
+FIT_RAD = 5e-5
+"""Difference between a position and where the velocities lead: 20 times that of faultless runs, contacts included."""
 BEYOND_RAD, BEYOND_SPEED = 0.05, 1.2
-"""How far beyond its range, and at what multiple of its velocity limit, no joint can be."""
+"""Distance beyond its range, and multiple of its velocity limit, that no joint can reach."""
 STILL_CYCLES = 10
-"""Cycles without the least change, while the set point goes on, that no joint is capable of."""
+"""Cycles without the least change, while the set point moves, after which a sensor is stuck."""
 STILL_RAD = 5e-5
-"""Way of the set point in that time: however slow it is, a joint that is driven with a stuck sensor soon runs away."""
+"""Least way of the set point in that time: however slow, a joint driven with a stuck sensor soon runs away."""
 PLAUSIBLE_RAD = 1e-3
-"""Offset of a joint that came with a fault of its sensor and is taken over at rest: a millimetre at the arm's reach."""
+"""Offset that came with a fault of a joint's sensor and is accepted at rest: a millimetre at the arm's reach."""
 STUCK_RAD = 0.01
-"""How far a joint may have come until it is noticed that its sensor does not tell."""
+"""Distance that a joint may have moved before its stuck sensor is noticed."""
 STUCK_STEPS = 3.0
-"""Way, in multiples of what a good sample may be off both ways, after which an encoder that shows none is stuck."""
+"""Way, in multiples of twice a good sample's largest error, after which an encoder that shows none is stuck."""
 UNSEEN_S = 0.05
-"""Time for which a joint may have moved off while its sensor, unnoticed, did not."""
+"""Time for which a joint may have moved off while its sensor, unnoticed, was stuck."""
 BRAKE_TAIL_S2 = 1e-3
-"""What a joint needs beyond v^2 / 2 a until the brake has stopped it, for every rad/s2 of its braking."""
+"""Way of a braked joint beyond v^2 / 2 a, per rad/s2 of its braking."""
 STRUCK_SPEED = 5.0
-"""Multiple of that velocity up to which a blow may throw a joint about, within a cycle and without any model."""
+"""Multiple of the fastest velocity that a blow may give a joint, within a cycle and without any model."""
 SILENT_CYCLES = 2
 """Cycles without a new sample after which the sensors are silent."""
 
 
 class SensorMonitor:
-    """Holds every sample against the one before: a position must be where the velocities lead to.
+    """Checks every sample against the one before: the position must be where the velocities lead.
 
-    `position`, `velocity` (joints,), rad, rad/s, are the sample's if it is good. Where it is not, they go on with the
-    sensed velocity or, without one, as the brakes stop the arm; `doubt` (joints,), rad, is how far off that may be.
-    A joint is good again where what it says fits to that, and from sample to sample to itself, `good_cycles` in a row:
-    an offset that is greater than the doubt is never taken for the truth. `blamed`: joint, what it reads, rad, and by
-    how much that is off, rad; -1 and the age, ticks, of a sample that does not come. `fresh`: there is a sample of this
-    cycle. `faulty`: not yet `good_cycles` in a row were good, or `retry_cycles` where a joint that was stuck shows no
-    change at rest. `drivable`: velocities are known, so the arm could still be driven.
+    A joint is good again when its samples agree with the estimate, and with each other, `good_cycles` in a row: an
+    offset greater than `doubt` is never accepted.
     """
 
-    def __init__(
-        self,
-        bounds: Bounds,
-        encoders: Encoders,
-        braking: Array,
-        home: Array,
-        tick_s: float,
-        every: int,
-        good_cycles: int,
-        retry_cycles: int,
-    ) -> None:
-        """Judge joints that brake with `braking`, rad/s2, and start at `home`, rad, in cycles of `every` ticks."""
-        self._retry_cycles = max(retry_cycles, good_cycles)
-        self._room, self._speed_room = ROOM_RAD + 2.0 * encoders.off, encoders.speed_off
+    def __init__(self, cell: Cell, params: ServoParams, tick_s: float, every: int) -> None:
+        """Check the joints of a cell in cycles of `every` ticks; they start at home."""
+        self._good_cycles = params.good_cycles
+        self._retry_cycles = max(round(params.retry / (every * tick_s)), params.good_cycles)
+        encoders, bounds, home = cell.encoders, cell.bounds, cell.home
+        self._room, self._speed_room = FIT_RAD + 2.0 * encoders.off, encoders.speed_off
         self._coarse = not encoders.exact
         self._unshown = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
         self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
         self._fastest = BEYOND_SPEED * bounds.velocity
-        self._braking, self._tick_s, self._every, self._good_cycles = braking, tick_s, every, good_cycles
+        self._braking, self._tick_s, self._every = cell.limits.acceleration, tick_s, every
         joints = len(home)
-        self.position, self.velocity, self.doubt = home.copy(), np.zeros(joints), np.zeros(joints)
-        self._raw = (home.copy(), np.zeros(joints))
-        self._unchanged = np.zeros(joints, dtype=bool)
-        self._still, self._still_way, self._claimed = np.zeros(joints, dtype=int), np.zeros(joints), np.zeros(joints)
+        self.position = home.copy()  # (joints,), rad: as sensed; estimated for joints whose sensor is suspect
+        self.velocity = np.zeros(joints)  # (joints,), rad/s, likewise; unknown ones as the brakes stop the arm
+        self.doubt = np.zeros(joints)  # (joints,), rad: largest error of `position`
+        self.fresh = True  # there is a sample of this cycle
+        self.faulty = False  # a sensor is, or was until fewer than `good_cycles` ago, at fault
+        self.drivable = True  # velocities are known, so the arm could still be driven
+        self.blamed = (
+            -1,
+            0.0,
+            0.0,
+        )  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
+        self.findings: list[Finding] = []  # new ones, one an episode; the executor takes them out
+        self._raw = (home.copy(), np.zeros(joints))  # position and velocity of the last sample
+        self._unchanged = np.zeros(joints, dtype=bool)  # the last sample trusted showed the position before it
+        self._still = np.zeros(joints, dtype=int)  # cycles without a change while the set point moves
+        self._still_way = np.zeros(joints)  # rad: way of the set point in that time
+        self._claimed = np.zeros(joints)  # rad: way by the sensed velocity while the sample does not change
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
         self._sent = self._everyone  # its set point moves, or may have moved
         self._tick: int | None = None
-        self._streak = 0
-        self._rung: set[Alarm] = set()
-        self.findings: list[Finding] = []
-        self.blamed = (-1, 0.0, 0.0)
-        self.fresh = self.drivable = True
-        self.faulty = False
+        self._streak = 0  # good samples in a row
+        self._rung: set[Alarm] = set()  # found in this episode
 
     def recall(self, state: Message) -> None:
-        """Go on from what an `ARM_STATE` says that the level knew."""
+        """Continue from the estimate in an `ARM_STATE`."""
         self.position[:], self.velocity[:], self.doubt[:] = state.position, state.velocity, state.doubt
         self._tick = state.tick
 
     def remember(self, state: Message) -> None:
-        """Fill in what `recall` wants to know."""
+        """Fill in the estimate for `recall`."""
         state.position, state.velocity, state.doubt = self.position, self.velocity, self.doubt
 
     def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
-        """Judge a sample at `tick`; `wanted`: velocities, rad/s, that the arm was driven with, None: it was not.
+        """Check a sample at `tick`, and add faults to `findings`, once an episode.
 
-        `struck`: something has touched the arm since the last cycle.
-
-        What is wrong is added to `findings`, once an episode.
+        `wanted` are the velocities, (joints,), rad/s, at which the arm was driven; None: it was not. `struck`:
+        something has touched the arm since the last cycle.
         """
         passed = tick - self._tick if self._tick is not None else self._every
         self._tick, passed_s = tick, passed * self._tick_s
         self.fresh = sensed.tick == tick
         if not self.fresh:
-            self._go_on_blind(passed_s, tick - sensed.tick)
+            self._estimate_blind(passed_s, tick - sensed.tick)
             return
         q, qd = sensed.position, sensed.velocity
         change = qd - self.velocity
         way = (0.5 * passed_s) * (qd + self.velocity)
         room = self._room + passed_s * (np.abs(change) + self._speed_room)
         if passed > self._every:
-            # Driven on for a while, then braked: faster in between than at both ends.
+            # Driven for a while, then braked: faster in between than at both ends.
             room += passed_s * 4.0 * self._every * self._tick_s * self._braking
         fastest = self._fastest
         if struck:
             fastest = STRUCK_SPEED * fastest
             room += passed_s * fastest
-        # Never true for what is no number.
+        # Never true for NaN.
         fits = np.abs(q - self.position - way) <= (room + self.doubt if self.faulty else room)
         stirs = self._stirs(q, qd, change, wanted, passed_s)
         if self._coarse:
-            # Exact sensors that do not change show it in the next sample.
+            # An exact sensor that is stuck shows it in the next sample.
             self._claim(q, qd, passed_s)
             stirs = stirs and bool((self._claimed <= self._room).all())
         if self.faulty or not stirs or np.count_nonzero(fits) < fits.size:
@@ -133,13 +128,13 @@ class SensorMonitor:
         self._take(q, qd, way, room)
 
     def _take(self, q: Array, qd: Array, way: Array, room: Array) -> None:
-        """Trust a sample; say where that moves a joint by more than `room`, rad."""
+        """Trust a sample; report a joint that this moves by more than `room`, rad."""
         np.equal(q, self._raw[0], out=self._unchanged)
         if np.count_nonzero(self.doubt):
             off = q - self.position - way
             for joint in np.flatnonzero(np.abs(off) > room):
                 self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
-            # What does not change proves nothing: it may be stuck.
+            # A sensor that does not change proves nothing: it may be stuck.
             self.doubt[~self._unchanged] = 0.0
         np.copyto(self.position, q)
         np.copyto(self.velocity, qd)
@@ -147,7 +142,7 @@ class SensorMonitor:
         np.copyto(self._raw[1], qd)
 
     def _stirs(self, q: Array, qd: Array, change: Array, wanted: Array | None, passed_s: float) -> bool:
-        """Say whether no joint has been still for too long while it was under way."""
+        """Return whether no joint has been still for too long while its set point moved."""
         if wanted is None or np.count_nonzero(change) == change.size:
             if np.count_nonzero(self._still):
                 self._still[:] = 0
@@ -161,7 +156,7 @@ class SensorMonitor:
         return not self._is_still().any()
 
     def _claim(self, q: Array, qd: Array, passed_s: float) -> None:
-        """Add up where a sensor says that a joint is going while it shows no change: at the least that it may be."""
+        """Add up the least way that a joint must have gone by its sensed velocity while its sample does not change."""
         self._claimed += passed_s * np.maximum(np.abs(qd) - self._speed_room, 0.0)
         self._claimed *= (q == self._raw[0]) & (qd == self._raw[1])
 
@@ -169,7 +164,7 @@ class SensorMonitor:
         return np.asarray((self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown))
 
     def _doubtful(self, q: Array, qd: Array, way: Array, fits: Mask, room: Array, passed_s: float) -> None:
-        """Name what is wrong with a sample, take what is right, and go on from what is known for the rest."""
+        """Report the faults of a sample, take its good joints, and estimate the others."""
         finite, inside = np.isfinite(q) & np.isfinite(qd), (q >= self._low) & (q <= self._high)
         last_q, last_qd = self._raw
         unchanged = (q == last_q) & (qd == last_qd)
@@ -188,10 +183,9 @@ class SensorMonitor:
         self._unproven |= still
         self._unproven &= unchanged
         if begins:
-            # One that showed no change may have been stuck while its joint crept: it is off by that now it shows one.
+            # A sensor that showed no change may have been stuck while its joint crept: by that it may be off now.
             np.maximum(self.doubt, np.where(self._unchanged, STUCK_RAD, PLAUSIBLE_RAD), out=self.doubt)
-            # One that shows none now though its joint was sent somewhere may be stuck as well, since before that was
-            # found.
+            # One that shows no change now, though its joint was moved, may be stuck as well, and for longer.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
         self._still[still] = 0
@@ -205,16 +199,16 @@ class SensorMonitor:
         self._estimate(q, qd, way, np.isfinite(qd) & ~frozen, passed_s)
 
     def _blame(self, good: Mask, q: Array, off: Array) -> None:
-        """Keep the joint that is wrong by most."""
+        """Keep the joint with the largest error."""
         if not good.all():
             amount = np.where(np.isfinite(off), np.abs(off), np.inf)
             joint = int(np.where(good, -1.0, amount).argmax())
             self.blamed = joint, float(q[joint]), float(off[joint])
 
     def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
-        """Let suspects go on, with their velocity where that is known; take the others as sensed.
+        """Estimate suspect joints from their velocity, or as braked where that is unknown; take the others as sensed.
 
-        A sample of a suspect that happens to fit is not taken: noise would lead the estimate away step by step.
+        A suspect's sample that happens to fit is not taken: noise would lead the estimate away step by step.
         """
         coasting = self._suspect & known
         self.doubt[coasting] += 0.5 * passed_s * np.abs(qd - self.velocity)[coasting]
@@ -223,8 +217,8 @@ class SensorMonitor:
         np.add(self.position, way, out=self.position, where=coasting)
         np.copyto(self.velocity, qd, where=known)
 
-    def _go_on_blind(self, passed_s: float, age: int) -> None:
-        """Go on without a sample."""
+    def _estimate_blind(self, passed_s: float, age: int) -> None:
+        """Estimate the joints without a sample."""
         if age >= SILENT_CYCLES * self._every:
             self._ring(Finding(Alarm.SENSOR_SILENT, -1, age))
             self.drivable = False
@@ -234,13 +228,13 @@ class SensorMonitor:
         self._brake(self._everyone, passed_s)
 
     def _brake(self, joints: Mask, passed_s: float) -> None:
-        """Let joints go on as the brakes stop them."""
+        """Estimate `joints` as the brakes stop them."""
         if not joints.any():
             return
         speed = np.abs(self.velocity)
         time_s = np.minimum(passed_s, speed / self._braking)
         way = (speed - 0.5 * self._braking * time_s) * time_s * joints
-        # Until the brakes close the last torque still acts.
+        # Until the brakes engage the last torque still acts.
         acting = 2.0 * self._braking * passed_s * self._every * self._tick_s
         self.position += np.copysign(way, self.velocity)
         np.maximum(self.doubt, BRAKE_TAIL_S2 * self._braking, out=self.doubt, where=joints)
@@ -260,7 +254,7 @@ class SensorMonitor:
             self.findings.append(finding)
 
     def _settled(self, good: bool) -> bool:
-        """Count good samples in a row; say whether there are enough of them to end the episode."""
+        """Count good samples in a row; return whether they are enough to end the episode."""
         self._streak = self._streak + 1 if good else 0
         if self._streak < (self._retry_cycles if self._unproven.any() else self._good_cycles):
             return False

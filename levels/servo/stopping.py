@@ -1,4 +1,4 @@
-"""Decides in every cycle whether the arm follows its set points, or what it does instead, and for how long."""
+"""Decides in every cycle whether the arm follows its set points or stops, and for how long; logs its brakes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import NamedTuple
 from rack.backplane.alarms import Alarm
 from rack.backplane.message import Message
 from rack.backplane.words import Demand
+from rack.levels.arm import Arm
 from rack.levels.level import Finding
 from rack.levels.messages import Error
-from rack.levels.servo.params import ServoParams
+from rack.levels.servo.control import ServoParams
 from rack.levels.servo.sensor_monitor import SensorMonitor
 
 
 class Reaction(IntEnum):
-    """What the servo level does, the stronger the greater."""
+    """Reactions of the servo level; the greater, the stronger."""
 
     NONE = 0  # follow the set points
     HOLD = 1  # ramp to rest, hold with torques
@@ -28,25 +29,24 @@ DEMANDED = {Demand.NONE: Reaction.NONE, Demand.STOP: Reaction.STOP, Demand.BRAKE
 
 
 class Cause(NamedTuple):
-    """A fault that keeps the arm from its set points: what is wrong and what comes next, in words, joint and value."""
+    """A fault that keeps the arm from its set points."""
 
     error: Error
-    text: str
+    text: str  # what is wrong, readable
     joint: int = -1
-    value: float = 0.0
-    then: str = ""
+    value: float = 0.0  # measured: rad, N m or ticks, by error
+    then: str = ""  # the next step, readable
 
 
 class Stopping:
-    """Weighs demands on the arm and faults of sensors, motors and torques, and blows: the strongest reaction wins.
+    """Weighs the rack's demands, faults of sensors, motors and torques, and blows: the strongest reaction wins.
 
-    A motor at fault is tried again after a while: the arm holds with it, and follows when that went well for
-    `good_cycles`. Where it fails while the arm ramps or holds with it, the brakes close. An arm that was struck stays
-    braked until nothing has touched it for as long.
+    A failed motor is retried after a while: the arm holds with it, and follows once that went well for `good_cycles`.
+    If it fails while the arm ramps or holds with it, the brakes engage. A struck arm stays braked until nothing has
+    touched it for as long.
 
-    Faults keep the arm from its set points for `patience` at most. That time runs while a fault does, and back while
-    the arm follows, so faults that come again and again use it up as well. Then the fault is latched: `error` is set,
-    and the brakes stay engaged. `reason` says in one line why the arm does not follow; empty: it does.
+    Faults may keep the arm from its set points for `patience`. That time runs up during faults and down while the arm
+    follows, so recurring faults use it up as well. Then the fault is latched: the brakes stay engaged.
     """
 
     def __init__(self, params: ServoParams, joints: Sequence[str], tick_s: float, every: int) -> None:
@@ -55,25 +55,24 @@ class Stopping:
         self._on_motors = Reaction[params.on_actuator_fault.upper()]
         self._retry_ticks, self._good_ticks = round(params.retry / tick_s), params.good_cycles * every
         self._most = max(round(params.patience / tick_s), every)
-        self._kept = 0
+        self.refused: Finding | None = None  # the last cycle's torque, if the arm refused it
+        self.error = Error.NONE  # latched fault
+        self.reason = ""  # why the arm does not follow its set points, in one line; empty: it does
+        self.findings: list[Finding] = []  # new ones, one an episode; the executor takes them out
+        self._kept = 0  # ticks for which faults have kept the arm from its set points
         self._tick: int | None = None
-        self._retry_at: int | None = None
-        self._standing = self._on_motors
+        self._retry_at: int | None = None  # tick at which a failed motor is retried; None: none has failed
+        self._on_failure = self._on_motors  # reaction until then
         self._motor = self._blow = Cause(Error.NONE, "")
-        self._struck_until: int | None = None
-        self.refused: Finding | None = None
-        """The torque of the last cycle, if the arm did not let it through."""
-        self.error = Error.NONE
-        self.reason = ""
-        self.findings: list[Finding] = []
+        self._struck_until: int | None = None  # tick until which a struck arm stays braked
 
     def recall(self, state: Message) -> None:
-        """Go on from what an `ARM_STATE` says that the level knew."""
+        """Continue from the state in an `ARM_STATE`."""
         self._tick, self._kept = state.tick, state.kept
         self.error, self.reason = Error(state.error), state.reason
 
     def remember(self, state: Message) -> None:
-        """Fill in what `recall` wants to know."""
+        """Fill in the state for `recall`."""
         state.kept = self._kept
         if self.error != state.error:
             state.error, state.reason = self.error, self.reason
@@ -84,21 +83,21 @@ class Stopping:
         return self._retry_at is not None
 
     def motor_fails(self, joint: int, lacking: float, tick: int) -> Reaction:
-        """Take in that a motor does not do what it is told; return the reaction."""
-        self._standing = self._on_motors if self._retry_at is None else Reaction.BRAKE
+        """Register a motor that lacks `lacking` N m of its torque; return the reaction."""
+        self._on_failure = self._on_motors if self._retry_at is None else Reaction.BRAKE
         self._retry_at = tick + self._retry_ticks
         text = f"motor of '{self._joints[joint]}' does not give the torque commanded"
         self._motor = Cause(Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}")
         self._wait_for(self._motor, tick)
-        return self._standing
+        return self._on_failure
 
     def refuse(self, finding: Finding, tick: int) -> None:
-        """Take in that the arm did not let a torque through."""
+        """Register a torque that the arm refused."""
         self.refused = finding
         self._wait_for(self._about_torque(finding), tick)
 
     def struck(self, contact: tuple[int, int], named: str, tick: int) -> None:
-        """Take in that something touches the arm."""
+        """Register an unintended contact of the arm."""
         if self._struck_until is None:
             self.findings.append(Finding(Alarm.COLLISION, *contact))
         self._struck_until = tick + self._retry_ticks
@@ -126,11 +125,11 @@ class Stopping:
         return max(reaction, DEMANDED[demand])
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
-        """Say what must be over, and until when."""
+        """Set `reason`: what must be over, and by when."""
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
     def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
-        """Return what faults make the arm do, and the one to name."""
+        """Return the reaction to faults, and the fault to name."""
         reaction, cause = Reaction.NONE, None if self.refused is None else self._about_torque(self.refused)
         if sensors.faulty:
             reaction = self._on_sensors if sensors.drivable else Reaction.BRAKE
@@ -160,10 +159,39 @@ class Stopping:
         if tick >= retry_at + self._good_ticks:
             self._retry_at = None
             return Reaction.NONE
-        return self._standing if tick < retry_at else Reaction.HOLD
+        return self._on_failure if tick < retry_at else Reaction.HOLD
 
     def _latch(self, cause: Cause) -> Reaction:
-        """Brake for good."""
+        """Latch the fault: brake for good."""
         self.error, self.reason = cause.error, f"{cause.text}; not over within {self._params.patience:g} s"
         self.findings.append(Finding(Alarm.LATCHED, cause.joint, cause.value))
         return Reaction.BRAKE
+
+
+class BrakeLog:
+    """Reports when the brakes of an arm engage and release."""
+
+    def __init__(self, arm: Arm, every: int) -> None:
+        self._arm, self._every = arm, every
+        self._engaged_at: int | None = None
+
+    def start(self, tick: int) -> None:
+        """Begin at `tick`, with brakes engaged because no torque has been given yet."""
+        self._engaged_at = tick
+
+    def after_waiting(self, tick: int, findings: list[Finding]) -> None:
+        """Report brakes that engaged, up to `tick`, because torques did not come."""
+        if self._arm.braked and self._engaged_at is None:
+            missed = self._arm.waited - self._every
+            self._engaged_at = tick
+            findings.append(Finding(Alarm.BRAKES_CLOSED, -1, missed))
+
+    def after_cycle(self, tick: int, findings: list[Finding]) -> None:
+        """Report what the cycle at `tick` did to the brakes."""
+        if not self._arm.braked:
+            if self._engaged_at is not None and tick > self._engaged_at:
+                findings.append(Finding(Alarm.BRAKES_OPENED, -1, tick - self._engaged_at))
+            self._engaged_at = None
+        elif self._engaged_at is None:
+            self._engaged_at = tick
+            findings.append(Finding(Alarm.BRAKES_CLOSED, -1, 0))

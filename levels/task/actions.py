@@ -14,7 +14,7 @@ from rack.levels.messages import Error, Verb
 from rack.levels.planning.motion import MotionPlanner, at
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.planning.situation import Situation
-from rack.levels.scene import SceneConfig
+from rack.levels.tables import SceneConfig
 from rack.levels.task.grasps import DOWN, goals, grasps, standing
 from rack.levels.task.program import Goto, Home, TaskConfig, Transfer
 from rack.levels.task.rehearsal import Rehearsal

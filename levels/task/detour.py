@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
 from rack.levels.messages import Verb
-from rack.levels.operator import Answer, Goal, What, told
-from rack.levels.orders import Orders, joints_of
+from rack.levels.operator import Answer, Goal, Operation, Orders, described, joints_of
 from rack.levels.planning.move import Move
 from rack.levels.planning.pose import pointing, pose
-from rack.levels.robot import RobotConfig
+from rack.levels.tables import RobotConfig
 from rack.levels.task.window import ShownWindow, is_free, next_free
 
 FARTHEST_RAD = 1e3
@@ -41,9 +40,9 @@ class Detour:
         """Whether the goal of the move is known: not where this board has died and a hold came after the goto."""
         return self._goal is not None
 
-    def told(self, orders: Orders) -> str:
+    def described(self, orders: Orders) -> str:
         """Return, as a reason, what the goto that stands has come to, and what ends it."""
-        goal = told(What.GOTO, self._goal.goal) if self._goal is not None else "goto"
+        goal = described(Operation.GOTO, self._goal.goal) if self._goal is not None else "goto"
         stage = "done" if orders.answer is Answer.DONE else "under way"
         return f"diverted by the operator: {goal} {stage}; `resume` goes on"
 
@@ -64,14 +63,14 @@ class Detour:
     def step(self, orders: Orders, plan: Message, done: int, below: Message, window: ShownWindow) -> int:
         """Go on by one cycle; return how many of the plan's moves are done: at most one less than `done`."""
         self.holds, self.until = False, None
-        if orders.standing is What.NONE and self.move:
+        if orders.standing is Operation.NONE and self.move:
             window.renumber(done)
             self.move = 0
-        elif orders.standing is What.GOTO and self.move:
+        elif orders.standing is Operation.GOTO and self.move:
             if self._is_new:
                 self.move = window.jump()
             self._follow(orders, below, window)
-        elif orders.standing is What.GOTO:
+        elif orders.standing is Operation.GOTO:
             done = self._leave(orders, plan, done, below, window)
         self._is_new = False
         return done

@@ -8,12 +8,11 @@ from typing import ClassVar
 from rack.backplane.message import Message, MessageType, State
 from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
 from rack.levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
-from rack.levels.operator import OPERATOR_COMMAND, Commands, Goal, What
-from rack.levels.orders import BELOW_LOST, HELD_FROM_ABOVE, Orders
-from rack.levels.params import read_params
+from rack.levels.operator import BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Commands, Goal, Operation, Orders
+from rack.levels.tables import read_params
 from rack.levels.task.detour import Detour
 from rack.levels.task.params import TaskParams
-from rack.levels.task.program import read_program
+from rack.levels.task.program import TaskConfig, read_program
 from rack.levels.task.window import ShownWindow
 
 ROUNDING_S = 1e-9
@@ -35,10 +34,11 @@ class TaskExecutor(Executor):
     }
     outputs: ClassVar[Mapping[str, MessageType]] = {"command": TASK_COMMAND, "status": TASK_STATUS}
     commands: ClassVar[Commands] = {
-        What.HOLD: (),
-        What.RESUME: (),
-        What.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
+        Operation.HOLD: (),
+        Operation.RESUME: (),
+        Operation.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
     }
+    program = TaskConfig
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -84,7 +84,7 @@ class TaskExecutor(Executor):
 
     def _judge(self, command: Message, answered: int) -> None:
         """Take up a goto, or one that this board had answered when it died, or refuse it."""
-        if self._orders.standing is What.GOTO:
+        if self._orders.standing is Operation.GOTO:
             self._detour.begin(command, self._orders, command.id > answered)
 
     def _follow(self, plan: Message, below: Message) -> None:
@@ -109,9 +109,9 @@ class TaskExecutor(Executor):
     def _kept_from(self, below: Reading) -> str:
         """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
         orders = self._orders
-        if orders.standing is What.GOTO:
-            return self._detour.told(orders)
-        if orders.standing is not What.NONE:
+        if orders.standing is Operation.GOTO:
+            return self._detour.described(orders)
+        if orders.standing is not Operation.NONE:
             return orders.keeps(self.context.board)
         if below.is_lost:
             return BELOW_LOST
@@ -122,7 +122,7 @@ class TaskExecutor(Executor):
         """Fail where nothing has moved for too long, unless an operator wants it so."""
         plan, below = read.plan.value, read.status.value
         mark = (plan.id, self._done, below.done, below.planned, below.current, below.progress, self._detour.move)
-        operated = below.operated or self._orders.standing is not What.NONE
+        operated = below.operated or self._orders.standing is not Operation.NONE
         if operated or mark != self._mark:
             self._mark, self._moved_at = mark, tick
         elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
@@ -158,9 +158,9 @@ class TaskExecutor(Executor):
     def _answer(self, below: Message, write: Ports) -> None:
         """Hold where an operator says so, answer, and hand down what this cycle rests on."""
         orders = self._orders
-        write.command.hold = orders.standing is What.HOLD or self._detour.holds
+        write.command.hold = orders.standing is Operation.HOLD or self._detour.holds
         write.command.operator = orders.rests_on(0)
-        if orders.standing is What.HOLD and below.resting and below.operator >= orders.basis:
+        if orders.standing is Operation.HOLD and below.resting and below.operator >= orders.basis:
             orders.done()
         orders.report(write.status)
 

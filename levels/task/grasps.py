@@ -8,13 +8,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.cell import Cell
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 from rack.levels.planning.situation import Situation
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.lookup import below, geom_name, geoms_of
 from rack.levels.task.program import Transfer
-from rack.levels.touches import below, geom_name, geoms_of
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from rack.levels.robot import Positive, Table
+from rack.levels.tables import Positive, Table
 
 
 class TaskParams(Table):

@@ -8,15 +8,15 @@ from typing import ClassVar
 import numpy as np
 
 from rack.backplane.message import Message, MessageType
-from rack.levels.cell import build_cell
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
-from rack.levels.params import read_params
 from rack.levels.planning.situation import Situation
+from rack.levels.robot.cell import build_cell
+from rack.levels.tables import read_params
 from rack.levels.task.finish import Rehearsed, cycles_of, finish_times
 from rack.levels.task.params import TaskParams
-from rack.levels.task.program import read_program
+from rack.levels.task.program import TaskConfig, read_program
 
 AT_REST_M_S = 0.01
 """An object slower than this lies still: its place can be planned with."""
@@ -36,6 +36,7 @@ class TaskPlanner(Planner):
     }
     output: ClassVar[MessageType] = TASK_PLAN
     params = TaskParams
+    program = TaskConfig
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

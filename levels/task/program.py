@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import Field, ValidationError, model_validator
 
 from rack.levels.errors import ProgramError
-from rack.levels.robot import Finite, Positive, RobotConfig, Table
-from rack.levels.scene import SceneConfig
+from rack.levels.level import Program
+from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
 
 Vector = tuple[Finite, Finite, Finite]
-
-
-VERBS = ("transfer", "goto", "home")
 
 
 class Action(Table):
@@ -26,7 +23,7 @@ class Action(Table):
 class Transfer(Action):
     """Take an object to another place."""
 
-    do: Literal["transfer"] = "transfer"
+    do: Literal["transfer"] = Field("transfer", description="the kind of action")
     object: str = Field(description="object of the scene")
     to: Vector = Field(description="where the object's origin goes, m")
     yaw: Finite | None = Field(None, description="turn of the object's x axis there, rad; free when not given")
@@ -39,7 +36,7 @@ class Transfer(Action):
 class Goto(Action):
     """Bring the tool to a pose, or the joints to positions."""
 
-    do: Literal["goto"] = "goto"
+    do: Literal["goto"] = Field("goto", description="the kind of action")
     position: Vector | None = Field(None, description="of the tool, m")
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(None, description="of the tool, as w, x, y, z")
     direction: Vector | None = Field(None, description="of the tool's z axis, any turn about it; down when not given")
@@ -65,58 +62,45 @@ class Goto(Action):
 class Home(Action):
     """Bring the arm back to where it starts."""
 
-    do: Literal["home"] = "home"
+    do: Literal["home"] = Field("home", description="the kind of action")
 
     def __str__(self) -> str:
         return "home"
 
 
-class TaskConfig(Table):
+class TaskConfig(Program):
     """A program: actions, done in their order."""
 
     action: tuple[Annotated[Transfer | Goto | Home, Field(discriminator="do")], ...] = Field(
         (), description="actions, done in their order"
     )
 
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
+        """Yield key, value and reason of everything that the arm or the scene lacks."""
+        for k, action in enumerate(self.action if robot is not None else ()):
+            for key, value, why in _misfits(action, cast(RobotConfig, robot), scene):
+                yield f"action[{k}].{key}", value, why
+
 
 def read_program(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> TaskConfig:
-    """Return the program that the `[task]` table holds.
-
-    Raises `ProgramError`, a line a mistake: its place, its value and what is valid.
-    """
+    """Return the program in the `[task]` table. Raises `ProgramError`, with one line per mistake."""
     try:
-        program = TaskConfig(**table)
+        program = TaskConfig.model_validate(table)
     except ValidationError as error:
-        raise ProgramError("\n".join(_line(mistake) for mistake in error.errors())) from error
-    mistakes = [line for k, action in enumerate(program.action) for line in _misfits(k, action, robot, scene)]
-    if mistakes:
-        raise ProgramError("\n".join(mistakes))
+        lines = [f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
+        raise ProgramError("\n".join(lines)) from error
+    misfits = [f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)]
+    if misfits:
+        raise ProgramError("\n".join(misfits))
     return program
 
 
-def _line(mistake: Any) -> str:
-    # pydantic puts the chosen kind of action into the place: the user did not write it there.
-    path = [str(part) for k, part in enumerate(mistake["loc"]) if not (k == 2 and part in VERBS)]
-    kind, value = mistake["type"], f" = {mistake['input']!r}"
-    text = mistake["msg"].removeprefix("Value error, ")
-    if kind.startswith("union_tag"):
-        path.append("do")
-        value = f" = {mistake['ctx']['tag']!r}" if "tag" in mistake.get("ctx", {}) else ""
-        text = f"valid: {', '.join(VERBS)}"
-    elif kind == "missing" or isinstance(mistake["input"], Mapping):
-        value = ""
-    return f"task.{'.'.join(path)}{value}: {text[:1].lower()}{text[1:]}"
-
-
-def _misfits(k: int, action: Action, robot: RobotConfig, scene: SceneConfig) -> list[str]:
-    """Return what of an action the robot or the scene does not have."""
-    place, found = f"task.action.{k}", []
+def _misfits(action: Action, robot: RobotConfig, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
     if isinstance(action, Transfer):
         if action.object not in scene.objects:
-            valid = ", ".join(scene.objects) or "none"
-            found.append(f"{place}.object = '{action.object}': not in the scene; objects: {valid}")
+            yield "object", action.object, f"not in the scene; objects: {', '.join(scene.objects) or 'none'}"
         if robot.gripper is None:
-            found.append(f"{place}.do = 'transfer': the robot has no gripper; valid: goto, home")
+            yield "do", action.do, "the robot has no gripper; permitted: goto, home"
     if isinstance(action, Goto) and action.joints is not None and len(action.joints) != len(robot.joints):
-        found.append(f"{place}.joints: {len(action.joints)} values; valid: {len(robot.joints)}, one a joint")
-    return found
+        why = f"{len(action.joints)} values; permitted: {len(robot.joints)}, one per joint"
+        yield "joints", list(action.joints), why

@@ -8,7 +8,7 @@ from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_s
 from rack.backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec
 from rack.backplane.message import Field, MessageType
 from rack.backplane.segment import Segment
-from rack.boards.config.fields import field_specs
+from rack.boards.config.layout import field_specs
 
 CLOCK_NS = 2_500_000
 NAME = "writer.point"

@@ -18,7 +18,7 @@ from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
 from rack.boards.config.faults import injections
 from rack.boards.events import Event
-from rack.levels.cell import build_cell
+from rack.levels.robot.cell import build_cell
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 

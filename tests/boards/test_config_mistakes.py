@@ -7,37 +7,45 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, wire
-from rack.boards.errors import ConfigError
+from rack.boards.config import load, names, resolve
+from rack.boards.errors import ConfigError, Mistake
 
 Write = Callable[[str, str], Path]
+
+
+def mistakes(name: str | Path, *settings: str) -> list[Mistake]:
+    """Return everything wrong with a config."""
+    with pytest.raises(ConfigError) as error:
+        resolve(load(name, settings))
+    return error.value.mistakes
+
 
 MISTAKES = {
     "unknown key": ("clock.periodms=1", "clock.periodms = 1: unknown key; did you mean 'period_ms'?"),
     "out of range": ("board.upper.slot=22", "board.upper.slot = 22: should be less than or equal to 21; slot in"),
     "slot of the clock": ("board.upper.slot=1", "slot 1 is the clock's"),
-    "slot taken": ("board.upper.slot=3", "board.lower.slot = 3: the slot is taken by board.upper.slot"),
+    "slot taken": ("board.upper.slot=3", "board.lower.slot = 3: already taken by board.upper.slot"),
     "name": ("name='../x'", 'name = "../x": '),
     "choice": ("clock.mode=fast", "'realtime' or 'lockstep'"),
     "not finite": ("clock.speed=inf", "clock.speed = inf: should be a finite number"),
-    "period": ("clock.period_ms=2.4999995", "clock.period_ms = 2.4999995: is no whole number of ns"),
+    "period": ("clock.period_ms=2.4999995", "clock.period_ms = 2.4999995: not a whole number of ns"),
     "rate": (
         "board.upper.rate_hz=60",
         "60 Hz does not divide the 400 Hz clock; nearest: 57.14 Hz (every 7 ticks), 66.67 Hz (every 6 ticks)",
     ),
     "rate above the clock": ("board.upper.rate_hz=1000", "nearest: 400 Hz (every 1 tick)"),
     "speed in lockstep": ("clock.speed=2", "clock.speed = 2.0: lockstep runs as fast as it can"),
-    "neighbour": ("board.lower.above=uper", 'board.lower.above = "uper": no other board is called so; boards: upper'),
+    "neighbour": ("board.lower.above=uper", 'board.lower.above = "uper": no other board has this name; boards: upper'),
     "circle below": (
         "board.lower.below=upper",
-        'board.lower.below = "upper": the levels go round in a circle, upper -> lower -> upper; the lowest has none',
+        'board.lower.below = "upper": the levels form a circle, upper -> lower -> upper; the lowest level has no below',
     ),
-    "circle above": ("board.upper.above=lower", "a circle, upper -> lower -> upper; the highest has none"),
+    "circle above": ("board.upper.above=lower", "a circle, upper -> lower -> upper; the highest level has no above"),
     "truth for a number": ("clock.period_ms=true", "clock.period_ms = true: should be a valid number; one tick, ms"),
     "text for a number": ("board.upper.core='1'", 'board.upper.core = "1": should be a valid integer'),
     "number for a truth": ("board.upper.ends_run=1", "board.upper.ends_run = 1: should be a valid boolean"),
     "very short tick": ("clock.period_ms=1e-6", "should be greater than or equal to 0.01; one tick, ms"),
-    "very fast": ("clock.speed=1e300", "clock.speed = 1e+300: should be less than or equal to 1000; real time runs"),
+    "very fast": ("clock.speed=1e300", "clock.speed = 1e+300: should be less than or equal to 1000; simulated time"),
     "very slow": ("clock.speed=1e-300", "clock.speed = 1e-300: should be greater than or equal to 0.001"),
     "short tick in real time": (
         "clock={ mode = 'realtime', speed = 500 }",
@@ -45,70 +53,60 @@ MISTAKES = {
     ),
     "very long cycle": ("board.lower={ rate_hz = 1e-5 }", "makes a cycle of 40000000 ticks; permitted: 1000000"),
     "rate near zero": ("board.lower={ rate_hz = 5e-324 }", "board.lower.rate_hz = 5e-324: should be greater than or"),
-    "own neighbour": ("board.lower.above=lower", "no other board is called so"),
-    "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose", as there is a planner'),
-    "no planner": ("board.upper.coupling=tight", 'permitted: "none", as there is no planner'),
+    "own neighbour": ("board.lower.above=lower", "no other board has this name"),
+    "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose" with a planner'),
+    "no planner": ("board.upper.coupling=tight", 'permitted: "none" without a planner'),
     "loose": ("board.lower.coupling=loose", "board.lower.planner_slot: missing; a loosely coupled planner has"),
-    "planner slot": ("board.lower.planner_slot=9", 'only a planner with coupling = "loose" has one'),
-    "priorities": ("board.lower.planner_priority=5", "a tightly coupled planner runs below its executor"),
-    "polling": ("board.upper.wake=poll", "needs a core of its own; core 0 has also: lower, clock, lower.planner"),
-    "two ends": ("board.lower.ends_run=true", "one board ends the run, and 'upper' does already"),
+    "planner slot": ("board.lower.planner_slot=9", 'only for a planner with coupling = "loose"'),
+    "priorities": ("board.lower.planner_priority=5", "must be below the executor's priority, 0"),
+    "polling": (
+        "board.upper.wake=poll",
+        "needs a core of its own, but shares core 0 with: clock, lower, lower.planner",
+    ),
+    "two ends": ("board.lower.ends_run=true", "only one board can end the run, and 'upper' does"),
     "board name": (
         "board.own={ slot = 4, every = 1, executor = 'two_levels:Upper', below = 'lower' }",
-        "no name for a",
+        "invalid name for a board",
     ),
     "no class name": ("board.upper.executor=two_levels", "package.module:Class"),
-    "moving what is not there": ("scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]", "no obstacle is called so"),
-}
-WIRING_MISTAKES = {
+    "moving what is not there": ("scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]", "no such obstacle"),
     "no module": ("board.upper.executor='no_levels:Upper'", "cannot import 'no_levels': ModuleNotFoundError"),
     "no method": ("board.upper.executor='two_levels:Unfinished'", "class 'Unfinished' lacks the method 'process'"),
     "no class": (
         "board.upper.executor='two_levels:Uper'",
-        "has no class 'Uper'; it has: Lower, PlanWriter, Unfinished, Upper",
+        "has no class 'Uper'; it has: Lower, PlanWriter, Programmed, Unfinished, Upper",
     ),
     "no executor": ("board.upper.executor='two_levels:LowerPlanner'", "has no Executor named 'LowerPlanner'"),
-    "nobody writes": ("board.upper.reads={ status = 'lower.state' }", "nobody writes it; mailboxes: upper.command"),
+    "nobody writes": ("board.upper.reads={ status = 'lower.state' }", "no task writes it; mailboxes: upper.command"),
     "type": (
         "board.upper.reads={ status = 'upper.command' }",
-        "carries count_command 1; the port wants count_status 1",
+        "carries count_command 1; the port needs count_status 1",
     ),
     "no port": ("board.upper.reads={ state = 'lower.status' }", "the executor has no such port; ports: status"),
     "two writers": ("board.lower.executor='two_levels:PlanWriter'", "mailbox lower.plan"),
     "protocol": ("protocol.mailbox={ 'lower.state' = 'lock' }", "protocol.mailbox.lower.state: no such mailbox"),
-    "size": ("board.lower.planner='two_levels:SizedPlanner'", "carries count_plan 1; the port wants small_plan 1"),
+    "size": ("board.lower.planner='two_levels:SizedPlanner'", "carries count_plan 1; the port needs small_plan 1"),
 }
 
 
-@pytest.mark.parametrize(("setting", "told"), MISTAKES.values(), ids=MISTAKES)
-def test_load_tells_the_mistake(small: Path, setting: str, told: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, [setting])
-    assert told in str(error.value)
-    assert len(error.value.mistakes) == 1
+@pytest.mark.parametrize(("setting", "expected"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_reported_alone_with_place_value_and_what_is_permitted(
+    small: Path, setting: str, expected: str
+) -> None:
+    (mistake,) = mistakes(small, setting)
+    assert expected in str(mistake)
 
 
-@pytest.mark.parametrize(("setting", "told"), WIRING_MISTAKES.values(), ids=WIRING_MISTAKES)
-def test_wire_tells_the_mistake(small: Path, setting: str, told: str) -> None:
-    config = load(small, [setting])
-    with pytest.raises(ConfigError) as error:
-        wire(config)
-    assert told in str(error.value)
-    assert len(error.value.mistakes) == 1
-
-
-def test_all_mistakes_are_told_at_once_wherever_they_stand(small: Path) -> None:
-    settings = [
+def test_all_mistakes_are_reported_at_once_wherever_they_are(small: Path) -> None:
+    found = mistakes(
+        small,
         "clock.wake=sleep",
         "board.upper.core=-1",
         "board.lower.planner_slot=9",
         "board.lower.above=uper",
         "board.lower.planner='two_levels:Nobody'",
-    ]
-    with pytest.raises(ConfigError) as error:
-        load(small, settings)
-    places = {mistake.place for mistake in error.value.mistakes}
-    assert places >= {
+    )
+    assert {mistake.place for mistake in found} >= {
         "clock.wake",
         "board.upper.core",
         "board.lower.planner_slot",
@@ -117,7 +115,7 @@ def test_all_mistakes_are_told_at_once_wherever_they_stand(small: Path) -> None:
     }
 
 
-def test_mistakes_of_tables_model_scene_faults_and_commands_are_told_together(write: Write) -> None:
+def test_mistakes_of_tables_model_scene_faults_and_commands_are_reported_together(write: Write) -> None:
     text = """
 extends = ["nasrem"]
 [clock]
@@ -144,9 +142,7 @@ level = "task"
 what = "hold"
 home = true
 """
-    with pytest.raises(ConfigError) as error:
-        load(write("mine.toml", text))
-    found = {mistake.place: mistake.why for mistake in error.value.mistakes}
+    found = {mistake.place: mistake.why for mistake in mistakes(write("mine.toml", text))}
     # What a mistake of its own hides: nothing of the world board, of the first fault, of the first command follows.
     assert set(found) == {
         "clock.wake",
@@ -167,11 +163,10 @@ home = true
     assert found["scene.supports"].startswith("no geom 'shelf' in the model; it has: pedestal, floor, table")
 
 
-def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_told() -> None:
+def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_reported() -> None:
     settings = [f"board.level.{setting}" for setting in ("slot=99", "params.plan_ms=1")]
-    with pytest.raises(ConfigError) as error:
-        load("fig2", [*settings, "timing.small_share=2", "scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]"])
-    assert {mistake.place for mistake in error.value.mistakes} == {
+    settings += ["timing.small_share=2", "scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]"]
+    assert {mistake.place for mistake in mistakes("fig2", *settings)} == {
         "board.level.slot",
         "timing.small_share",
         "scene.motion[0].body",
@@ -188,33 +183,77 @@ def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
 
 def test_a_segment_that_no_machine_has_room_for_is_refused(small: Path) -> None:
     with pytest.raises(ConfigError, match=r"^mailbox upper.command: keeps \d+ messages .*; permitted: 1073741824; "):
-        wire(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
+        resolve(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
 
 
 def test_a_broken_board_does_not_make_its_neighbours_wrong(small: Path) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, ["board.lower.slot=99"])
-    assert [mistake.place for mistake in error.value.mistakes] == ["board.lower.slot"]
+    assert [mistake.place for mistake in mistakes(small, "board.lower.slot=99")] == ["board.lower.slot"]
 
 
 def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, [f"clock.mode='{'long' * 100}'"])
-    assert len(str(error.value)) < 250
-    assert "\n" not in str(error.value)
+    (mistake,) = mistakes(small, f"clock.mode='{'long' * 100}'")
+    assert len(str(mistake)) < 250
+    assert "\n" not in str(mistake)
 
 
 @pytest.mark.parametrize(
     ("setting", "place"), [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")]
 )
 def test_a_value_of_several_kinds_makes_one_mistake(setting: str, place: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        load("nasrem", [f"robot.sensors.{setting}"])
-    (mistake,) = error.value.mistakes
+    (mistake,) = mistakes("nasrem", f"robot.sensors.{setting}")
     assert (mistake.place, mistake.value) == (f"robot.sensors.{place}", -1)
 
 
-def test_lists_of_another_length_than_the_joints_are_told_together() -> None:
-    with pytest.raises(ConfigError) as error:
-        load("nasrem", ["robot.home=[0, 0]", "robot.jerk=[1]", "robot.model=none.xml"])
-    assert {mistake.place for mistake in error.value.mistakes} == {"robot.home", "robot.jerk", "robot.model"}
+def test_lists_of_another_length_than_the_joints_are_reported_together() -> None:
+    found = mistakes("nasrem", "robot.home=[0, 0]", "robot.jerk=[1]", "robot.model=none.xml")
+    assert {mistake.place for mistake in found} == {"robot.home", "robot.jerk", "robot.model"}
+
+
+PARAMS = {
+    "unknown": ("fig2", "level.params.proces_ms=1", "= 1: unknown key; did you mean 'process_ms'?"),
+    "of nothing known": ("nasrem", "world.params.x=1", "= 1: unknown key; known: moved, turned, slow, resting"),
+    "text": ("fig2", "level.params.process_ms=lock", '= "lock": should be a valid number; X: the executor in a cycle'),
+    "truth": ("nasrem", "servo.params.bandwidth=true", "= true: should be a valid number; natural frequency"),
+    "range": ("nasrem", "primitive.params.braking=4", "= 4: should be less than or equal to 3; multiple of"),
+    "choice": ("nasrem", "servo.params.on_sensor_fault=stay", "= \"stay\": should be 'hold', 'stop' or 'brake'"),
+    "of the planner alone": ("nasrem", "task.params.settling=-1", "= -1: should be greater than 0; from the end"),
+    "both": ("nasrem", "elemental_move.params.patience=nan", "= nan: should be a finite number; time that a move"),
+}
+
+
+@pytest.mark.parametrize(("rack", "setting", "expected"), PARAMS.values(), ids=PARAMS)
+def test_a_parameter_that_no_level_has_is_a_mistake(rack: str, setting: str, expected: str) -> None:
+    (mistake,) = mistakes(rack, f"board.{setting}")
+    assert str(mistake).startswith(f"board.{setting.partition('=')[0]} {expected}")
+
+
+def test_every_mistake_of_parameters_is_reported() -> None:
+    found = mistakes("nasrem", "board.servo.params={ bandwidth = -1, damping = 9 }", "board.world.params.slow=0")
+    assert [mistake.place for mistake in found] == [
+        "board.servo.params.bandwidth",
+        "board.servo.params.damping",
+        "board.world.params.slow",
+    ]
+
+
+def test_a_level_that_declares_no_parameters_reads_what_it_likes(small: Path) -> None:
+    assert resolve(load(small, ["board.lower.params={ gain = 'high', deep = { on = true } }"]))
+
+
+OWN_PROGRAM = "board.upper.executor='two_levels:Programmed'"
+
+
+def test_a_users_own_level_declares_its_program(small: Path) -> None:
+    assert resolve(load(small, [OWN_PROGRAM, "task.count=[1, 2]"]))
+    found = mistakes(small, OWN_PROGRAM, "task={ count = [1, 'two'], counts = 3 }")
+    assert [str(mistake).partition(";")[0] for mistake in found] == [
+        'task.count[1] = "two": should be a valid integer',
+        "task.counts = 3: unknown key",
+    ]
+    found = mistakes(small, OWN_PROGRAM, "task.count=[1, -2]")
+    assert [str(mistake) for mistake in found] == ["task.count[1] = -2: nothing to count; objects: none"]
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_shipped_racks_have_no_mistakes(name: str) -> None:
+    assert resolve(load(name))

@@ -38,8 +38,8 @@ def test_other_budgets_go_into_a_config_and_come_out_as_they_were(small: Path) -
 @pytest.mark.parametrize("key", ["exchange_ms", "update_ms"])
 def test_what_a_planner_would_take_is_a_mistake_without_one(small: Path, table: str, key: str) -> None:
     with pytest.raises(ConfigError, match=rf"board\.upper\.{table}\.{key} = 1\.5: the board has no planner"):
-        load(small, [f"board.upper.{table}.{key}=1.5"])
-    assert load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"])
+        wire(load(small, [f"board.upper.{table}.{key}=1.5"]))
+    assert wire(load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"]))
 
 
 def test_tasks_are_on_the_cores_that_the_config_asks_for(small: Path) -> None:

@@ -128,7 +128,7 @@ def test_a_run_ends_when_nothing_is_heard_any_more_of_the_level_that_ends_it(con
     with Rack(config("clock.period_ms=25", text=slow).model_copy(update={"fault": (fault,)})) as rack:
         outcome = rack.run()
     assert (outcome.cause, outcome.worked) == ("task failed", False)
-    assert outcome.reason.startswith("nothing heard of 'watch.status' for 30.")
+    assert outcome.reason.startswith("'watch.status' has not been written for 30.")
     assert outcome.ticks < FIRST + 31 * 40
 
 

@@ -64,7 +64,7 @@ def test_an_unknown_script_lists_those_there_are(small: Path) -> None:
 
 @pytest.mark.parametrize("text", ["[clock]\nspeed = 2\n", "fault = 3\n", 'name = "x"\n'])
 def test_a_script_holds_faults_and_nothing_else(small: Path, write: Write, text: str) -> None:
-    with pytest.raises(ConfigError, match=r"script.toml: \w+: a script of faults holds \[\[fault\]\] tables and"):
+    with pytest.raises(ConfigError, match=r"script.toml: \w+: a fault script contains \[\[fault\]\] tables and"):
         load(small, faults=write("script.toml", text))
 
 

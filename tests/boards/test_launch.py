@@ -36,11 +36,11 @@ def test_a_planner_that_fails_its_self_test_holds_its_boards_sysfail(config: Mak
     assert 2 in UtilityLines(rack.segment).sysfail
 
 
-def test_a_level_that_cannot_be_made_is_told_with_its_error(config: MakeConfig) -> None:
+def test_a_level_that_cannot_be_made_is_reported_with_its_error(config: MakeConfig) -> None:
     rack = Rack(config("board.wave.params.final=NONE"))
-    told = refusal(rack)
-    assert "board 'wave' failed" in told
-    assert "KeyError: 'NONE'" in told
+    reason = refusal(rack)
+    assert "board 'wave' failed" in reason
+    assert "KeyError: 'NONE'" in reason
     assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
 
 
@@ -49,12 +49,12 @@ def test_a_board_that_leaves_without_a_word_is_no_ready_board(config: MakeConfig
 
 
 def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rack.boards.rack.LAUNCH_S", 1.0)
+    monkeypatch.setattr("rack.boards.rack.LAUNCH_S", 2.0)
     settings = ("board.watch.executor=wave_levels:Endless",)
-    assert refusal(Rack(config(*settings))) == "boards watch: not ready within 1 s"
+    assert refusal(Rack(config(*settings))) == "boards watch: not ready within 2 s"
 
 
-def test_a_crate_killed_during_the_launch_is_told(config: MakeConfig) -> None:
+def test_a_crate_killed_during_the_launch_is_reported(config: MakeConfig) -> None:
     def kill_crate(event: Event) -> None:
         if event.kind == "launch":
             crates = [pid for pid in children_of(os.getpid()) if b"rack.boards.crate" in command_of(pid)]

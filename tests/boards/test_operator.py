@@ -1,4 +1,4 @@
-"""Commands of an operator on real boards: given at their ticks by the clock, answered, told, repeated bit for bit."""
+"""Commands of an operator on real boards: given at their ticks by the clock, answered, logged, repeated bit for bit."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
 from rack.boards.faults.config import FaultConfig
-from rack.boards.operating.text import message_of
+from rack.boards.operating.command import message_of
 from rack.boards.outcome import Outcome
 from rack.boards.rack import Rack
-from rack.levels.operator import Answer, Goal, What
+from rack.levels.operator import Answer, Goal, Operation
+from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
-from tests.boards.told_racks import TOLD, commands
 from tests.processes import FORKS, forked, kill, wait_until
 
 HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
@@ -32,8 +32,8 @@ SECONDS = 1.0
 
 
 @pytest.fixture
-def told(config: MakeConfig) -> Callable[..., RackConfig]:
-    return lambda *settings: config(*settings, text=TOLD)
+def commanded(config: MakeConfig) -> Callable[..., RackConfig]:
+    return lambda *settings: config(*settings, text=COMMANDED)
 
 
 def run(config: RackConfig, seconds: float = SECONDS) -> tuple[Outcome, list[Event], dict[str, np.ndarray]]:
@@ -49,8 +49,8 @@ def first(rows: np.ndarray, serial: int) -> int:
     return int(rows["tick"][np.argmax(rows["message"]["operator"] >= serial)])
 
 
-def test_a_command_is_given_at_its_tick_and_goes_down_level_by_level(told: Callable[..., RackConfig]) -> None:
-    _, events, boxes = run(told(HELD))
+def test_a_command_is_given_at_its_tick_and_goes_down_level_by_level(commanded: Callable[..., RackConfig]) -> None:
+    _, events, boxes = run(commanded(HELD))
     given = boxes["upper.operator"]
     assert given["tick"].tolist() == [101, 203]
     assert given["visible_at"].tolist() == [102, 204]
@@ -62,34 +62,34 @@ def test_a_command_is_given_at_its_tick_and_goes_down_level_by_level(told: Calla
     assert counts[111] == counts[110] + 1
     assert counts[112] == counts[111] == counts[215]
     assert counts[216] == counts[215] + 1
-    told_of = [event for event in events if event.kind == "command"]
-    assert [(e.tick, e.code, e.board, e.subject, e.value) for e in told_of] == [
+    seen = [event for event in events if event.kind == "command"]
+    assert [(e.tick, e.code, e.board, e.subject, e.value) for e in seen] == [
         (101, "hold", "upper", "upper", 1),
         (203, "resume", "upper", "upper", 2),
     ]
 
 
-def test_a_run_with_its_commands_repeats_bit_for_bit(told: Callable[..., RackConfig]) -> None:
-    digests = [run(told(setting))[0].digest for setting in (HELD, HELD, "seed=0")]
+def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., RackConfig]) -> None:
+    digests = [run(commanded(setting))[0].digest for setting in (HELD, HELD, "seed=0")]
     assert digests[0] == digests[1] != digests[2]
 
 
 @pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
-def test_commands_reach_their_level_under_any_protocol(told: Callable[..., RackConfig], protocol: str) -> None:
-    config = told(HELD, f"protocol.default={protocol}")
+def test_commands_reach_their_level_under_any_protocol(commanded: Callable[..., RackConfig], protocol: str) -> None:
+    config = commanded(HELD, f"protocol.default={protocol}")
     # The clock waits for nobody.
     assert wire(config).mailbox("upper.operator").protocol == "double-buffer"
     _, _, boxes = run(config)
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
 
 
-def test_serials_rise_over_all_levels_in_the_order_of_giving(told: Callable[..., RackConfig]) -> None:
+def test_serials_rise_over_all_levels_in_the_order_of_giving(commanded: Callable[..., RackConfig]) -> None:
     setting = commands(
         "level='lower', what='hold', at=0.5",
         "level='upper', what='hold', tick=50",
         "level='lower', what='resume', at=0.5",
     )
-    _, _, boxes = run(told(setting))
+    _, _, boxes = run(commanded(setting))
     assert boxes["upper.operator"]["message"]["id"].tolist() == [1]
     assert boxes["lower.operator"]["message"]["id"].tolist() == [2, 3]
     assert boxes["lower.operator"]["tick"].tolist() == [200, 200]
@@ -97,53 +97,53 @@ def test_serials_rise_over_all_levels_in_the_order_of_giving(told: Callable[...,
     assert set(boxes["lower.status"]["message"]["order"].tolist()) == {0, 3}
 
 
-def test_a_refusal_is_answered_and_goes_no_further(told: Callable[..., RackConfig]) -> None:
-    _, _, boxes = run(told(commands("level='upper', what='goto', home=true, tick=50")))
+def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., RackConfig]) -> None:
+    _, _, boxes = run(commanded(commands("level='upper', what='goto', home=true, tick=50")))
     last = boxes["upper.status"]["message"][-1]
-    assert (last["order"], last["answer"], last["standing"]) == (1, Answer.REFUSED, What.NONE)
+    assert (last["order"], last["answer"], last["standing"]) == (1, Answer.REFUSED, Operation.NONE)
     assert last["objection"] == b"the way home is closed"
     assert not boxes["lower.status"]["message"]["operator"].any()
 
 
 @pytest.mark.parametrize("board", ["upper", "lower"])
-def test_a_board_that_comes_back_goes_on_with_what_it_was_told(told: Callable[..., RackConfig], board: str) -> None:
-    config = told(commands(f"level='{board}', what='hold', tick=50"))
+def test_a_restarted_board_continues_with_its_last_command(commanded: Callable[..., RackConfig], board: str) -> None:
+    config = commanded(commands(f"level='{board}', what='hold', tick=50"))
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
     outcome, events, boxes = run(config, 2.0)
     assert outcome.worked
     assert [event.board for event in events if event.code == "rejoined"] == [board]
     last = boxes[f"{board}.status"]["message"][-1]
-    assert (last["order"], last["standing"]) == (1, What.HOLD)
+    assert (last["order"], last["standing"]) == (1, Operation.HOLD)
 
 
 @pytest.mark.parametrize("board", ["upper", "lower"])
-def test_what_stood_before_a_refusal_stands_on_a_board_that_comes_back(
-    told: Callable[..., RackConfig], board: str
+def test_a_restarted_board_keeps_the_command_before_a_refused_one(
+    commanded: Callable[..., RackConfig], board: str
 ) -> None:
     # The lower level never takes a goto: its config would refuse it, an intruder in the table may say it all the same.
-    config = told(commands(f"level='{board}', what='hold', tick=50"))
+    config = commanded(commands(f"level='{board}', what='hold', tick=50"))
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
     with Rack(config) as rack:
         hold = OperatorTable(rack.segment).entries[0]
         message = message_of(hold, rack.segment.layout)
-        message.what, message.goal = What.GOTO, Goal.HOME
+        message.what, message.goal = Operation.GOTO, Goal.HOME
         OperatorTable(rack.segment).add(Request(hold[RequestWord.MAILBOX], bytes(message.raw), 60))
         assert rack.run(1.0).worked
         last = mailbox_ring(rack.segment, f"{board}.status").drain().rows["message"][-1]
     assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
-    assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, What.HOLD, 1)
+    assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, Operation.HOLD, 1)
 
 
-def test_a_command_overtaken_by_one_that_is_refused_stands(told: Callable[..., RackConfig]) -> None:
+def test_a_command_overtaken_by_one_that_is_refused_stands(commanded: Callable[..., RackConfig]) -> None:
     # Both come within one cycle of the level.
     setting = commands("level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52")
-    _, _, boxes = run(told(setting))
+    _, _, boxes = run(commanded(setting))
     last = boxes["upper.status"]["message"][-1]
-    assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, What.HOLD)
+    assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, Operation.HOLD)
 
 
-def test_a_clock_that_comes_back_goes_on_with_the_serials(told: Callable[..., RackConfig]) -> None:
-    config = told(HELD)
+def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackConfig]) -> None:
+    config = commanded(HELD)
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)})
     _, events, boxes = run(config)
     assert [event.board for event in events if event.code == "rejoined"] == ["clock"]
@@ -151,8 +151,8 @@ def test_a_clock_that_comes_back_goes_on_with_the_serials(told: Callable[..., Ra
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
 
 
-def test_a_program_commands_its_rack_while_it_runs(told: Callable[..., RackConfig]) -> None:
-    with Rack(told("clock.mode=realtime")) as rack:
+def test_a_program_commands_its_rack_while_it_runs(commanded: Callable[..., RackConfig]) -> None:
+    with Rack(commanded("clock.mode=realtime")) as rack:
         rack.start(20.0)
         entry = rack.command("lower", "hold")
         await_giving(rack, entry)
@@ -168,8 +168,8 @@ def test_a_program_commands_its_rack_while_it_runs(told: Callable[..., RackConfi
 
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("is_killed", [False, True])
-def test_a_command_is_given_only_while_its_client_lives(told: Callable[..., RackConfig], is_killed: bool) -> None:
-    with Rack(told(commands("level='upper', what='hold', tick=50"))) as rack:
+def test_a_command_is_given_only_while_its_client_lives(commanded: Callable[..., RackConfig], is_killed: bool) -> None:
+    with Rack(commanded(commands("level='upper', what='hold', tick=50"))) as rack:
         table = OperatorTable(rack.segment)
         wanted = Request(table.entries[0][RequestWord.MAILBOX], bytes(table.entries[0].message), 100)
 
@@ -185,11 +185,11 @@ def test_a_command_is_given_only_while_its_client_lives(told: Callable[..., Rack
         assert mailbox_ring(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
 
 
-def test_what_a_program_says_must_fit_the_rack(told: Callable[..., RackConfig]) -> None:
-    with Rack(told()) as rack:
+def test_commands_of_a_program_must_fit_the_rack(commanded: Callable[..., RackConfig]) -> None:
+    with Rack(commanded()) as rack:
         with pytest.raises(ConfigError, match="what = \"halt\": should be 'hold', 'resume'"):
             rack.command("lower", "halt")
-        with pytest.raises(ConfigError, match="'lower' takes no goto; it takes: hold, resume"):
+        with pytest.raises(ConfigError, match="'lower' does not take goto; it takes: hold, resume"):
             rack.command("lower", "goto", home=True)
 
 
@@ -208,34 +208,34 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 MISTAKES = {
     "no such level": (
         "level='uper', what='hold'",
-        'command[0].level = "uper": no level that can be commanded; levels: upper, lower',
+        'command[0].level = "uper": no such level takes commands; levels: upper, lower',
     ),
     "not for this level": (
         "level='lower', what='goto', home=true",
-        "command[0].what = \"goto\": 'lower' takes no goto; it takes: hold, resume",
+        "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume",
     ),
-    "no goal": ("level='upper', what='goto'", "command[0].goal: missing; goto of 'upper' has one of: home"),
+    "no goal": ("level='upper', what='goto'", "command[0].goal: missing; goto of 'upper' takes one of: home"),
     "another goal": (
         "level='upper', what='goto', joints=[1.0]",
-        "command[0].joints: no goal for goto of 'upper'; permitted: home",
+        "command[0].joints: not a goal for goto of 'upper'; permitted: home",
     ),
     "two goals": (
         "level='upper', what='goto', joints=[1.0], home=true",
-        "command[0].goal: joints|home are given; goto of 'upper' has one of: home",
+        "command[0].goal: several given: joints|home; goto of 'upper' takes one of: home",
     ),
-    "a goal too much": ("level='upper', what='hold', home=true", "command[0].home: hold has no goal; leave it out"),
-    "two times": ("level='upper', what='hold', tick=3, at=1", "command[0].at = 1.0: tick is given as well"),
+    "a goal too much": ("level='upper', what='hold', home=true", "command[0].home: hold takes no goal; remove it"),
+    "two times": ("level='upper', what='hold', tick=3, at=1", "command[0].at = 1.0: tick is also given"),
     "unknown key": ("level='upper', what='hold', tik=3", "command[0].tik = 3: unknown key; did you mean 'tick'?"),
 }
 
 
-@pytest.mark.parametrize(("table", "told_as"), MISTAKES.values(), ids=MISTAKES)
+@pytest.mark.parametrize(("table", "expected"), MISTAKES.values(), ids=MISTAKES)
 def test_mistakes_of_a_command_name_place_value_and_what_is_permitted(
-    config: MakeConfig, table: str, told_as: str
+    config: MakeConfig, table: str, expected: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
-        wire(config(commands(table), text=TOLD))
-    assert any(str(mistake).startswith(told_as) for mistake in caught.value.mistakes), str(caught.value)
+        wire(config(commands(table), text=COMMANDED))
+    assert any(str(mistake).startswith(expected) for mistake in caught.value.mistakes), str(caught.value)
 
 
 def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
@@ -244,11 +244,11 @@ def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
     beyond = [*robot.home[:2], 9.0, *robot.home[3:]]
     with pytest.raises(ConfigError) as caught:
         wire(load("nasrem", [commands(f"level='servo', what='setpoint', joints={beyond}")]))
-    assert str(caught.value).startswith("command[0].joints = 9.0: joint 'j3' cannot be there; permitted: ")
-    with pytest.raises(ConfigError, match="2 values; one a joint makes 6: j1, j2, "):
+    assert str(caught.value).startswith("command[0].joints = 9.0: out of range for joint 'j3'; permitted: ")
+    with pytest.raises(ConfigError, match="2 values; permitted: 6, one per joint: j1, j2, "):
         wire(load("nasrem", [commands("level='servo', what='setpoint', joints=[0.0, 0.0]")]))
 
 
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
-    with pytest.raises(ConfigError, match="the clock writes it, and waits for nobody"):
-        wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=TOLD))
+    with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
+        wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))

@@ -18,9 +18,9 @@ from rack.backplane.segment import Segment, unlink
 from rack.backplane.slots import Slots
 from rack.backplane.trace import Flag, trace_ring
 from rack.backplane.words import Block, System
-from rack.boards.config.classes import find_class
+from rack.boards.classes import find_class
+from rack.boards.config import Resolved, resolve
 from rack.boards.executor_task import ExecutorTask
-from rack.boards.launch import Launch
 from rack.boards.planner_task import PlannerTask
 from rack.boards.processor import die_with_parent, set_priority, take_processor
 from rack.levels.level import Executor, Planner
@@ -37,7 +37,7 @@ MakeBench = Callable[..., "Bench"]
 class Bench:
     """A wired rack whose tasks a test cycles itself; the clock stands at tick 0 and ticks last an hour."""
 
-    def __init__(self, plan: Launch) -> None:
+    def __init__(self, plan: Resolved) -> None:
         self.plan = plan
         self.segment = Segment.create(plan.layout, "")
         semaphores.create(plan.layout)
@@ -65,7 +65,7 @@ def bench(config: MakeConfig) -> Iterator[MakeBench]:
     made: list[Bench] = []
 
     def make(*settings: str) -> Bench:
-        made.append(Bench(Launch.of(config("clock.mode=realtime", *settings))))
+        made.append(Bench(resolve(config("clock.mode=realtime", *settings))))
         return made[-1]
 
     yield make

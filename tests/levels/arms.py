@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rack.levels.cell import Cell, build_cell
-from rack.levels.robot import GripperConfig, RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 
 CLOCK_NS = 2_500_000
 ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"

@@ -1,8 +1,8 @@
 """Runs levels in one process, tick by tick, with the visibility of the time-slice protocol.
 
-What a task released at tick T writes is visible from T + n, a plan from T + within_cycles * n, and all that a task
-reads is what was visible at its release. So a test sees what boards see, without processes and without waiting.
-Tasks can be lost and come back, mailboxes can be disturbed, as in a rack whose boards fail.
+Messages that a task released at tick T writes are visible from T + n, a plan from T + within_cycles * n, and a task
+reads what was visible at its release. So a test sees what boards see, without processes and without waiting.
+Tasks can be lost and come back, mailboxes can be disturbed, as in a rack whose boards fail; an operator can command.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from typing import Any
 
 from rack.backplane.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
-from rack.levels.cell import build_cell, sizes
 from rack.levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
-from rack.levels.operator import OPERATOR_COMMAND
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.box import Box, Disturbance
 
 CLOCK_NS = 2_500_000
@@ -213,3 +212,31 @@ def source(port: Input, board: BoardSpec) -> str:
     """Return the mailbox that a port reads."""
     place, _, rest = port.source.partition(".")
     return {"own": board.name, "above": board.above, "below": board.below}.get(place, place) + "." + rest
+
+
+class Operator:
+    """Says things to levels; every command has the next serial."""
+
+    def __init__(self, rack: Lockstep) -> None:
+        self._rack, self.serial = rack, 0
+
+    def say(self, level: str, what: Operation, joints: Sequence[float] = (), goal: Goal = Goal.NONE) -> int:
+        """Give a command now; return its serial. `joints`, rad, are its goal where there are any."""
+        message = self._message(level, what, Goal.JOINTS if len(joints) else goal)
+        message.count = len(joints)
+        message.joints[: len(joints)] = joints
+        self._rack.write(f"{level}.operator", message)
+        return self.serial
+
+    def goto(self, level: str, position: Sequence[float], direction: Sequence[float]) -> int:
+        """Send the tool somewhere, m, with its z axis in a direction; return the serial."""
+        message = self._message(level, Operation.GOTO, Goal.DIRECTION)
+        message.position, message.direction = position, direction
+        self._rack.write(f"{level}.operator", message)
+        return self.serial
+
+    def _message(self, level: str, what: Operation, goal: Goal) -> Message:
+        self.serial += 1
+        message = self._rack.message(f"{level}.operator")
+        message.id, message.what, message.goal = self.serial, what, goal
+        return message

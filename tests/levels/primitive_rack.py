@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from rack.levels.messages import MOVE_COMMAND, SegmentKind
 from rack.levels.primitive import PrimitiveExecutor, PrimitivePlanner
-from rack.levels.scene import MotionConfig
 from rack.levels.servo import ServoExecutor, ServoPlanner
+from rack.levels.tables import MotionConfig
 from rack.levels.world import WorldModel
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep

@@ -8,12 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.cell import Cell, build_cell
 from rack.levels.planning.collision import HELD_DEPTH_M, CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pointing, pose
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import SceneConfig
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
 
 DOWN = (0.0, 0.0, -1.0)

@@ -7,7 +7,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.messages import Error
-from rack.levels.scene import MotionConfig
+from rack.levels.tables import MotionConfig
 from tests.levels.whole_rack import WholeRack
 
 TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rack.backplane.message import Message, State
 from rack.levels.elemental_move import ElementalMoveExecutor
 from rack.levels.messages import MOVE_PLAN, PRIMITIVE_STATUS, TASK_COMMAND, Error, SegmentKind, Verb
-from rack.levels.orders import ABOVE_LOST, BELOW_LOST
+from rack.levels.operator import ABOVE_LOST, BELOW_LOST
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
 

@@ -11,8 +11,7 @@ import pytest
 from rack.backplane.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State
 from rack.levels.errors import LevelError
-from rack.levels.figures import FigureExecutor, FigurePlanner
-from rack.levels.figures.messages import FIGURE_PLAN, FIGURE_STATUS
+from rack.levels.figures import FIGURE_PLAN, FIGURE_STATUS, FigureExecutor, FigurePlanner
 from rack.levels.level import LevelContext, Ports
 
 MS = 1_000_000
@@ -53,7 +52,7 @@ def test_several_times_are_taken_in_turn_cycle_by_cycle() -> None:
     assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [True, False, False, True]
 
 
-def test_an_executor_tells_which_plan_it_has() -> None:
+def test_an_executor_reports_which_plan_is_in_force() -> None:
     executor, write = FigureExecutor(context(process_ms=0.0)), Ports(status=Message(FIGURE_STATUS.dtype({})))
     executor.process(ports(plan=None), write, 8)
     assert (write.status.cycle, write.status.plan, write.status.state) == (8, -1, State.EXECUTING)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import Message, State
-from rack.levels.cell import Cell
 from rack.levels.messages import WORLD_MODEL, SegmentKind
 from rack.levels.primitive.guard import Guard
 from rack.levels.primitive.path import BlendedPath
 from rack.levels.primitive.segment import Segment
 from rack.levels.primitive.trajectory import make_trajectory
-from rack.levels.scene import MotionConfig
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import MotionConfig
 from tests.levels import arms
 from tests.levels.primitive_rack import PrimitiveRack, path
 

@@ -1,4 +1,4 @@
-"""An operator beside the levels: holds at every one, goto at the task level; and the task is done all the same."""
+"""The operator's commands: how a level follows them, and in a whole rack."""
 
 from __future__ import annotations
 
@@ -7,11 +7,122 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rack.backplane.message import State
+from rack.backplane.mailbox import Reading, Verdict
+from rack.backplane.message import Message, State, status
 from rack.levels.messages import Verb
-from rack.levels.operator import Answer, Goal, What
-from tests.levels.operators import Operator
+from rack.levels.operator import ANSWER, OPERATOR_COMMAND, Answer, Goal, Operation, Orders, joints_of
+from tests.levels.lockstep import Operator
 from tests.levels.whole_rack import WholeRack
+
+TAKES = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.JOINTS, Goal.HOME)}
+STATUS = status("told", 1, *ANSWER)
+RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])
+
+
+def said(serial: int, what: Operation, goal: Goal = Goal.NONE, verdict: Verdict = Verdict.NEW) -> Reading:
+    message = Message(OPERATOR_COMMAND.dtype({}))
+    message.id, message.what, message.goal = serial, what, goal
+    return Reading(message, verdict)
+
+
+def report(orders: Orders, above: int = 0, message: Message | None = None) -> Message:
+    """Return what the status says; `message` is that of the cycle before, whose values stay."""
+    message = Message(STATUS.dtype({})) if message is None else message
+    orders.report(message, above)
+    return message
+
+
+def test_a_command_stays_in_force_until_resume() -> None:
+    orders = Orders(TAKES)
+    assert orders.take(said(3, Operation.HOLD))
+    assert not orders.take(said(3, Operation.HOLD, verdict=Verdict.OLD))
+    assert orders.standing is Operation.HOLD
+    assert orders.take(said(5, Operation.RESUME))
+    assert (orders.standing, orders.answer) == (Operation.NONE, Answer.DONE)
+
+
+def test_a_command_given_twice_is_taken_up_once() -> None:
+    orders = Orders(TAKES)
+    orders.take(said(4, Operation.HOLD))
+    orders.take(said(5, Operation.RESUME))
+    assert not orders.take(said(4, Operation.HOLD))
+    assert orders.standing is Operation.NONE
+
+
+@pytest.mark.parametrize(
+    ("what", "goal"), [(Operation.SETPOINT, Goal.JOINTS), (Operation.GOTO, Goal.POSE), (Operation.HOLD, Goal.HOME)]
+)
+def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(what: Operation, goal: Goal) -> None:
+    orders = Orders(TAKES)
+    orders.take(said(1, Operation.HOLD))
+    assert not orders.take(said(2, what, goal))
+    told = report(orders)
+    assert (told.order, told.answer, told.standing) == (2, Answer.REFUSED, Operation.HOLD)
+    name = f"{what.name} {goal.name}".lower()
+    assert told.objection == f"{name} is not a command of this level; permitted: hold, resume, goto joints|home"
+    # The torque still rests on the one before.
+    assert told.operator == 1
+
+
+def test_an_unknown_number_is_refused() -> None:
+    orders = Orders(TAKES)
+    reading = said(1, Operation.NONE)
+    reading.value.what = 99
+    assert not orders.take(reading)
+    assert report(orders).objection.startswith("99 is not a command of this level")
+
+
+def test_a_status_rests_on_the_newest_of_here_and_above() -> None:
+    orders = Orders(TAKES)
+    assert orders.rests_on(3) == 3
+    orders.take(said(5, Operation.HOLD))
+    assert (orders.rests_on(3), orders.rests_on(8)) == (5, 8)
+    assert report(orders, above=8).operator == 8
+
+
+def test_a_command_given_up_holds() -> None:
+    orders = Orders(TAKES)
+    orders.take(said(5, Operation.GOTO, Goal.HOME))
+    orders.fail("out of reach")
+    told = report(orders)
+    assert (told.standing, told.answer, told.objection) == (Operation.HOLD, Answer.REFUSED, "out of reach")
+    assert told.operator == 5
+    orders.done()
+    assert report(orders, message=told).answer == Answer.REFUSED
+
+
+def test_only_a_command_under_way_becomes_done() -> None:
+    orders = Orders(TAKES)
+    orders.done()
+    assert report(orders).answer == Answer.NONE
+    orders.take(said(5, Operation.HOLD))
+    assert report(orders).answer == Answer.TAKEN
+    orders.done()
+    assert report(orders).answer == Answer.DONE
+
+
+@pytest.mark.parametrize(
+    ("joints", "why"),
+    [
+        ((0.0,), "1 joint positions; the arm has 2 joints"),
+        ((0.0, 2.5), "joint 'elbow' at 2.5 rad; permitted: 0 to 2"),
+        ((np.nan, 1.0), "joint 'base' at nan rad; permitted: -1 to 1"),
+    ],
+)
+def test_joints_that_cannot_be_name_the_joint_and_its_range(joints: tuple[float, ...], why: str) -> None:
+    message = said(1, Operation.GOTO, Goal.JOINTS).value
+    message.count = len(joints)
+    message.joints[: len(joints)] = joints
+    with pytest.raises(ValueError, match=why.replace("(", r"\(")):
+        joints_of(message, ("base", "elbow"), RANGES)
+
+
+def test_joints_at_the_ends_of_their_ranges_can_be() -> None:
+    message = said(1, Operation.GOTO, Goal.JOINTS).value
+    message.count = 2
+    message.joints[:2] = (-1.0, 2.0)
+    assert joints_of(message, ("base", "elbow"), RANGES).tolist() == [-1.0, 2.0]
+
 
 LEVELS = ("task", "elemental_move", "primitive", "servo")
 REACH = {"do": "goto", "position": [0.45, 0.10, 0.95]}
@@ -36,11 +147,11 @@ def answers(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bo
 
 
 @pytest.mark.parametrize("level", LEVELS)
-def test_a_level_that_was_held_in_motion_goes_on_to_the_end_of_the_task(level: str) -> None:
+def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> None:
     rack = WholeRack(actions=[REACH, HOME])
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
-    serial = operator.say(level, What.HOLD)
+    serial = operator.say(level, Operation.HOLD)
     assert rack.run(6.0, answers(level, Answer.DONE, serial))
     held = rack.read("servo.status").position.copy()
     rack.run(2.0)
@@ -50,12 +161,12 @@ def test_a_level_that_was_held_in_motion_goes_on_to_the_end_of_the_task(level: s
     assert [rack.read(f"{name}.status").operator for name in LEVELS] == above * [0] + (4 - above) * [serial]
     # But every one of them says that it is kept from its work, and by whom.
     statuses = [rack.read(f"{name}.status") for name in LEVELS[: min(above, 2) + 1]]
-    for status in [s for s in statuses if s.state != State.DONE]:
-        assert status.state == State.HOLDING
-        assert f"{level}" in status.reason
-        assert "held by the operator" in status.reason
+    for shown in [s for s in statuses if s.state != State.DONE]:
+        assert shown.state == State.HOLDING
+        assert f"{level}" in shown.reason
+        assert "held by the operator" in shown.reason
     assert level == "task" or rack.move.operated
-    operator.say(level, What.RESUME)
+    operator.say(level, Operation.RESUME)
     assert rack.run_to_end(30.0).state == State.DONE
 
 
@@ -64,18 +175,18 @@ def test_a_restarted_board_holds_on(level: str) -> None:
     rack = WholeRack(actions=[REACH, HOME])
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
-    serial = operator.say(level, What.HOLD)
+    serial = operator.say(level, Operation.HOLD)
     assert rack.run(6.0, answers(level, Answer.DONE, serial))
     held = rack.read("servo.status").position.copy()
     rack.lose(level, 200)
     rack.run(3.0)
-    assert rack.read(f"{level}.status").standing == What.HOLD
+    assert rack.read(f"{level}.status").standing == Operation.HOLD
     assert np.abs(rack.read("servo.status").position - held).max() < 1e-3
-    operator.say(level, What.RESUME)
+    operator.say(level, Operation.RESUME)
     assert rack.run_to_end(30.0).state == State.DONE
 
 
-def test_a_goto_leaves_a_free_motion_and_the_program_goes_on_behind_it() -> None:
+def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
@@ -88,7 +199,7 @@ def test_a_goto_leaves_a_free_motion_and_the_program_goes_on_behind_it() -> None
     assert rack.task.reason == "diverted by the operator: goto direction done; `resume` goes on"
     rack.run(2.0)
     assert np.abs(rack.read("servo.scene").tool_position - ASIDE).max() < 5e-3
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
     assert rack.task.detour == 0
 
@@ -100,9 +211,9 @@ def test_a_goto_takes_the_next_one_from_where_it_is() -> None:
     first = operator.goto("task", ASIDE, DOWN)
     assert rack.run(20.0, answers("task", Answer.TAKEN, first))
     rack.run(2.0)
-    second = operator.say("task", What.GOTO, goal=Goal.HOME)
+    second = operator.say("task", Operation.GOTO, goal=Goal.HOME)
     assert rack.run(20.0, answers("task", Answer.DONE, second))
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
     assert rack.task.moves_done == rack.task.moves
 
@@ -117,24 +228,24 @@ def test_what_is_done_with_an_object_is_done_before_a_goto() -> None:
     # The block is taken and not put down, or put down and left alone.
     next_move = rack.read("task.plan").moves["verb"][rack.task.moves_done]
     assert next_move in (Verb.MOVE, Verb.MOVE_JOINTS)
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(60.0).state == State.DONE
     assert np.abs(rack.read("world.model").position[0] - TRANSFER["to"]).max() < 0.01
 
 
-def test_a_goto_that_cannot_be_is_refused_and_the_task_goes_on_behind_it() -> None:
+def test_an_impossible_goto_is_refused_and_the_task_continues() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
     serial = operator.goto("task", [3.0, 0.0, 0.5], DOWN)
     assert rack.run(20.0, answers("task", Answer.REFUSED, serial))
     assert "cannot bring the tool to" in rack.task.objection
-    assert (rack.task.standing, rack.task.state) == (What.HOLD, State.HOLDING)
-    operator.say("task", What.RESUME)
+    assert (rack.task.standing, rack.task.state) == (Operation.HOLD, State.HOLDING)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
 
 
-def test_a_goto_goes_on_when_the_board_of_the_task_level_has_died() -> None:
+def test_a_goto_continues_after_the_task_board_has_died() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
     assert rack.run(10.0, is_under_way)
@@ -144,7 +255,7 @@ def test_a_goto_goes_on_when_the_board_of_the_task_level_has_died() -> None:
     rack.lose("task", 200)
     assert rack.run(20.0, answers("task", Answer.DONE, serial))
     assert rack.task.detour == move
-    operator.say("task", What.RESUME)
+    operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
 
 
@@ -153,7 +264,7 @@ def test_set_points_in_the_middle_of_a_transfer_do_not_hinder_it() -> None:
     operator = Operator(rack)
     assert rack.run(20.0, lambda r: r.read("elemental_move.status").verb == Verb.DEPART)
     goal = rack.read("servo.status").target + np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0])
-    serial = operator.say("servo", What.SETPOINT, goal)
+    serial = operator.say("servo", Operation.SETPOINT, goal)
     assert rack.run(10.0, answers("servo", Answer.DONE, serial))
-    operator.say("servo", What.RESUME)
+    operator.say("servo", Operation.RESUME)
     assert rack.run_to_end(60.0).state == State.DONE

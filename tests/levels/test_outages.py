@@ -10,8 +10,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.messages import Verb
-from tests.levels.box import Disturbance
-from tests.levels.disturbances import SwapPairs, hold_back, lose_some, mute
+from tests.levels.box import Disturbance, SwapPairs, hold_back, lose_some, mute
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.whole_rack import WholeRack
 

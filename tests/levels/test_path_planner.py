@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.levels.cell import Cell
 from rack.levels.messages import WAYPOINTS
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
@@ -13,6 +12,7 @@ from rack.levels.planning.path import Path
 from rack.levels.planning.path_planner import PathPlanner
 from rack.levels.planning.pose import pointing, pose
 from rack.levels.primitive.path import BlendedPath
+from rack.levels.robot.cell import Cell
 from tests.levels.arms import cell, config
 
 SEED = 3

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rack.levels.cell import Cell, build_cell
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
 from rack.levels.planning.motion import MotionPlanner
@@ -15,6 +14,7 @@ from rack.levels.planning.move import Move
 from rack.levels.planning.payload import Payloads
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.planning.situation import Situation
+from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.task import read_program
 from rack.levels.task.actions import rehearse
 from rack.levels.task.grasps import grasps

@@ -11,7 +11,7 @@ from rack.levels.messages import Error
 from rack.levels.primitive.path import BlendedPath
 from rack.levels.primitive.path_motion import PathMotion
 from rack.levels.primitive.speed import BrakingLimits
-from tests.levels.disturbances import Shown, mute
+from tests.levels.box import Shown, mute
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive_rack import PrimitiveRack, gripper, path
 

@@ -22,7 +22,7 @@ from rack.levels.task.finish import Cycles, Rehearsed, finish_times
 from rack.levels.task.params import TaskParams
 from rack.levels.task.rehearsal import Rehearsal
 from tests.levels.arms import cell, config
-from tests.levels.disturbances import lose_some
+from tests.levels.box import lose_some
 from tests.levels.lockstep import BoardSpec, Lockstep
 from tests.levels.whole_rack import WholeRack
 

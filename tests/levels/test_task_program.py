@@ -7,11 +7,14 @@ from typing import Any
 
 import pytest
 
+from rack.boards.config import load, resolve
+from rack.boards.errors import ConfigError
 from rack.levels.errors import ProgramError
 from rack.levels.task.program import Goto, Home, TaskConfig, Transfer, read_program
 from tests.levels.arms import ROBOTS, config
 
 PUMA, SCENE = config("puma560")
+NASREM = load("nasrem")
 TASKS = ROBOTS.parent / "tasks"
 
 
@@ -20,8 +23,9 @@ def read(*actions: dict[str, Any]) -> TaskConfig:
 
 
 def mistake(*actions: dict[str, Any]) -> str:
-    with pytest.raises(ProgramError) as caught:
-        read(*actions)
+    """Return everything wrong with a program, as the check of a config reports it."""
+    with pytest.raises(ConfigError) as caught:
+        resolve(NASREM.model_copy(update={"task": {"action": list(actions)}}))
     return str(caught.value)
 
 
@@ -53,24 +57,30 @@ def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> Non
 @pytest.mark.parametrize(
     ("action", "line"),
     [
-        ({"do": "fly"}, "task.action.0.do = 'fly': valid: transfer, goto, home"),
-        ({"object": "peg"}, "task.action.0.do: valid: transfer, goto, home"),
+        ({"do": "fly"}, 'task.action[0].do = "fly": permitted: transfer, goto, home'),
+        ({"object": "peg"}, "task.action[0].do: missing; it says what kind of table this is"),
         (
             {"do": "transfer", "object": "cup", "to": [0.5, 0.3, 0.5]},
-            "task.action.0.object = 'cup': not in the scene; objects: block1, block2, peg",
+            'task.action[0].object = "cup": not in the scene; objects: block1, block2, peg',
         ),
-        ({"do": "transfer", "object": "peg"}, "task.action.0.to: field required"),
-        ({"do": "home", "by": 0}, "task.action.0.by = 0: input should be greater than 0"),
-        ({"do": "home", "speed": 2}, "task.action.0.speed = 2: extra inputs are not permitted"),
-        ({"do": "goto"}, "task.action.0: a goto has either position or joints"),
-        ({"do": "goto", "joints": [0, 0]}, "task.action.0.joints: 2 values; valid: 6, one a joint"),
+        ({"do": "transfer", "object": "peg"}, "task.action[0].to: missing; where the object's origin goes, m"),
+        (
+            {"do": "home", "by": 0},
+            "task.action[0].by = 0: should be greater than 0; simulated time by which the action must be done, s",
+        ),
+        ({"do": "home", "speed": 2}, "task.action[0].speed = 2: unknown key; known: by, do"),
+        (
+            {"do": "goto"},
+            "task.action[0]: a goto has either position or joints",
+        ),
+        ({"do": "goto", "joints": [0, 0]}, "task.action[0].joints = [0.0, 0.0]: 2 values; permitted: 6, one per joint"),
         (
             {"do": "goto", "position": [0, 0, 1], "direction": [0, 0, 0]},
-            "task.action.0: direction is all zero; its length must not be zero",
+            "task.action[0]: direction is all zero; its length must not be zero",
         ),
         (
             {"do": "goto", "position": [0, 0, float("nan")]},
-            "task.action.0.position.2 = nan: input should be a finite number",
+            "task.action[0].position[2] = nan: should be a finite number; of the tool, m",
         ),
     ],
 )
@@ -84,7 +94,7 @@ def test_all_mistakes_are_told_at_once() -> None:
 
 def test_transfer_needs_a_gripper() -> None:
     robot, scene = config("k1607")
-    with pytest.raises(ProgramError, match="the robot has no gripper; valid: goto, home"):
+    with pytest.raises(ProgramError, match="the robot has no gripper; permitted: goto, home"):
         read_program({"action": [{"do": "transfer", "object": "peg", "to": [0, 0, 0]}]}, robot, scene)
 
 

@@ -13,7 +13,7 @@ from rack.backplane.message import Message
 from rack.levels.messages import SCENE
 from rack.levels.world import WorldModel
 from tests.levels.arms import config
-from tests.levels.disturbances import lose_some
+from tests.levels.box import lose_some
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
 Array = NDArray[np.float64]
@@ -131,7 +131,7 @@ def test_the_revision_rises_across_a_restart() -> None:
     assert rig.model.revision > before
 
 
-def test_restarted_board_shows_what_it_knew_and_since_when_until_it_sees_again() -> None:
+def test_a_restarted_board_shows_its_last_model_and_age_until_it_sees_again() -> None:
     rig = WorldRig()
     rig.run(1.0, resting)
     rig.rack.disturb("servo.scene", lose_some(1.0, seed=1), round(0.2 / TICK_S))

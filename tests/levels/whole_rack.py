@@ -8,8 +8,7 @@ from typing import Any
 
 from rack.backplane.message import Message, State
 from rack.boards.config import RackConfig, load
-from rack.levels.robot import RobotConfig
-from rack.levels.scene import MotionConfig, SceneConfig
+from rack.levels.tables import MotionConfig, RobotConfig, SceneConfig
 from tests.levels.arms import config as arm_config
 from tests.levels.lockstep import BoardSpec, Lockstep
 

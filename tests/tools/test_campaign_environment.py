@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards import config
 from rack.boards.processor import name_process
-from rack.levels.arm.limit_monitor import LimitMonitor
+from rack.levels.arm.monitors import LimitMonitor
 from rack.tools.answer import Failure
 from rack.tools.campaigns.environment import children, examine, left_behind, load
 from tests.processes import FORKS, forked, runs, wait_until

@@ -186,4 +186,4 @@ def test_a_folder_that_is_no_run_is_refused_in_one_line(check: Check, small: Pat
 def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(check: Check, small: Path) -> None:
     done = check(small, "--set", "board.upper.budget.plan_ms=6")
     assert done.returncode == 2
-    assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; leave it out, or name one\n"
+    assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; remove it, or add one\n"

@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from rack.boards.config import CONFIGS, load, names
-from rack.boards.config.text import to_toml
+from rack.boards.config.toml import to_toml
 from rack.tools.answer import LONGEST_LINE
 from rack.tools.cli import run_commands
 

@@ -21,7 +21,7 @@ from rack.tools.commanding import patience
 from rack.tools.commanding.answers import Answers
 from rack.tools.commanding.goals import goal_of
 from rack.tools.commanding.live import LiveDesk
-from tests.boards.told_racks import TOLD
+from tests.boards.commanded_racks import COMMANDED
 from tests.processes import RACK, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +35,7 @@ def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
     """Start a rack that runs until it is stopped; return when it does."""
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -113,15 +113,15 @@ def test_what_can_be_told_to_whom_is_listed(running: str) -> None:
 
 
 REFUSED = {
-    "no level": (("uper", "hold"), 'level = "uper": no level that can be commanded; levels: upper, lower'),
+    "no level": (("uper", "hold"), 'level = "uper": no such level takes commands; levels: upper, lower'),
     "no wait to bound": (
         ("upper", "hold", "--timeout", "1"),
         "--timeout is the bound of --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
     "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
-    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' takes no setpoint; it takes: hold, resume"),
-    "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' has one of: home"),
+    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
+    "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
     "no word": (("upper", "goto", "hom"), "'hom' is no goal; permitted: home, joints=..., position=..."),
     "no number": (("upper", "goto", "joints=1,x"), "'joints=1,x': 'x' is not a number; permitted: numbers with commas"),
     "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),
@@ -176,7 +176,7 @@ def test_a_clock_without_ticks_is_not_waited_for(
 ) -> None:
     monkeypatch.setattr(patience, "SILENT_S", 0.05)
     path = tmp_path / "told.toml"
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     # Launched and not started: there is a rack, and no clock yet.
     with Rack(load(path, [f"name={rack_name}"])):
         with pytest.raises(Failure, match="no tick for"):

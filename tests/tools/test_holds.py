@@ -13,16 +13,16 @@ from rack.backplane.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Run, System
 from rack.boards.config import load, wire
-from rack.levels.operator import Answer, Goal, What
+from rack.levels.operator import Answer, Goal, Operation
 from rack.tools.holds import STILL_S, Holds, Standstill
-from tests.boards.told_racks import TOLD
+from tests.boards.commanded_racks import COMMANDED
 
 TICK_S = 0.0025
 
 
 @pytest.fixture
 def segment(tmp_path: Path, rack_name: str) -> Iterator[Segment]:
-    (tmp_path / "told.toml").write_text(TOLD)
+    (tmp_path / "told.toml").write_text(COMMANDED)
     config = load(tmp_path / "told.toml", [f"name={rack_name}"])
     made = Segment.create(wire(config), config.text())
     yield made
@@ -30,17 +30,17 @@ def segment(tmp_path: Path, rack_name: str) -> Iterator[Segment]:
     unlink(rack_name)
 
 
-def give(segment: Segment, *whats: What) -> None:
+def give(segment: Segment, *whats: Operation) -> None:
     """Have an operator give `upper` commands, at ticks 100, 200, ..."""
     writer = open_writer(segment, "upper.operator")
     for number, what in enumerate(whats, 1):
         writer.message.id, writer.message.what = number, what
-        writer.message.goal = Goal.HOME if what is What.GOTO else Goal.NONE
+        writer.message.goal = Goal.HOME if what is Operation.GOTO else Goal.NONE
         writer.write(100 * number)
     writer.close()
 
 
-def answer(segment: Segment, standing: What, order: int, given: Answer, state: State = State.EXECUTING) -> None:
+def answer(segment: Segment, standing: Operation, order: int, given: Answer, state: State = State.EXECUTING) -> None:
     writer = open_writer(segment, "upper.status")
     message = writer.message
     message.standing, message.order, message.answer, message.state = standing, order, given, state
@@ -54,28 +54,28 @@ def lines(segment: Segment) -> list[str]:
 
 
 def test_an_operators_hold_says_since_when_and_how_to_release_it(segment: Segment) -> None:
-    give(segment, What.HOLD)
-    answer(segment, What.HOLD, 1, Answer.DONE)
+    give(segment, Operation.HOLD)
+    answer(segment, Operation.HOLD, 1, Answer.DONE)
     release = f"to release: rack command {segment.rack} upper resume"
     assert lines(segment) == [f"upper held by the operator (hold), since 0.25 s; {release}"]
 
 
 def test_a_diversion_says_where_to_and_whether_it_is_there(segment: Segment) -> None:
-    give(segment, What.GOTO)
-    answer(segment, What.GOTO, 1, Answer.TAKEN)
+    give(segment, Operation.GOTO)
+    answer(segment, Operation.GOTO, 1, Answer.TAKEN)
     assert lines(segment)[0].startswith("upper diverted by the operator (goto home), since 0.25 s; ")
-    answer(segment, What.GOTO, 1, Answer.DONE)
+    answer(segment, Operation.GOTO, 1, Answer.DONE)
     assert lines(segment)[0].startswith("upper diverted by the operator (goto home, done), since 0.25 s; ")
 
 
 def test_a_command_that_was_refused_leaves_the_one_before_it_standing(segment: Segment) -> None:
-    give(segment, What.GOTO, What.GOTO)
-    answer(segment, What.GOTO, 2, Answer.REFUSED)
+    give(segment, Operation.GOTO, Operation.GOTO)
+    answer(segment, Operation.GOTO, 2, Answer.REFUSED)
     assert [hold.since_tick for hold in Holds(segment).look()] == [100]
 
 
 def test_a_level_that_holds_by_itself_gives_its_reason(segment: Segment) -> None:
-    answer(segment, What.NONE, 0, Answer.NONE, State.HOLDING)
+    answer(segment, Operation.NONE, 0, Answer.NONE, State.HOLDING)
     segment.block("upper")[Block.LEVEL_SINCE] = 40
     assert lines(segment) == ["upper holding: something is in the way, since 0.10 s"]
 
@@ -87,16 +87,16 @@ def test_the_emergency_stop_is_released_by_its_reset(segment: Segment) -> None:
 
 
 def test_nothing_holds_a_level_at_its_work_or_a_rack_whose_run_is_over(segment: Segment) -> None:
-    answer(segment, What.NONE, 1, Answer.DONE)
+    answer(segment, Operation.NONE, 1, Answer.DONE)
     assert lines(segment) == []
-    answer(segment, What.HOLD, 1, Answer.DONE)
+    answer(segment, Operation.HOLD, 1, Answer.DONE)
     segment.words[System.STATE] = Run.STOPPED
     assert lines(segment) == []
 
 
 def test_a_standstill_is_one_event_for_each_hold(segment: Segment) -> None:
-    give(segment, What.HOLD)
-    answer(segment, What.HOLD, 1, Answer.DONE)
+    give(segment, Operation.HOLD)
+    answer(segment, Operation.HOLD, 1, Answer.DONE)
     standstill, told = Standstill(segment), []
     for second in range(20):
         segment.words[System.TICK] = round(second / TICK_S)

@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Field, MessageType
 from rack.boards.config import load
-from rack.boards.config.fields import field_specs
+from rack.boards.config.layout import field_specs
 from rack.tools.answer import Failure
 from rack.tools.display import SilentDisplay
 from rack.tools.recorder.columns import columns_of

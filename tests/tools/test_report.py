@@ -23,7 +23,7 @@ from rack.tools.reporting.report import report_of, write_report
 from rack.tools.reporting.response import system_response
 from rack.tools.reporting.timing import plan_age_ms, task_times
 from rack.tools.running import run_rack
-from tests.boards.told_racks import TOLD, commands
+from tests.boards.commanded_racks import COMMANDED, commands
 from tests.conftest import SMALL
 
 TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
@@ -185,7 +185,7 @@ def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: i
 
 
 def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, tmp_path: Path) -> None:
-    (tmp_path / "told.toml").write_text(TOLD)
+    (tmp_path / "told.toml").write_text(COMMANDED)
     told = commands(
         "level='upper', what='hold', tick=101",
         "level='upper', what='resume', tick=203",

@@ -10,7 +10,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from rack.boards.config import load, loads
-from rack.levels.cell import STATE, Cell, build_cell
+from rack.levels.robot.cell import STATE, Cell, build_cell
 from rack.tools.display import SilentDisplay
 from rack.tools.recording import Recording
 from rack.tools.running import run_rack

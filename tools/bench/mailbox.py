@@ -15,7 +15,7 @@ from rack.backplane.layout import PROTOCOLS, Layout, MailboxSpec, Protocol, Task
 from rack.backplane.message import Field, command
 from rack.backplane.protocols import open_reader, open_writer
 from rack.backplane.segment import Segment, unlink
-from rack.boards.config.fields import field_specs
+from rack.boards.config.layout import field_specs
 
 CALLS = 20_000
 ROUNDS = 15

@@ -12,7 +12,7 @@ import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
-from rack.boards.config import RackConfig, load, loads, rack_timing, wire
+from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.levels.timing.response_time import response_times
 from rack.tools.answer import Failure
@@ -52,8 +52,8 @@ class Partition:
         boards = {name: self._board(board, free) for name, board in config.board.items()}
         clock = config.clock.model_copy(update={"mode": "realtime", "core": config.clock.core % self.cores})
         changed = config.model_copy(update={"board": boards, "clock": clock})
-        # Copying validates nothing: only the loader finds mistakes.
-        return loads(changed.text())
+        # A copy is not validated: load and check it like a user's config.
+        return resolve(loads(changed.text())).config
 
     def _board(self, board: BoardConfig, free: Iterator[int]) -> BoardConfig:
         core = board.core % self.cores

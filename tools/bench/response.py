@@ -19,7 +19,7 @@ import numpy as np
 
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.config.schema import RackConfig
-from rack.boards.operating.config import CommandConfig
+from rack.boards.operating.command import CommandConfig
 from rack.boards.rack import Rack
 from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.answer import Failure

@@ -95,8 +95,8 @@ def examine(config: RackConfig) -> None:
 
     from rack.backplane.message import Message
     from rack.levels.arm import SimulatedArm
-    from rack.levels.cell import STATE, build_cell, sizes
     from rack.levels.messages import ARM_STATE
+    from rack.levels.robot.cell import STATE, build_cell, sizes
 
     if config.robot is None:
         return

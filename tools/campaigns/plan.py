@@ -10,7 +10,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config.ports import all_ports
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.text import to_toml
+from rack.boards.config.toml import to_toml
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind

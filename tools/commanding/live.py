@@ -12,11 +12,10 @@ from rack.backplane.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads
-from rack.boards.config.commands import commandable
+from rack.boards.config.commands import asked, commandable, request
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.operating.request import asked, request
-from rack.boards.operating.text import describe, message_of
-from rack.levels.operator import What, listed
+from rack.boards.operating.command import describe, message_of
+from rack.levels.operator import Operation, listed
 from rack.tools.answer import Failure
 from rack.tools.commanding.answers import Answers, answering
 from rack.tools.commanding.patience import SILENT_S, Patience
@@ -112,4 +111,4 @@ class LiveDesk:
         seen = open_observer(self._segment, box.name).peek() if box is not None else None
         if seen is None or not seen.is_there or not seen.value.standing:
             return ""
-        return What(seen.value.standing).name.lower()
+        return Operation(seen.value.standing).name.lower()

@@ -15,7 +15,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
 from rack.boards.config import loads
 from rack.boards.config.faults import injection
-from rack.boards.config.schema_mistakes import mistakes_of
+from rack.boards.config.mistakes import mistakes_of
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig, condition_text
 from rack.boards.faults.describe import describe, document

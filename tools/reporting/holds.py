@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.backplane.layout import Layout
 from rack.backplane.message import State
-from rack.levels.operator import What
+from rack.levels.operator import Operation
 from rack.tools.recording import Recording
 
 OWN = "holding"
@@ -35,7 +35,11 @@ def holds(recording: Recording, layout: Layout) -> list[dict[str, Any]]:
         what = np.where(standing > 0, standing, -own.astype(int))
         for first, end in _stretches(what):
             is_operators = what[first] > 0
-            said = What(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
+            said = (
+                Operation(what[first]).name.lower()
+                if is_operators
+                else str(recording.signal(mailbox, "reason")[end - 1])
+            )
             since, until = int(ticks[first]), int(ticks[end]) if end < len(ticks) else None
             found.append(
                 {

@@ -9,7 +9,7 @@ from typing import Any
 
 from rack.backplane.layout import Layout, Protocol
 from rack.boards.config import RackConfig, loads, rack_timing, wire
-from rack.boards.config.cores import obtained_core
+from rack.boards.config.layout import obtained_core
 from rack.boards.errors import ConfigError
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import predict

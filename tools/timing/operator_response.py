@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from rack.boards.config import rack_timing
-from rack.levels.operator import Answer, What
+from rack.levels.operator import Answer, Operation
 from rack.levels.timing.system_response import CommandPath, command_paths, lowest_level
 from rack.tools.answer import Failure, print_json
 from rack.tools.live_table import print_wrapped, terminal_width
@@ -174,7 +174,7 @@ def _commands(recording: Recording, level: str, path: CommandPath) -> Iterator[t
         command = AnsweredCommand(
             serial=int(serial),
             level=level,
-            what=What(int(what)).name.lower(),
+            what=Operation(int(what)).name.lower(),
             given=int(tick),
             sampled=path.samples_at(int(seen)),
             predicted=path.acts_at(int(seen)),

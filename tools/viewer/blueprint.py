@@ -8,8 +8,8 @@ import rerun.blueprint as rrb
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
-from rack.levels.cell import Cell
 from rack.levels.messages import SERVO_STATUS
+from rack.levels.robot.cell import Cell
 from rack.tools.viewer import ages, load
 from rack.tools.viewer.activity import LEVELS, LOG
 from rack.tools.viewer.document import CONFIG

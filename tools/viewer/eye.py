@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import rerun.blueprint as rrb
 
-from rack.levels.cell import Cell
+from rack.levels.robot.cell import Cell
 
 DIRECTION = np.array([0.75, -0.95, 0.55])
 """From what is looked at to the eye: from the front right, a little above."""

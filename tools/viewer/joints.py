@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from rack.levels.cell import Cell
+from rack.levels.robot.cell import Cell
 from rack.tools.viewer.blocks import Block
 from rack.tools.viewer.palette import COMMANDED, LIMIT, of_joint
 from rack.tools.viewer.stream import Stream

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config import RackConfig
-from rack.levels.cell import Cell
 from rack.levels.messages import (
     ARM_STATE,
     JOINT_SET_POINT,
@@ -18,6 +17,7 @@ from rack.levels.messages import (
     TASK_PLAN,
     WORLD_MODEL,
 )
+from rack.levels.robot.cell import Cell
 from rack.tools.viewer.activity import Activity, Commanded, Moves
 from rack.tools.viewer.blocks import Part
 from rack.tools.viewer.fields import Fields

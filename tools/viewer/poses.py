@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import rerun as rr
 
-from rack.levels.cell import STATE, Cell
+from rack.levels.robot.cell import STATE, Cell
 from rack.tools.viewer.blocks import Block
 from rack.tools.viewer.geometry import CELL, WORLD, frame_of, moving_bodies
 from rack.tools.viewer.shapes import xyzw

@@ -46,7 +46,7 @@ class ViewSink:
         config = loads(segment.config)
         cell = None
         if config.robot is not None:
-            from rack.levels.cell import build_cell
+            from rack.levels.robot.cell import build_cell
 
             cell = build_cell(config.robot, config.scene, config.clock_ns)
         self._times = Timelines(layout.clock_ns)

@@ -9,8 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from rack.levels.cell import Cell
 from rack.levels.messages import SegmentKind, Verb
+from rack.levels.robot.cell import Cell
 from rack.tools.viewer.blocks import Block, Changes
 from rack.tools.viewer.geometry import CELL, WORLD
 from rack.tools.viewer.palette import CURRENT, GOAL, PLANNED

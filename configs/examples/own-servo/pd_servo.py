@@ -7,13 +7,12 @@ from pydantic import Field
 
 from rack.backplane.message import State
 from rack.levels.arm import SimulatedArm
-from rack.levels.cell import build_cell
-from rack.levels.dynamics import Dynamics, Payload
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
-from rack.levels.params import read_params
-from rack.levels.robot import Positive, Table
-from rack.levels.servo.grip import Grip
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Dynamics, Payload
+from rack.levels.servo.control import Grip
+from rack.levels.tables import Positive, Table, read_params
 
 
 class Gains(Table):

@@ -11,11 +11,11 @@ import pytest
 
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
-from rack.boards.operating.config import CommandConfig
+from rack.boards.operating.command import CommandConfig
 from rack.tools.answer import Failure
 from rack.tools.bench.response import run_commands
 from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
-from tests.boards.told_racks import TOLD
+from tests.boards.commanded_racks import COMMANDED
 
 MakeConfig = Callable[..., RackConfig]
 
@@ -23,7 +23,7 @@ MakeConfig = Callable[..., RackConfig]
 @pytest.fixture
 def config(rack_name: str, tmp_path: Path) -> MakeConfig:
     path = tmp_path / "told.toml"
-    path.write_text(TOLD)
+    path.write_text(COMMANDED)
     return lambda *settings: load(path, [f"name={rack_name}", *settings])
 
 
@@ -37,7 +37,7 @@ def measured(config: RackConfig, folder: Path, *given: CommandConfig) -> Operato
 def response(tmp_path_factory: pytest.TempPathFactory) -> OperatorResponse:
     """The response of a run with three commands that are all acted on."""
     folder = tmp_path_factory.mktemp("responses")
-    (folder / "told.toml").write_text(TOLD)
+    (folder / "told.toml").write_text(COMMANDED)
     given = [("upper", "hold", 101), ("upper", "resume", 176), ("lower", "hold", 250)]
     commands = [CommandConfig(level=level, what=what, tick=tick) for level, what, tick in given]
     return measured(load(folder / "told.toml", [f"name=test-response-{os.getpid()}"]), folder / "run", *commands)

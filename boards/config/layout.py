@@ -1,0 +1,258 @@
+"""From config to layout: every mailbox and every task of a rack, as plain data for its segment."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from rack.backplane.address_map import CLOCK, AddressMap
+from rack.backplane.errors import MailboxError
+from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, depth_for
+from rack.backplane.message import MessageType
+from rack.boards.config.commands import commandable
+from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.ports import TaskPorts, all_ports
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import Mistake
+from rack.levels.operator import OPERATOR_COMMAND
+
+OPERATOR_DEPTH = 128
+"""Slots of an operator's mailbox; commands are rare."""
+MAX_SEGMENT_BYTES = 2**30
+KEPT_S = 2.0
+"""Simulated time that mailboxes and trace rings keep for a recorder: real-time boards may starve it for 1 s."""
+
+
+def obtained_core(core: int) -> int:
+    """Return the core that a task asking for `core` gets; cores that the machine lacks are shared out in turn."""
+    available = sorted(os.sched_getaffinity(0))
+    return core if core in available else available[core % len(available)]
+
+
+def shared_out(config: RackConfig) -> list[str]:
+    """Return one line for every core that is asked for and does not exist, for the launch to print."""
+    wanted: dict[int, list[str]] = {config.clock.core: [CLOCK]}
+    for place in config.tasks():
+        wanted.setdefault(place.core, []).append(place.name)
+    available = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
+    return [
+        f"core {core} is not available (available: {available}): {', '.join(tasks)} on core {obtained_core(core)}"
+        for core, tasks in sorted(wanted.items())
+        if obtained_core(core) != core
+    ]
+
+
+class Wiring:
+    """The ports of all tasks brought together: the writer and the readers of each mailbox.
+
+    `mistakes` holds everything wrong with them. `broken` names tables that have mistakes of their own: nothing that
+    depends on them is checked.
+    """
+
+    def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
+        self.config = config
+        self.mistakes: list[Mistake] = []
+        self.tasks = all_ports(config, self.mistakes)
+        found = {ports.task for ports in self.tasks}
+        # The mailboxes of such boards are unknown: that a reader lacks one is no mistake of the reader.
+        self._unknown = {place.board for place in config.tasks() if place.name not in found}
+        self._unknown |= {place.removeprefix("board.") for place in broken}
+        self._writers: dict[str, tuple[TaskPorts, MessageType]] = {}
+        for ports in self.tasks:
+            self._add_writer(ports)
+        self._operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
+        self._check_operated()
+        for ports in self.tasks:
+            self._check_reads(ports)
+        self._check_rest()
+        self._check_params()
+        if not broken & {"robot", "scene", "task"}:
+            self._check_programs()
+
+    def _add_writer(self, ports: TaskPorts) -> None:
+        for port, mailbox in ports.writes.items():
+            if mailbox in self._writers:
+                first = self._writers[mailbox][0].task
+                self.mistakes.append(Mistake(f"mailbox {mailbox}", ports.task, f"already written by {first}"))
+            else:
+                self._writers[mailbox] = ports, ports.outputs[port]
+
+    def _check_operated(self) -> None:
+        """The clock writes an operator's mailbox, and must never wait."""
+        for mailbox in self._operated:
+            if mailbox in self._writers:
+                first = self._writers[mailbox][0].task
+                self.mistakes.append(
+                    Mistake(f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox")
+                )
+            if self.config.protocol.mailbox.get(mailbox) == "lock":
+                why = "the clock writes it and must not wait; permitted: time-slice, double-buffer"
+                self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", "lock", why))
+
+    def _check_reads(self, ports: TaskPorts) -> None:
+        key = "reads" if ports.place.role == "executor" else "planner_reads"
+        for port, mailbox in ports.reads.items():
+            place, wanted = f"board.{ports.place.board}.{key}.{port}", ports.inputs[port]
+            if not self._is_known(mailbox):
+                why = f"no task writes it; mailboxes: {self._names()}"
+                self.mistakes.append(Mistake(place, mailbox, why))
+            elif (found := self._kind(mailbox)) is not None and found != wanted:
+                why = f"carries {found.name} {found.version}; the port needs {wanted.name} {wanted.version}"
+                self.mistakes.append(Mistake(place, mailbox, why))
+
+    def _check_rest(self) -> None:
+        for mailbox in self.config.protocol.mailbox:
+            if not self._is_known(mailbox):
+                why = f"no such mailbox; mailboxes: {self._names()}"
+                self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", None, why))
+        for name, board in self.config.board.items():
+            if board.ends_run and not self._is_known(f"{name}.status"):
+                self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
+
+    def _check_params(self) -> None:
+        """Check the parameters of each board against those that its executor's and planner's classes declare."""
+        kinds = [(ports.place.board, ports.kind.params) for ports in self.tasks if ports.kind.params is not None]
+        for board, kind in dict.fromkeys(kinds):
+            params = self.config.board[board].params
+            try:
+                kind.model_validate(params)
+            except ValidationError as error:
+                self.mistakes += mistakes_of(error, kind, params, f"board.{board}.params")
+
+    def _check_programs(self) -> None:
+        """Check `[task]` against the programs that the levels' classes declare."""
+        for kind in dict.fromkeys(ports.kind.program for ports in self.tasks if ports.kind.program is not None):
+            try:
+                program = kind.model_validate(self.config.task)
+            except ValidationError as error:
+                self.mistakes += mistakes_of(error, kind, self.config.task, "task")
+            else:
+                misfits = program.misfits(self.config.robot, self.config.scene)
+                self.mistakes += [Mistake(f"task.{key}", value, why) for key, value, why in misfits]
+
+    def _is_known(self, mailbox: str) -> bool:
+        return mailbox in self._writers or mailbox in self._operated or mailbox.partition(".")[0] in self._unknown
+
+    def _kind(self, mailbox: str) -> MessageType | None:
+        return self._writers[mailbox][1] if mailbox in self._writers else self._operated.get(mailbox)
+
+    def _names(self) -> str:
+        return ", ".join([*self._writers, *self._operated])
+
+    def check_sizes(self, sizes: Mapping[str, int]) -> list[Mistake]:
+        """Return a mistake for every message that needs a size which the rack does not know."""
+        found = []
+        for mailbox, (ports, kind) in self._writers.items():
+            try:
+                kind.dtype(sizes)
+            except MailboxError as error:
+                found.append(Mistake(f"mailbox {mailbox}", ports.task, str(error)))
+        return found
+
+    def layout(self, sizes: Mapping[str, int]) -> Layout:
+        """Return the layout of a config without mistakes."""
+        tasks = tuple(self._task(ports) for ports in self.tasks)
+        by_name = {task.name: task for task in tasks}
+        mailboxes = [self._mailbox(mailbox, by_name, sizes) for mailbox in self._writers]
+        mailboxes += [self._operators_mailbox(mailbox, kind) for mailbox, kind in self._operated.items()]
+        return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes))
+
+    def _task(self, ports: TaskPorts) -> TaskSpec:
+        place, every = ports.place, self.config.every(ports.place.board)
+        return TaskSpec(
+            name=place.name,
+            board=place.board,
+            role=place.role,
+            slot=place.slot,
+            core=obtained_core(place.core),
+            priority=place.priority,
+            every=every,
+            within_cycles=self.config.board[place.board].within_cycles if place.role == "planner" else 1,
+            depth=depth_for(self._kept_ticks, every),
+        )
+
+    @property
+    def _kept_ticks(self) -> int:
+        return round(KEPT_S * 1e9 / self.config.clock_ns)
+
+    def _mailbox(self, name: str, tasks: Mapping[str, TaskSpec], sizes: Mapping[str, int]) -> MailboxSpec:
+        ports, kind = self._writers[name]
+        writer = tasks[ports.task]
+        readers = self._readers(name)
+        delay = writer.every * writer.within_cycles
+        # A reader may still read, at the end of its own slice, what was visible at its start.
+        slowest = max((tasks[reader].every * tasks[reader].within_cycles for reader in readers), default=0)
+        return MailboxSpec(
+            name=name,
+            writer=writer.name,
+            readers=readers,
+            protocol=self._protocol(name),
+            every=writer.every,
+            delay=delay,
+            depth=depth_for(max(slowest + delay, self._kept_ticks), writer.every),
+            message=kind.name,
+            version=kind.version,
+            size=kind.dtype(sizes).itemsize,
+            fields=field_specs(kind, sizes),
+        )
+
+    def _operators_mailbox(self, name: str, kind: MessageType) -> MailboxSpec:
+        """Return the mailbox in which the clock gives an operator's commands to a level."""
+        protocol = self._protocol(name)
+        return MailboxSpec(
+            name=name,
+            writer=CLOCK,
+            readers=self._readers(name),
+            # With a lock the clock would wait for its readers.
+            protocol="double-buffer" if protocol == "lock" else protocol,
+            every=1,
+            delay=1,
+            depth=OPERATOR_DEPTH,
+            message=kind.name,
+            version=kind.version,
+            size=kind.dtype({}).itemsize,
+            fields=field_specs(kind, {}),
+        )
+
+    def _readers(self, mailbox: str) -> tuple[str, ...]:
+        return tuple(ports.task for ports in self.tasks if mailbox in ports.reads.values())
+
+    def _protocol(self, mailbox: str) -> Protocol:
+        return self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
+
+
+def too_large(layout: Layout) -> Iterable[Mistake]:
+    """Yield a mistake for the largest mailbox of a segment beyond the permitted size."""
+    size = AddressMap(layout).size
+    if size > MAX_SEGMENT_BYTES:
+        box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
+        why = f"keeps {box.depth} messages for its slowest reader, which makes a segment of {size} bytes"
+        advice = f"permitted: {MAX_SEGMENT_BYTES}; shorten cycles or within_cycles"
+        yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
+
+
+def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
+    """Return the fields of a message type with their offsets, shapes and numpy types, for tools that attach by name."""
+    offsets: Mapping[str, Any] = kind.dtype(sizes).fields or {}
+    specs = []
+    for field in kind.fields:
+        dtype, offset = offsets[field.name][:2]
+        scalar, shape = dtype.subdtype or (dtype, ())
+        is_group = isinstance(field.kind, MessageType)
+        specs.append(
+            FieldSpec(
+                name=field.name,
+                kind=f"V{scalar.itemsize}" if is_group else np.dtype(scalar).str,
+                shape=tuple(shape),
+                offset=offset,
+                unit=field.unit if isinstance(field.unit, str) else field.unit.__name__,
+                meaning=field.meaning,
+                fields=field_specs(field.kind, sizes) if isinstance(field.kind, MessageType) else (),
+                values=() if isinstance(field.unit, str) else tuple((n.name.lower(), int(n)) for n in field.unit),
+            )
+        )
+    return tuple(specs)

@@ -1,0 +1,264 @@
+"""Mistakes in the tables of a config: of each table by itself, as pydantic finds them, and between tables.
+
+Each rule yields mistakes, so that together they report every mistake at once. A rule skips what depends on a broken
+table: that table's own mistakes are reported already.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.errors import ClockError
+from rack.boards.config.files import file_at
+from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, RackConfig
+from rack.boards.errors import Mistake
+
+RESERVED = (CLOCK, "above", "below", "own")
+"""Names that mean something else in the wiring of ports."""
+PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
+PLANNER_TRANSFER = ("exchange_ms", "update_ms")
+BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
+HINTS = {"robot": "; a [robot] with its own model is another arm and inherits nothing from a file that it extends"}
+"""What to know about a table that misses a key."""
+
+
+def mistakes_of(error: ValidationError, model: type[BaseModel], tables: Any, place: str = "") -> list[Mistake]:
+    """Return the mistakes of `tables`, which stand at `place` in the config and failed as a `model`."""
+    found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
+    # A value that may be of several types yields a mistake for each: keep the first, or the one of its item.
+    first = {mistake.place: mistake for mistake in reversed(found)}
+    within = {place for place in first if any(other.startswith((f"{place}[", f"{place}.")) for other in first)}
+    return [first[place] for place in reversed(first) if place not in within]
+
+
+def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
+    keys = _keys(entry["loc"], tables, entry["type"] == "missing")
+    where = (place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)).lstrip(".")
+    if entry["type"].startswith("union_tag"):  # a table of several kinds, one of whose keys says which
+        about = entry["ctx"]
+        permitted = about.get("expected_tags", "").replace("'", "")
+        why = f"permitted: {permitted}" if permitted else "missing; it says what kind of table this is"
+        return Mistake(f"{where}.{about['discriminator'].strip(chr(39))}", about.get("tag"), why)
+    known, field = _declared(model, keys, tables)
+    meaning = f"; {field.description}" if field is not None and field.description else ""
+    if entry["type"] == "missing":
+        return Mistake(where, None, f"missing{meaning}{HINTS.get(str(keys[0]), '')}")
+    if entry["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(str(keys[-1]), known, 1)
+        why = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+        return Mistake(where, entry["input"], f"unknown key; {why}")
+    text = entry["msg"].removeprefix("Value error, ").removeprefix("Input ").replace("valid tuple", "list")
+    if entry["type"] == "value_error" and isinstance(entry["input"], dict):
+        return Mistake(where, None, text)
+    return Mistake(where, entry["input"], f"{text}{meaning}")
+
+
+def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int | str]:
+    """Return those keys of a location that are in the table, and a missing one: pydantic inserts names of variants."""
+    keys: list[int | str] = []
+    for key in loc:
+        in_list = isinstance(table, list) and isinstance(key, int) and key < len(table)
+        if in_list or (isinstance(table, dict) and key in table):
+            table = table[key]
+            keys.append(key)
+    return [*keys, loc[-1]] if is_missing else keys
+
+
+def _declared(model: type[BaseModel], keys: list[int | str], table: Any) -> tuple[list[str], FieldInfo | None]:
+    """Return the names of all keys of the table that `keys` lead into, and the field of the last one."""
+    models, known, field, is_name = [model], dict[str, FieldInfo](), None, False
+    for key in keys:
+        models = [kind for kind in models if _fits(kind, table)] or models
+        try:
+            table = table[key]
+        except (LookupError, TypeError):  # missing, or not a table
+            table = None
+        if isinstance(key, int):
+            continue
+        if is_name:  # the name of a table among tables of one type, as in [board.servo]
+            is_name = False
+            continue
+        known = {f.alias or name: f for kind in models for name, f in kind.model_fields.items()}
+        field = known.get(key)
+        models = list(_models(field.annotation)) if field is not None else []
+        is_name = field is not None and get_origin(field.annotation) is dict
+    return list(known), field
+
+
+def _fits(kind: type[BaseModel], table: Any) -> bool:
+    """Say whether a table may be of this kind: keys with few permitted values, as in do = "goto", tell kinds apart."""
+    fixed = {key: get_args(f.annotation) for key, f in kind.model_fields.items() if get_origin(f.annotation) is Literal}
+    return isinstance(table, dict) and all(table.get(key) in values for key, values in fixed.items())
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the tables in a type, as in `tuple[Transfer | Goto, ...]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models(part)
+
+
+def disagreements(config: RackConfig, broken: frozenset[str] = frozenset()) -> list[Mistake]:
+    """Return every disagreement between the tables of `config`; `broken` names tables that it lacks."""
+    boards = list(config.board.items())
+    known = [*config.board, *(place.removeprefix("board.") for place in broken if place.startswith("board."))]
+    found = [
+        *(mistake for name, board in boards for mistake in _board(name, board, known)),
+        *_circles(config),
+        *_slots(config),
+        *_ends(config),
+        *(_scene(config) if "scene" not in broken else ()),
+        *(_robot(config) if "robot" not in broken else ()),
+    ]
+    if "clock" not in broken:
+        found += [*_clock(config), *_rates(config), *_polling(config)]
+    return found
+
+
+def _board(name: str, board: BoardConfig, known: list[str]) -> Iterator[Mistake]:
+    place = f"board.{name}"
+    if not BOARD_NAME.fullmatch(name) or name in RESERVED:
+        why = f"invalid name for a board; permitted: a-z, 0-9 and _, at most 31, except {', '.join(RESERVED)}"
+        yield Mistake(place, None, why)
+    others = ", ".join(other for other in known if other != name) or "none"
+    for key, other in (("above", board.above), ("below", board.below)):
+        if other is not None and (other == name or other not in known):
+            yield Mistake(f"{place}.{key}", other, f"no other board has this name; boards: {others}")
+    yield from _planner(place, board)
+
+
+def _circles(config: RackConfig) -> Iterator[Mistake]:
+    """Find levels that are above themselves through others: a walk from level to level would not end."""
+    for key, end in (("below", "lowest"), ("above", "highest")):
+        links = {name: getattr(board, key) for name, board in config.board.items()}
+        seen: set[str] = set()
+        for name in links:
+            walk: list[str] = []
+            at: str | None = name
+            while at in links and at not in seen:
+                seen.add(at)
+                walk.append(at)
+                at = links[at]
+            circle = walk[walk.index(at) :] if at in walk else []
+            if len(circle) > 1:
+                why = f"the levels form a circle, {' -> '.join([*circle, circle[0]])}; the {end} level has no {key}"
+                yield Mistake(f"board.{circle[-1]}.{key}", circle[0], why)
+
+
+def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
+    has_planner, is_loose = board.planner is not None, board.coupling == "loose"
+    if has_planner != (board.coupling != "none"):
+        permitted = '"tight" or "loose" with a planner' if has_planner else '"none" without a planner'
+        yield Mistake(f"{place}.coupling", board.coupling, f"permitted: {permitted}")
+    if is_loose and board.planner_slot is None:
+        yield Mistake(f"{place}.planner_slot", None, "missing; a loosely coupled planner has its own board")
+    for key in ("planner_slot", "planner_core"):
+        if not is_loose and getattr(board, key) is not None:
+            yield Mistake(f"{place}.{key}", getattr(board, key), 'only for a planner with coupling = "loose"')
+    if board.coupling == "tight" and board.planner_priority >= max(board.priority, 1):
+        why = f"must be below the executor's priority, {board.priority}, with a tightly coupled planner"
+        yield Mistake(f"{place}.planner_priority", board.planner_priority, why)
+    if not has_planner:
+        # Nobody would notice that such a time is not counted.
+        for table, keys in (("budget", PLANNER_BUDGET), ("transfer", PLANNER_TRANSFER)):
+            for key in keys:
+                if value := getattr(getattr(board, table), key, None):
+                    yield Mistake(f"{place}.{table}.{key}", value, "the board has no planner; remove it, or add one")
+
+
+def _slots(config: RackConfig) -> Iterator[Mistake]:
+    taken: dict[int, str] = {}
+    for name, board in config.board.items():
+        for key, slot in (("slot", board.slot), ("planner_slot", board.planner_slot)):
+            place = f"board.{name}.{key}"
+            if slot is not None and slot in taken:
+                yield Mistake(place, slot, f"already taken by {taken[slot]}")
+            elif slot is not None:
+                taken[slot] = place
+
+
+def _ends(config: RackConfig) -> Iterator[Mistake]:
+    ending = [name for name, board in config.board.items() if board.ends_run]
+    for name in ending[1:]:
+        yield Mistake(f"board.{name}.ends_run", True, f"only one board can end the run, and '{ending[0]}' does")
+
+
+def _clock(config: RackConfig) -> Iterator[Mistake]:
+    clock = config.clock
+    if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
+        yield Mistake("clock.period_ms", clock.period_ms, "not a whole number of ns")
+    if clock.mode == "lockstep" and clock.speed != 1.0:
+        yield Mistake("clock.speed", clock.speed, 'lockstep runs as fast as it can; speed needs mode = "realtime"')
+    tick_ms = clock.period_ms / clock.speed
+    if tick_ms < SHORTEST_MS:
+        why = f"makes a tick of {tick_ms:g} ms in real time; permitted: {SHORTEST_MS:g} ms or more"
+        yield Mistake("clock.speed", clock.speed, why)
+
+
+def _rates(config: RackConfig) -> Iterator[Mistake]:
+    for name, board in config.board.items():
+        place = f"board.{name}.rate_hz"
+        if (board.rate_hz is None) == (board.every is None):
+            why = "missing; give rate_hz, Hz, or every, ticks"
+            yield Mistake(place, board.rate_hz, why if board.every is None else "every is also given; permitted: one")
+            continue
+        try:
+            every = config.every(name)
+        except ClockError as error:
+            yield Mistake(place, None, str(error))
+        else:
+            if every > LONGEST_EVERY:
+                yield Mistake(place, board.rate_hz, f"makes a cycle of {every} ticks; permitted: {LONGEST_EVERY}")
+
+
+def _polling(config: RackConfig) -> Iterator[Mistake]:
+    """Refuse a board that busy-waits on a shared core: under a real-time priority it would starve the others."""
+    cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.tasks()}
+    for name, board in config.board.items():
+        others = [other for other, core in cores.items() if core == board.core and other != name]
+        if (board.wake or config.clock.wake) == "poll" and others:
+            why = f"needs a core of its own, but shares core {board.core} with: {', '.join(others)}"
+            yield Mistake(f"board.{name}.wake", "poll", why)
+
+
+def _robot(config: RackConfig) -> Iterator[Mistake]:
+    robot = config.robot
+    if robot is None:
+        return
+    joints = len(robot.joints)
+    if file_at(robot.model) is None:
+        yield Mistake("robot.model", str(robot.model), "no such file")
+    for key in ("home", "velocity", "acceleration", "jerk", "torque", "position"):
+        values = getattr(robot, key)
+        if values is not None and len(values) != joints:
+            yield Mistake(f"robot.{key}", list(values), f"{len(values)} values; permitted: {joints}, one per joint")
+    for key, values in robot.sensors:
+        if isinstance(values, tuple) and len(values) != joints:
+            why = f"{len(values)} values; permitted: one for all joints, or {joints}, one per joint"
+            yield Mistake(f"robot.sensors.{key}", list(values), why)
+    yield from _repeated("robot.joints", robot.joints)
+
+
+def _scene(config: RackConfig) -> Iterator[Mistake]:
+    scene = config.scene
+    for at, motion in enumerate(scene.motion):
+        if motion.body not in scene.obstacles:
+            why = f"no such obstacle; scene.obstacles: {', '.join(scene.obstacles) or 'none'}"
+            yield Mistake(f"scene.motion[{at}].body", motion.body, why)
+    yield from _repeated("scene.objects and scene.obstacles", scene.bodies)
+
+
+def _repeated(place: str, names: tuple[str, ...]) -> Iterator[Mistake]:
+    for name, count in Counter(names).items():
+        if count > 1:
+            yield Mistake(place, name, f"listed {count} times")

@@ -1,0 +1,225 @@
+"""Every key of a config with type, unit, range, default and meaning, from the models that validate it.
+
+The tables of levels come from a config: the classes that it names declare `[task]` and `[board.<name>.params]`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from rack.boards.config.files import EXTENDS
+from rack.boards.config.ports import all_ports
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError, Mistake, shown
+from rack.boards.faults.kind import KINDS
+
+UNIT = re.compile(
+    r", ((?:kg m2|N s/m|N/m|N m|N|rad/s[23]?|rad|m/s|m|ms|s|Hz|ticks|cycles)(?: or (?:rad|N m))?)(?=$|[;:,])"
+)
+"""The unit in a description: after a comma, before the end or more text."""
+REQUIRED = "required"
+WHOLE = "rack"
+"""Name of the table of the keys outside any table."""
+
+Schema = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key of a table. Empty: no unit, everything permitted, no default."""
+
+    name: str
+    type: str
+    unit: str
+    permitted: str
+    default: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class KeyTable:
+    """One table of a config: its name, as in "board.budget", its heading in TOML, its meaning and its keys."""
+
+    name: str
+    heading: str
+    meaning: str
+    keys: tuple[Key, ...]
+
+
+class Place(NamedTuple):
+    """Where a table stands in TOML: its keys, whether it is one of a list, and what tells it from others there."""
+
+    path: str
+    is_list: bool = False
+    variant: str = ""
+
+    @property
+    def heading(self) -> str:
+        """The heading of the table in TOML."""
+        text = f"[[{self.path}]]" if self.is_list else f"[{self.path}]"
+        return f"{text} with {self.variant}" if self.variant else text if self.path else "(top of the file)"
+
+
+def key_tables(config: RackConfig) -> list[KeyTable]:
+    """Return every table that a config of these boards may have. Raises `ConfigError` for a class that is not found."""
+    mistakes: list[Mistake] = []
+    ports = all_ports(config, mistakes)
+    if mistakes:
+        raise ConfigError(mistakes)
+    whole, *found = _tables(RackConfig, WHOLE, Place(""))
+    extends = Key("extends", "list of strings", "", "", "", EXTENDS)
+    found = [replace(whole, keys=(extends, *whole.keys)), *found, *_fault_kinds()]
+    for program in dict.fromkeys(p.kind.program for p in ports if p.kind.program is not None):
+        found += _tables(program, "task", Place("task"))
+    for board, params in dict.fromkeys((p.place.board, p.kind.params) for p in ports if p.kind.params is not None):
+        name = f"board.{board}.params"
+        found += _tables(params, name, Place(name))
+    return found
+
+
+def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
+    """Return the table called `name`, or all whose names begin with it. Raises `LookupError` with those there are."""
+    known = {found.name: found for found in key_tables(config)}
+    wanted = name.strip("[]")
+    start, _, rest = wanted.partition(".")
+    board, _, rest = rest.partition(".")
+    if start == "board" and board in (*config.board, "<name>") and wanted not in known:
+        wanted = f"board.{rest}" if rest else "board"
+    found = [known[wanted]] if wanted in known else [t for n, t in known.items() if n.startswith(f"{wanted}.")]
+    if not found:
+        top = dict.fromkeys(name.partition(".")[0] for name in known)
+        raise LookupError(f"no such table; tables: {', '.join(top)}, and more that 'rack schema' lists")
+    return found
+
+
+def _tables(model: type[BaseModel], name: str, place: Place) -> Iterator[KeyTable]:
+    schema = model.model_json_schema()
+    yield from _walk(schema, schema.get("$defs", {}), name, place)
+
+
+def _walk(schema: Schema, known: Schema, name: str, place: Place) -> Iterator[KeyTable]:
+    """Yield a table, then those in it."""
+    properties, required = schema.get("properties", {}), schema.get("required", ())
+    inner = {key: list(_inner(entry, known, Place(key))) for key, entry in properties.items()}
+    keys = [_key(key, properties[key], key in required) for key, found in inner.items() if not found]
+    if keys:
+        yield KeyTable(name, place.heading, _summary(schema.get("description", "")), tuple(keys))
+    for key, found in inner.items():
+        for entry, at in found:
+            variant = at.variant.rpartition(" ")[2].strip('"')
+            below = ".".join(part for part in ("" if name == WHOLE else name, key, variant) if part)
+            yield from _walk(entry, known, below, at._replace(path=f"{place.path}.{at.path}".lstrip(".")))
+
+
+def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Place]]:
+    """Yield the tables that the value of a key at `at` may be or hold."""
+    if "$ref" in entry:
+        yield known[entry["$ref"].rpartition("/")[2]], at
+    for option in entry.get("anyOf", ()):
+        yield from _inner(option, known, at)
+    for value, ref in entry.get("discriminator", {}).get("mapping", {}).items():
+        variant = f'{entry["discriminator"]["propertyName"]} = "{value}"'
+        yield known[ref.rpartition("/")[2]], at._replace(variant=variant)
+    if isinstance(entry.get("items"), dict):
+        yield from _inner(entry["items"], known, at._replace(is_list=True))
+    if isinstance(entry.get("additionalProperties"), dict):
+        yield from _inner(entry["additionalProperties"], known, at._replace(path=f"{at.path}.<name>"))
+
+
+def _key(name: str, entry: Schema, is_required: bool) -> Key:
+    description = entry.get("description", "")
+    unit = UNIT.search(description)
+    default = entry.get("default")
+    return Key(
+        name=name,
+        type=_type(entry),
+        unit=unit[1] if unit else "",
+        permitted=_permitted(entry),
+        default=REQUIRED if is_required else "" if default in (None, [], {}) else shown(default),
+        meaning=UNIT.sub("", description, count=1),
+    )
+
+
+def _options(entry: Schema) -> list[Schema]:
+    return [option for option in entry.get("anyOf", [entry]) if option.get("type") != "null"]
+
+
+def _type(entry: Schema) -> str:
+    return " or ".join(_type_of(option) for option in _options(entry))
+
+
+def _type_of(entry: Schema) -> str:
+    kind = "path" if entry.get("format") == "path" else entry.get("type", "any")
+    kind = {"array": "list", "object": "table"}.get(kind, kind)
+    if (held := _held(entry)) is None:
+        return kind
+    count = f"{len(entry['prefixItems'])} " if "prefixItems" in entry else ""
+    return f"{kind} of {count}{_plural(held)}"
+
+
+def _held(entry: Schema) -> Schema | None:
+    """Return the schema of what a list or a table holds, all alike; None for others."""
+    places = (entry.get("items"), *entry.get("prefixItems", ()), entry.get("additionalProperties"))
+    held = (*places, *entry.get("patternProperties", {}).values())
+    return next((found for found in held if isinstance(found, dict)), None)
+
+
+def _plural(entry: Schema) -> str:
+    first, _, rest = _type(entry).partition(" ")
+    return f"{first}s {rest}".rstrip()
+
+
+def _permitted(entry: Schema) -> str:
+    return next((text for option in _options(entry) if (text := _range(option))), "")
+
+
+def _range(entry: Schema) -> str:
+    """Return the permitted values of one type; of a list, those of its items."""
+    if values := entry.get("enum") or ([entry["const"]] if "const" in entry else []):
+        return ", ".join(map(shown, values))
+    if (held := _held(entry)) is not None:
+        count = f"{entry['minItems']} to {entry['maxItems']} items" if "maxItems" in entry and "items" in entry else ""
+        return "; ".join(filter(None, (count, _permitted(held))))
+    low, high, above, below = (
+        _number(entry[key]) if key in entry else ""
+        for key in ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum")
+    )
+    if low and high:
+        return f"{low} to {high}"
+    least = f"{low} or more" if low else f"above {above}" if above else ""
+    return ", ".join(filter(None, (least, f"at most {high}" if high else f"below {below}" if below else "")))
+
+
+def _number(value: float) -> str:
+    text = f"{value:g}"
+    return text if float(text) == value else str(value)
+
+
+def _summary(docstring: str) -> str:
+    """Return the first sentence of a table's docstring, without its heading."""
+    text = " ".join(docstring.partition("\n\n")[0].split())
+    text = re.sub(r"^`\[.*?\]`: ", "", text).partition(". ")[0].rstrip(".")
+    return text[:1].lower() + text[1:]
+
+
+def _fault_kinds() -> Iterator[KeyTable]:
+    """Yield a table for every kind of fault that takes parameters: keys of its `[[fault]]` besides the common ones."""
+    for kind in KINDS:
+        keys = [
+            Key(
+                name=parameter.name,
+                type="integer" if parameter.is_whole else "number",
+                unit="" if parameter.unit == "1" else parameter.unit,
+                permitted=f"{_number(parameter.least)} to {_number(parameter.most)}",
+                default=REQUIRED if parameter.default is None else _number(parameter.default),
+                meaning=parameter.meaning,
+            )
+            for parameter in kind.parameters
+        ]
+        if keys:
+            yield KeyTable(f"fault.{kind.name}", f'[[fault]] with kind = "{kind.name}"', kind.means, tuple(keys))

@@ -1,0 +1,268 @@
+"""The way from TOML to a rack: `load` reads and validates the tables, `resolve` checks and wires everything, once.
+
+They are two steps because a launch imports the levels in the crate's process while `resolve` wires the config here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar, cast
+
+from pydantic import ValidationError
+
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout
+from rack.backplane.operator_table import Request
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Demand
+from rack.boards.classes import extend_path
+from rack.boards.config.cell import cell_sizes
+from rack.boards.config.commands import command_mistakes, requests
+from rack.boards.config.faults import fault_mistakes
+from rack.boards.config.files import CONFIGS, anchor, read, with_faults
+from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
+from rack.boards.config.mistakes import disagreements, mistakes_of
+from rack.boards.config.ports import TaskPorts, reference
+from rack.boards.config.schema import LAST_SLOT, RackConfig
+from rack.boards.config.timing import is_critical
+from rack.boards.config.toml import Tables, override, parse
+from rack.boards.errors import ConfigError, LaunchError
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kind import KINDS
+from rack.boards.operating.command import CommandConfig
+from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
+from rack.levels.level import LevelContext, Pace
+from rack.levels.tables import RobotConfig, Table
+
+LINGER_S = 0.5
+"""Simulated time that a run continues after the task's end, to see the arm at rest."""
+SILENT_S = 30.0
+"""Simulated time without a status after which the level that ends the run counts as dead; at least 8 of its cycles."""
+AHEAD_S = KEPT_S / 2
+"""Simulated time by which lockstep may be ahead of a recorder: half of what the rings keep."""
+PERMIT = (
+    "To permit it: a line '@GROUP - rtprio 99' in /etc/security/limits.conf for one of your groups, and a new login "
+    "(ulimit -r shows it); or CAP_SYS_NICE"
+)
+"""How a user gets real-time priorities."""
+
+T = TypeVar("T", bound=Table)
+
+
+def load(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None) -> RackConfig:
+    """Return the config of that name or in that file, with `key.sub=value` overrides; its levels can be imported.
+
+    The faults of the script `faults`, by name or path, are added to its own. Paths in an override are relative to the
+    current folder. Raises `ConfigError` with every mistake if a table by itself is wrong; `resolve` checks the rest.
+    """
+    tables = read(name_or_path)
+    if faults is not None:
+        tables = with_faults(tables, faults)
+    return _validated(anchor(override(tables, overrides), Path.cwd()))
+
+
+def loads(text: str) -> RackConfig:
+    """Return the config in TOML text, as `RackConfig.text` writes it. Raises `ConfigError` as `load` does."""
+    return _validated(anchor(parse(text), CONFIGS))
+
+
+def resolve(config: RackConfig) -> Resolved:
+    """Check and wire a config. Raises `ConfigError` with every mistake."""
+    faults = [(f"fault[{at}]", fault) for at, fault in enumerate(config.fault)]
+    commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
+    examined = _Examined(config, faults, commands)
+    if examined.mistakes:
+        raise ConfigError(examined.mistakes)
+    return examined.resolved()
+
+
+def wire(config: RackConfig) -> Layout:
+    """Return the layout of a config. Raises `ConfigError` with every mistake."""
+    return resolve(config).layout
+
+
+def modules(config: RackConfig) -> tuple[str, ...]:
+    """Return the modules of all levels, for the crate to import while the config is checked."""
+    return tuple(dict.fromkeys(reference(config, place).partition(":")[0] for place in config.tasks()))
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """A config, checked, and everything that follows from it: ready to launch."""
+
+    config: RackConfig
+    layout: Layout
+    tasks: tuple[TaskWiring, ...]
+    faults: tuple[Injection, ...]
+    commands: tuple[Request, ...]
+
+    def clock(self, seconds: float | None) -> ClockWiring:
+        """Return the wiring of the clock for a run of `seconds` of simulated time; None: until the task ends."""
+        clock, tick_ns = self.config.clock, self.config.clock_ns
+        return ClockWiring(
+            lockstep=clock.mode == "lockstep",
+            period_ns=round(tick_ns / clock.speed),
+            stop_tick=0 if seconds is None else max(1, self._ticks(seconds)),
+            ends_run=self.ends_run,
+            linger=self._ticks(LINGER_S),
+            silent=max(self._ticks(SILENT_S), 8 * self._ending_every),
+            history=self._ticks(AHEAD_S),
+            core=obtained_core(clock.core),
+            priority=clock.priority,
+            restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
+            on_loss={task.name: self._on_loss(task.board) for task in self.layout.tasks if task.role == "executor"},
+        )
+
+    def _ticks(self, seconds: float) -> int:
+        return round(seconds * 1e9 / self.config.clock_ns)
+
+    def _on_loss(self, board: str) -> Demand:
+        """Return what the loss of a board demands of the arm; nothing where the level below holds."""
+        return {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}[self.config.board[board].on_loss]
+
+    @property
+    def ends_run(self) -> str | None:
+        """The status mailbox whose state ends the run; None: no level does."""
+        return next((f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None)
+
+    @property
+    def _ending_every(self) -> int:
+        return 0 if self.ends_run is None else self.layout.task(self.layout.mailbox(self.ends_run).writer).every
+
+    @property
+    def crate_priority(self) -> int:
+        """SCHED_FIFO priority of the crate: below that of every real-time board, above all ordinary processes."""
+        priorities = [task.priority for task in self.layout.tasks if task.priority and task.role == "executor"]
+        return max(min(priorities, default=0) - 1, 0)
+
+    def notes(self, segment: Segment) -> list[str]:
+        """Return what the launch must report: cores shared out, real-time priorities refused."""
+        refused = self._refused(segment)
+        return shared_out(self.config) + ([f"{refused}; misses are likely. {PERMIT}"] if refused else [])
+
+    def check_realtime(self, segment: Segment) -> None:
+        """Raise `LaunchError` if a task was refused its real-time priority and the config insists on it."""
+        if self.config.clock.on_no_realtime == "refuse" and (refused := self._refused(segment)):
+            raise LaunchError(f'{refused}, and clock.on_no_realtime is "refuse". {PERMIT}')
+
+    def _refused(self, segment: Segment) -> str:
+        refused = [t.name for t in self.layout.tasks if t.priority and not segment.block(t.name)[Block.PRIORITY]]
+        return f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
+
+
+class _Examined:
+    """A config with everything that was found while checking it.
+
+    `broken` names tables that the config lacks, because of mistakes already known: what depends on them is not checked.
+    """
+
+    def __init__(
+        self,
+        config: RackConfig,
+        faults: Iterable[tuple[str, FaultConfig]],
+        commands: Iterable[tuple[str, CommandConfig]],
+        broken: frozenset[str] = frozenset(),
+    ) -> None:
+        self._config = config
+        self.mistakes = disagreements(config, broken)
+        tables = {mistake.place.partition(".")[0] for mistake in self.mistakes} | broken
+        self._wiring = Wiring(config, broken)
+        self.mistakes += self._wiring.mistakes
+        self._sizes = cell_sizes(config, self.mistakes, is_whole=not tables & {"robot", "scene"})
+        self._layout: Layout | None = None
+        if not self.mistakes and not broken:
+            self.mistakes += self._wiring.check_sizes(self._sizes)
+        if not self.mistakes and not broken:
+            self._layout = self._wiring.layout(self._sizes)
+            self.mistakes += too_large(self._layout)
+        boards = frozenset(place.removeprefix("board.") for place in broken if place.startswith("board."))
+        self.mistakes += fault_mistakes(faults, config, None if self.mistakes else self._layout, boards)
+        self.mistakes += command_mistakes(commands, config, boards)
+
+    def resolved(self) -> Resolved:
+        """Return everything that follows from a config without mistakes."""
+        config, layout = self._config, self._layout
+        assert layout is not None, "no mistakes"
+        from rack.boards.config.faults import injections
+
+        faults = injections(config, layout)
+        failing = {layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"}
+        tasks = tuple(self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks)
+        return Resolved(config, layout, tasks, faults, requests(config, layout))
+
+    def _task(self, layout: Layout, ports: TaskPorts, fails_self_test: bool) -> TaskWiring:
+        board, spec = self._config.board[ports.place.board], layout.task(ports.task)
+        is_executor = spec.role == "executor"
+        critical = not is_executor and is_critical(self._config, layout, spec.board)
+        return TaskWiring(
+            task=ports.task,
+            target=reference(self._config, ports.place),
+            inputs=dict(ports.reads),
+            outputs=dict(ports.writes),
+            context=self._context(spec.board),
+            poll=(board.wake or self._config.clock.wake) == "poll" and is_executor,
+            critical_priority=board.priority if critical else 0,
+            guards_clock=is_executor and spec.every == min(task.every for task in layout.tasks),
+            fails_self_test=fails_self_test,
+            transfer=BusTimes(**{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}),
+        )
+
+    def _context(self, name: str) -> LevelContext:
+        config, board = self._config, self._config.board[name]
+        below = board.below
+        return LevelContext(
+            board=name,
+            every=config.every(name),
+            within_cycles=board.within_cycles,
+            clock_ns=config.clock_ns,
+            seed=config.seed,
+            # The levels of a rack without an arm do not ask for one.
+            robot=cast(RobotConfig, config.robot),
+            scene=config.scene,
+            task=config.task,
+            sizes=self._sizes,
+            below=Pace(config.every(below), config.board[below].within_cycles) if below is not None else None,
+            params=board.params,
+        )
+
+
+def _validated(tables: Tables) -> RackConfig:
+    try:
+        config = RackConfig.model_validate(tables)
+    except ValidationError as error:
+        broken = _broken(error)
+        config = _intact(tables, broken)
+        extend_path(config.python_path)
+        faults, commands = _readable(tables, "fault", FaultConfig), _readable(tables, "command", CommandConfig)
+        found = mistakes_of(error, RackConfig, tables)
+        raise ConfigError([*found, *_Examined(config, faults, commands, broken).mistakes]) from None
+    extend_path(config.python_path)
+    return config
+
+
+def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
+    """Yield place and table for the valid tables of a list; the mistakes of the others are known."""
+    entries = tables.get(key)
+    for at, entry in enumerate(entries if isinstance(entries, list) else []):
+        with suppress(ValidationError):
+            yield f"{key}[{at}]", kind.model_validate(entry)
+
+
+def _broken(error: ValidationError) -> frozenset[str]:
+    """Return the tables with mistakes, as "robot" or "board.servo"."""
+    places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
+    return frozenset(".".join(keys[:2] if keys[0] == "board" else keys[:1]) for keys in places)
+
+
+def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
+    """Return a config of the tables without mistakes."""
+    kept = {key: value for key, value in tables.items() if key in RackConfig.model_fields and key not in broken}
+    boards = {name: table for name, table in kept.get("board", {}).items() if f"board.{name}" not in broken}
+    # Stand-ins for required tables; nothing that depends on a broken table is checked.
+    spare = {"name": "unnamed", "clock": {"period_ms": 1}}
+    none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
+    config = RackConfig.model_validate({**spare, **kept, "board": boards or none})
+    return config if boards else config.model_copy(update={"board": {}})

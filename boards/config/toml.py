@@ -1,0 +1,149 @@
+"""TOML text: parsed within bounds, changed by `--set key.sub=value`, and written."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import tomli_w
+
+from rack.boards.errors import ConfigError, Mistake, shown
+
+MAX_DEPTH = 32
+"""Nesting of tables and lists, and of files that extend each other."""
+INTEGER_BITS = 64
+"""TOML's own bound; Python's integers have none."""
+PART = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[^."'=\s]+)"""
+SETTING = re.compile(rf"\s*({PART}(?:\s*\.\s*{PART})*)\s*=(.*)", re.DOTALL)
+""""key.sub=value"; a key that contains a dot is quoted, as in TOML: protocol.mailbox."level.plan"=lock."""
+TOO_DEEP = f"nested too deeply; permitted: {MAX_DEPTH} levels"
+TOO_LONG = f"integer too long; permitted: {INTEGER_BITS} bits"
+FREE_FORM = ("params", "task")
+"""Tables of the levels: there an empty list is a value like any other."""
+
+Tables = dict[str, Any]
+
+
+def parse(text: str, place: str = "config") -> Tables:
+    """Return the tables of TOML text. Raises `ConfigError` with the line that is not TOML, or a value out of bounds."""
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
+    except RecursionError:
+        raise ConfigError([Mistake(place, None, TOO_DEEP)]) from None
+    except ValueError:  # Python does not convert integers of thousands of digits
+        raise ConfigError([Mistake(place, None, TOO_LONG)]) from None
+    if mistakes := list(_out_of_bounds(tables, place)):
+        raise ConfigError(mistakes)
+    return tables
+
+
+def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
+    """Yield values that TOML permits and a config does not: nesting without end, long integers, dates."""
+    waiting: list[tuple[str, int, Any]] = [(f"{place}: {key}", 1, value) for key, value in tables.items()]
+    while waiting:
+        where, depth, value = waiting.pop()
+        if isinstance(value, dict | list) and depth >= MAX_DEPTH:
+            yield Mistake(where, None, TOO_DEEP)
+        elif isinstance(value, dict):
+            waiting += [(f"{where}.{key}", depth + 1, item) for key, item in value.items()]
+        elif isinstance(value, list):
+            waiting += [(f"{where}[{at}]", depth + 1, item) for at, item in enumerate(value)]
+        elif isinstance(value, int) and value.bit_length() >= INTEGER_BITS:
+            yield Mistake(where, value, TOO_LONG)
+        elif isinstance(value, str) and "\0" in value:
+            yield Mistake(where, value, "text must not contain NUL")
+        elif not isinstance(value, str | int | float):
+            yield Mistake(where, str(value), "dates and times are not permitted; use a number or quoted text")
+
+
+def to_toml(tables: Mapping[str, Any]) -> str:
+    """Return tables as TOML; empty ones are left out."""
+    return tomli_w.dumps(_without_empty(tables))
+
+
+def _without_empty(table: Mapping[str, Any]) -> Tables:
+    kept = {key: value for key, value in table.items() if value not in ({}, [], ())}
+    return {key: value if key in FREE_FORM else _lean(value) for key, value in kept.items()}
+
+
+def _lean(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_lean(item) for item in value]
+    return _without_empty(value) if isinstance(value, Mapping) else value
+
+
+def merge(base: Tables, top: Tables) -> Tables:
+    """Return `base` overlaid with `top`, key by key."""
+    merged = dict(base)
+    for key, value in top.items():
+        is_table = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = merge(base[key], value) if is_table else value
+    return merged
+
+
+def override(tables: Tables, settings: Sequence[str]) -> Tables:
+    """Return the tables with each setting `key.sub=value` applied, in order.
+
+    Values are TOML; text that is not a TOML value is taken as a string. A number in a key is an index into a list,
+    as in `task.action.0.by=30`. Raises `ConfigError` with every mistake.
+    """
+    mistakes: list[Mistake] = []
+    for setting in settings:
+        try:
+            keys, value = _parts(setting)
+            tables = _put(tables, keys, value)
+        except LookupError as error:
+            mistakes.append(Mistake("--set", setting, str(error.args[0])))
+        except ConfigError as error:
+            mistakes += [Mistake("--set", setting, mistake.why) for mistake in error.mistakes]
+    if mistakes:
+        raise ConfigError(mistakes)
+    return tables
+
+
+def _parts(setting: str) -> tuple[list[str], Any]:
+    """Return the keys and the value of a setting. Raises `LookupError` and `ConfigError`."""
+    found = SETTING.fullmatch(setting)
+    if found is None or "\0" in setting:
+        raise LookupError("must be key=value, as in clock.speed=2")
+    keys = [_key(part) for part in re.findall(PART, found[1])]
+    if len(keys) > MAX_DEPTH:
+        raise LookupError(TOO_DEEP)
+    return keys, _value(found[2])
+
+
+def _key(part: str) -> str:
+    if part[0] not in "\"'":
+        return part
+    try:
+        return str(tomllib.loads(f"key = {part}")["key"])
+    except tomllib.TOMLDecodeError as error:
+        raise LookupError(f"{part} is not a valid key: {error}") from None
+
+
+def _value(text: str) -> Any:
+    try:
+        tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text.strip()
+    except (RecursionError, ValueError):
+        pass  # TOML, but out of bounds: `parse` says why
+    return parse(f"value = {text}")["value"]
+
+
+def _put(node: Any, keys: list[str], value: Any) -> Any:
+    """Return a copy of `node` with `value` at `keys`. Raises `LookupError` with a reason."""
+    if not keys:
+        return merge(node, value) if isinstance(node, dict) and isinstance(value, dict) else value
+    key, *rest = keys
+    if isinstance(node, list):
+        if key not in map(str, range(len(node))):
+            raise LookupError(f"{shown(key)} is not an index of a list of {len(node)}")
+        return [_put(item, rest, value) if place == int(key) else item for place, item in enumerate(node)]
+    if not isinstance(node, dict):
+        raise LookupError(f"{shown(key)} cannot be set in {shown(node)}, which is not a table")
+    return {**node, key: _put(node.get(key, {} if rest else None), rest, value)}

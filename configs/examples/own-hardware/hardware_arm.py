@@ -1,0 +1,61 @@
+"""An arm of one's own behind the servo level: hardware in place of MuJoCo."""
+
+from __future__ import annotations
+
+import numpy as np
+from drives import Drives
+from numpy.typing import NDArray
+
+from rack.backplane.message import Message
+from rack.levels.arm import Arm, Sensed
+from rack.levels.level import Finding
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import SceneConfig
+
+Array = NDArray[np.float64]
+
+
+class HardwareArm(Arm):
+    """Passes torques down to the drives and samples up."""
+
+    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+        super().__init__(cell, scene, clock_ns, every, seed)
+        self.drives = Drives(cell, clock_ns * 1e-9, self.patience)
+
+    def sense(self) -> Sensed:
+        """Return the newest sample."""
+        return Sensed(self.drives.position.copy(), self.drives.velocity.copy(), 0.0, 0.0, self.tick)
+
+    def drive(self, torque: Array, grip_force: float) -> Finding | None:
+        """Pass torques on; brake on one that no drive may be given."""
+        finding = self.refused(torque)
+        if finding is None:
+            self.drives.write(torque)
+            self.torque, self.waited, self.braked = torque.copy(), 0, False
+        else:
+            self.brake()
+        return finding
+
+    def brake(self) -> None:
+        """Engage the brakes."""
+        self.drives.brake()
+        self.torque, self.braked = np.zeros_like(self.torque), True
+
+    def step(self, ticks: int) -> None:
+        """Let time pass."""
+        self.drives.pass_ticks(ticks)
+        self.tick += ticks
+        self.waited += ticks
+        if self.drives.braked and not self.braked:
+            self.brake()
+
+    def save(self, state: Message) -> None:
+        """Add what a restarted board could ask real drives for."""
+        super().save(state)
+        state.state[: 2 * len(self.torque)] = [*self.drives.position, *self.drives.velocity]
+
+    def restore(self, state: Message) -> None:
+        """Continue where the arm was left."""
+        super().restore(state)
+        saved = state.state[: 2 * len(self.torque)].reshape(2, -1)
+        self.drives.position[:], self.drives.velocity[:] = saved

@@ -1,0 +1,134 @@
+"""Parts of the simulated arm's drives: brakes, the limit gate on torques, and encoders of finite resolution."""
+
+from __future__ import annotations
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.algebra import mat_vec, solve
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
+
+Array = NDArray[np.float64]
+
+STANDSTILL = 0.01
+"""Joint speed, rad/s, below which a joint holds its position."""
+SPEED_PART = 0.99
+"""Part of a velocity limit that the gate lets a joint reach; what its model leaves out in a cycle fits in the rest."""
+RANGE_KEPT_RAD = 0.002
+"""Distance that the gate keeps from the ends of a joint's range, for the same reason."""
+HARD, SOFT = 0, 8
+"""Kinds of the solver's constraints."""
+
+
+class Brake:
+    """Stops the joints and holds them where they came to rest, also a joint whose motor is off."""
+
+    def __init__(self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0) -> None:
+        """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of the hold."""
+        self._braking, self._dynamics = braking, dynamics
+        self._stiffness = stiffness
+        self.rest: Array = rest.copy()  # (joints,), rad: where the joints came to rest
+
+    def hold_at(self, q: Array) -> None:
+        """Engage at positions `q`, (joints,), rad."""
+        np.copyto(self.rest, q)
+
+    def torque(self, q: Array, qd: Array) -> Array:
+        """Return the torques (joints,), N m, that stop or hold the arm at state `q`, `qd`."""
+        np.copyto(self.rest, q, where=np.abs(qd) > STANDSTILL)
+        wanted = self._stiffness**2 * (self.rest - q) - 2.0 * self._stiffness * qd
+        inertia, bias = self._dynamics.terms(q, qd)
+        return np.asarray(mat_vec(inertia, np.clip(wanted, -self._braking, self._braking)) + bias)
+
+
+class LimitGate:
+    """Cuts torques so that the next cycle ends within limits, at a state from which the arm can still be stopped.
+
+    A joint may be only so fast that it can brake, with `braking` (joints,), rad/s2, before the end of its range. The
+    arm's equation of motion predicts the velocities. Torques that lead too far are replaced by the nearest ones, in
+    acceleration, that do not: a small quadratic program, in which torque limits take precedence.
+    """
+
+    def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
+        self._torque = bounds.torque
+        self._fastest = SPEED_PART * bounds.velocity
+        self._low = bounds.position[:, 0] + RANGE_KEPT_RAD
+        self._high = bounds.position[:, 1] - RANGE_KEPT_RAD
+        self._braking = braking
+        self._period_s = period_s
+        self._dynamics = dynamics
+        joints = len(braking)
+        self._inertia, self._resisting = np.eye(joints), np.zeros(joints)
+        self._unity = np.eye(joints)
+        self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
+
+    def admit(self, torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
+        """Return the torques (joints,), N m, that may pass at state `q`, `qd`, and whether anything was cut.
+
+        `torque` must be finite.
+        """
+        passed: Array = np.clip(torque, -self._torque, self._torque)
+        least = -self._speed_towards(q - self._low, -qd) - qd
+        most = self._speed_towards(self._high - q, qd) - qd
+        gain = np.clip(self._gain(passed, q, qd), least, most)
+        # Light joints change speed so much within a cycle that only its middle predicts where it ends.
+        gain = self._gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
+        if (gain < least).any() or (gain > most).any():
+            passed = self._nearest(gain, least, most)
+        return passed, not np.array_equal(passed, torque)
+
+    def _gain(self, torque: Array, q: Array, qd: Array) -> Array:
+        """Return the change in velocity, rad/s, that torques cause in one cycle at state `q`, `qd`."""
+        self._inertia, bias = self._dynamics.terms(q, qd)
+        self._resisting = bias + self._dynamics.friction(qd)
+        return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
+
+    def _nearest(self, gain: Array, least: Array, most: Array) -> Array:
+        """Return the torques whose gain in velocity, rad/s a cycle, is nearest to `gain` between `least` and `most`."""
+        scale = self._fastest
+        per_torque = self._inertia * (scale / self._period_s) / self._torque[:, None]
+        offset = self._resisting / self._torque
+        upper = np.concatenate((most / scale, 1.0 - offset))
+        lower = np.concatenate((least / scale, -1.0 - offset))
+        nearest, _, status, _ = daqp.solve(self._unity, -gain / scale, per_torque, upper, lower, self._kinds)
+        if status < 0:
+            nearest = np.clip(gain, least, most) / scale
+        return np.asarray(np.clip((mat_vec(per_torque, nearest) + offset) * self._torque, -self._torque, self._torque))
+
+    def _speed_towards(self, distance: Array, speed: Array) -> Array:
+        """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.
+
+        With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop within the rest:
+        v'^2 / 2 a <= distance - (v + v') T / 2.
+        """
+        half = 0.5 * self._braking * self._period_s
+        left = np.maximum(distance - 0.5 * speed * self._period_s, 0.0)
+        stoppable = np.sqrt(half * half + 2.0 * self._braking * left) - half
+        return np.minimum(stoppable, self._fastest)
+
+
+class CoarseSensors:
+    """Samples positions and velocities of the joints: noise on the truth, then the nearest step of the encoder.
+
+    Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as positions over
+    `EDGE_TIMING_S`. The noise of a tick is always the same, also for a restarted board and a second look.
+    """
+
+    def __init__(self, encoders: Encoders, seed: int) -> None:
+        self._seed = seed
+        per_second = np.array([[1.0], [1.0 / EDGE_TIMING_S]])
+        self._noise, self._step = encoders.noise * per_second, encoders.resolution * per_second
+        self._noisy, self._stepped = bool(encoders.noise.any()), self._step > 0.0
+        self._per_step = 1.0 / np.where(self._stepped, self._step, 1.0)
+
+    def sample(self, position: Array, velocity: Array, tick: int) -> Array:
+        """Return (2, joints): positions, rad, and velocities, rad/s, of a tick as sensed."""
+        sample = np.array((position, velocity))
+        if self._noisy:
+            sample += self._noise * np.random.default_rng((self._seed, tick)).standard_normal(sample.shape)
+        steps = np.rint(sample * self._per_step)
+        steps *= self._step
+        np.copyto(sample, steps, where=self._stepped)
+        return sample

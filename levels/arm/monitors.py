@@ -1,0 +1,128 @@
+"""Monitors of the simulation: limits exceeded and unintended contacts, independent of the code that prevents them."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.robot.cell import Cell, unintended_contacts
+from rack.levels.robot.lookup import geom_name
+
+Array = NDArray[np.float64]
+
+QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
+
+
+class LimitMonitor:
+    """Records position, velocity and torque, of motor and brake together, in every step; judges once a tick.
+
+    It shares nothing with the limit gate, which keeps the limits.
+    """
+
+    def __init__(self, cell: Cell, data: mujoco.MjData, substeps: int) -> None:
+        """Watch `data`; a tick takes `substeps` steps."""
+        model, bounds = cell.model, cell.bounds
+        self._names = [model.joint(int(joint)).name for joint in model.dof_jntid[cell.dof]]
+        # Whole rows are recorded, at no more cost than the arm's part of them; other entries have no limits.
+        self._live = data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied
+        ends = np.cumsum([model.nq, model.nv, model.nv])
+        self._seen = np.zeros((substeps, ends[-1]))
+        self._parts = [tuple(np.split(row, ends[:-1])) for row in self._seen]
+        self._columns = np.stack((cell.qpos, ends[0] + cell.dof, ends[1] + cell.dof))
+        self._low, self._high = np.full(ends[-1], -np.inf), np.full(ends[-1], np.inf)
+        self._low[self._columns] = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
+        self._high[self._columns] = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
+        self.count = 0  # steps in which the drives broke a limit
+        self.pushed = 0  # steps in which a blow did, of position or velocity, and no torque: no drive can prevent it
+        self.first = ""  # the first broken limit, readable
+
+    def look(self, substep: int) -> None:
+        """Record the step that has just been made, number `substep` of its tick."""
+        q, qd, motors, brakes = self._live
+        position, velocity, torque = self._parts[substep]
+        position[:] = q
+        velocity[:] = qd
+        np.add(motors, brakes, out=torque)
+
+    def judge(self, time_s: float, struck: bool) -> bool:
+        """Judge the steps of one tick that began at simulated `time_s`; return whether one broke a limit.
+
+        `struck`: the motion is still that of a blow.
+        """
+        # NaN is not within limits either. (Counting is five times as fast as `all`.)
+        within = np.count_nonzero(self._seen >= self._low) + np.count_nonzero(self._seen <= self._high)
+        if within == 2 * self._seen.size:
+            return False
+        self._count(time_s, struck)
+        return True
+
+    def _count(self, time_s: float, struck: bool) -> None:
+        wrong = ~((self._seen >= self._low) & (self._seen <= self._high))
+        steps = wrong.any(axis=1)
+        if struck:
+            pushed = steps & ~wrong[:, self._columns[2]].any(axis=1) & np.isfinite(self._seen).all(axis=1)
+            self.pushed += int(pushed.sum())
+            steps &= ~pushed
+            if not steps.any():
+                return
+        self.count += int(steps.sum())
+        if self.first:
+            return
+        substep = int(steps.argmax())
+        part, joint = (int(at[0]) for at in np.nonzero(wrong[substep, self._columns]))
+        column = self._columns[part, joint]
+        what, unit = QUANTITIES[part]
+        where = f"joint '{self._names[joint]}' at {time_s:.4f} s, step {substep}"
+        permitted = f"{self._low[column]:g} to {self._high[column]:g} is permitted"
+        self.first = f"{what} {self._seen[substep, column]:.6g} {unit} of {where}; {permitted}"
+
+
+class ContactMonitor:
+    """Counts the unintended contacts of a cell after every step of the simulation."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._model = cell.model
+        self._touch = cell.touch
+        self._arm, self._gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
+        self._arm[cell.arm_geoms] = self._gripper[cell.gripper_geoms] = True
+        self._root = cell.model.body_rootid[cell.model.geom_bodyid]
+        self.count = 0  # unintended contacts, summed over the steps
+        self.first = ""  # the first one, readable: which geoms, and when
+        self.struck: tuple[int, int] | None = None  # geoms of the newest one of arm or load since this was set to None
+
+    def look(self, data: mujoco.MjData, time_s: float) -> None:
+        """Count the unintended contacts of one step at simulated `time_s`."""
+        if data.ncon == 0:
+            return
+        pairs = unintended_contacts(data, self._touch)
+        if not len(pairs):
+            return
+        if not self.first:
+            self.first = f"unintended contact: {self.named(pairs[0])} at {time_s:.3f} s"
+        self.count += len(pairs)
+        ours = pairs[(self._arm | self._held(data))[pairs].any(axis=1)]
+        if len(ours):
+            self.struck = int(ours[0, 0]), int(ours[0, 1])
+
+    def holds(self, data: mujoco.MjData) -> bool:
+        """Return whether the gripper touches a free body."""
+        return bool(self._held(data).any())
+
+    def leans(self, data: mujoco.MjData) -> bool:
+        """Return whether the arm, or its load, touches anything else."""
+        ours = self._arm | self._held(data)
+        one_sided = ours[data.contact.geom].sum(axis=1) == 1
+        return bool((one_sided & (data.contact.dist < 0.0)).any())
+
+    def named(self, pair: tuple[int, int] | NDArray[np.int32]) -> str:
+        """Return a pair in words."""
+        first, second = (geom_name(self._model, geom) for geom in pair)
+        return f"'{first}' touches '{second}'"
+
+    def _held(self, data: mujoco.MjData) -> NDArray[np.bool_]:
+        """Mark (ngeom,) the geoms of free bodies that the gripper touches."""
+        pairs = data.contact.geom
+        others = pairs[self._gripper[pairs].any(axis=1)].ravel()
+        roots = self._root[others[~self._arm[others]]]
+        return np.asarray(np.isin(self._root, roots[roots != 0]))

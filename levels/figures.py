@@ -1,0 +1,97 @@
+"""The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only computes, for given times."""
+
+from __future__ import annotations
+
+from time import process_time_ns
+from typing import Annotated
+
+from pydantic import Field as Parameter
+
+from rack.backplane.message import Field, Message, MessageType, State, status
+from rack.backplane.process import compute_until
+from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
+from rack.levels.tables import Table, read_params
+
+FIGURE_PLAN = MessageType(
+    "figure_plan",
+    1,
+    (
+        Field("made_at", "i8", "tick", "release that the plan answers"),
+        Field("cycle", "i8", "tick", "cycle of the executor whose status the plan rests on; -1: none was there"),
+    ),
+)
+FIGURE_STATUS = status(
+    "figure_status",
+    1,
+    Field("cycle", "i8", "tick", "release of this cycle"),
+    Field("plan", "i8", "tick", "release that the plan in force answers; -1: there is none yet"),
+)
+
+NS_PER_MS = 1e6
+Milliseconds = Annotated[float, Parameter(ge=0, le=10_000, allow_inf_nan=False)]
+
+
+class FigureParams(Table):
+    """Processor times of the level's unit functions; R, W, U and C are the bus's, in `[board.<name>.transfer]`."""
+
+    process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = Parameter(
+        2.0, description="X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"
+    )
+    plan_ms: Milliseconds = Parameter(6.0, description="P: one plan, without its update, ms")
+
+    @property
+    def process_ns(self) -> tuple[int, ...]:
+        """X by cycle, ns; after the last the first comes again."""
+        times = self.process_ms if isinstance(self.process_ms, tuple) else (self.process_ms,)
+        return tuple(round(ms * NS_PER_MS) for ms in times)
+
+    @property
+    def plan_ns(self) -> int:
+        """P, ns."""
+        return round(self.plan_ms * NS_PER_MS)
+
+
+class FigureExecutor(Executor):
+    """Computes for X of processor time in every cycle, and reports which plan is in force."""
+
+    inputs = {"plan": Input(FIGURE_PLAN, "own.plan")}
+    outputs = {"status": FIGURE_STATUS}
+    params = FigureParams
+
+    def __init__(self, context: LevelContext) -> None:
+        """Raise `LevelError` for an invalid parameter."""
+        super().__init__(context)
+        self._times_ns = read_params(FigureParams, context.params).process_ns
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Report, and compute; time in which another process has the processor does not count."""
+        end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
+        status, plan = write.status, read.plan
+        status.state = State.EXECUTING
+        status.cycle = tick
+        status.plan = plan.value.made_at if plan.is_there else -1
+        compute_until(end)
+
+
+class FigurePlanner(Planner):
+    """Computes for P of processor time, then begins the next plan: one is always wanted."""
+
+    inputs = {"status": Input(FIGURE_STATUS, "own.status")}
+    output = FIGURE_PLAN
+    params = FigureParams
+
+    def __init__(self, context: LevelContext) -> None:
+        """Raise `LevelError` for an invalid parameter."""
+        super().__init__(context)
+        self._time_ns = read_params(FigureParams, context.params).plan_ns
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Return True: a plan is always wanted."""
+        return True
+
+    def plan(self, read: Ports, write: Message, tick: int) -> None:
+        """Report, and compute; time in which the executor has the processor does not count."""
+        end = process_time_ns() + self._time_ns
+        write.made_at = tick
+        write.cycle = read.status.value.cycle if read.status.is_there else -1
+        compute_until(end)

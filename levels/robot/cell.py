@@ -1,0 +1,190 @@
+"""The cell: a robot and its surroundings, as one MuJoCo model and the indices into it.
+
+Every task that needs the model builds it from the config by itself: equal files give equal models.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.errors import RobotError
+from rack.levels.robot import lookup
+from rack.levels.robot.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
+from rack.levels.robot.linkage import Linkage, solve_linkage
+from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
+from rack.levels.tables import RobotConfig, SceneConfig
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+"""Everything the next step depends on: a simulation restored from it continues bit for bit."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A compiled cell. Indices are addresses in `model`."""
+
+    model: mujoco.MjModel
+    """Torque motors on every joint of the arm, a force motor on the gripper. Keyframe 0 is the start: the arm at home,
+    the gripper open."""
+    qpos: NDArray[np.int_]  # (joints,), the arm's joints in qpos
+    dof: NDArray[np.int_]  # (joints,), the same in qvel
+    actuators: NDArray[np.int_]  # (joints,), their motors in ctrl
+    home: NDArray[np.float64]  # (joints,), rad: positions at the start
+    tool: int  # site
+    gripper_qpos: int | None  # None, here and below, for an arm without a gripper
+    gripper_dof: int | None
+    gripper_actuator: int | None
+    gripper_open: float | None  # joint position, m or rad
+    gripper_closed: float | None  # joint position when closed on nothing, m or rad
+    gripper_stiffness: float | None  # of the gripper's position loop, N/m or N m/rad
+    linkage: Linkage | None  # positions of all joints of the gripper, by its opening
+    arm_geoms: NDArray[np.int_]  # geoms that the arm moves, gripper included
+    gripper_geoms: NDArray[np.int_]  # those of hand and fingers
+    bodies: NDArray[np.int_]  # in the order of `scene.bodies`
+    object_qpos: NDArray[np.int_]  # (objects,), first of 7 addresses of each object
+    mocap: NDArray[np.int_]  # (obstacles,), mocap ids
+    supports: NDArray[np.int_]  # geoms
+    touch: NDArray[np.bool_]  # (ngeom, ngeom), True where a contact is unintended
+    bounds: Bounds  # never exceeded by the arm
+    limits: Limits  # of planned motion
+    encoders: Encoders  # resolution and noise of its sensors
+
+    def start(self) -> mujoco.MjData:
+        """Return data of the start: the arm at home, the gripper open, objects where the model puts them."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, data, 0)
+        mujoco.mj_forward(self.model, data)
+        return data
+
+
+def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+    """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps.
+
+    Raises `RobotError`, one line, for a file, joint, site, body or geom that is missing or of the wrong kind, a list of
+    the wrong length, a home outside the limits or in unintended contact.
+    """
+    spec = load_spec(robot.model)
+    check_joints(robot, spec)
+    motors, torque = fit_motors(spec, robot)
+    prepare(spec, robot, clock_ns)
+    cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
+    cell.model.key_qpos[0] = start_qpos(cell)
+    check_start(cell, robot)
+    return cell
+
+
+def sizes(cell: Cell) -> dict[str, int]:
+    """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state."""
+    return {
+        "joints": len(cell.qpos),
+        "bodies": max(1, len(cell.bodies)),
+        "state": mujoco.mj_stateSize(cell.model, STATE),
+    }
+
+
+def index(
+    model: mujoco.MjModel, robot: RobotConfig, scene: SceneConfig, motors: list[str], torque: NDArray[np.float64]
+) -> Cell:
+    """Find everything that the config names in the compiled model. Raises `RobotError`."""
+    joints = np.array([model.joint(name).id for name in robot.joints])
+    moved = lookup.below(model, model.jnt_bodyid[joints])
+    gripper, joint = robot.gripper, lookup.gripper_joint(model, robot, moved)
+    bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
+    objects, obstacles = bodies[: len(scene.objects)], bodies[len(scene.objects) :]
+    hand = lookup.hand(model, joint, joints)
+    arm_geoms, gripper_geoms = lookup.geoms_of(model, moved), lookup.geoms_of(model, hand)
+    object_geoms = lookup.geoms_of(model, lookup.below(model, objects))
+    supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
+    bounds = joint_bounds(model, joints, robot, torque)
+    return Cell(
+        model=model,
+        qpos=model.jnt_qposadr[joints].astype(int),
+        dof=model.jnt_dofadr[joints].astype(int),
+        actuators=np.array([model.actuator(name).id for name in motors]),
+        home=np.array(robot.home),
+        tool=lookup.tool_site(model, robot.tool, moved),
+        gripper_qpos=None if joint is None else int(model.jnt_qposadr[joint]),
+        gripper_dof=None if joint is None else int(model.jnt_dofadr[joint]),
+        gripper_actuator=None if gripper is None else int(model.actuator(gripper.actuator).id),
+        gripper_open=None if gripper is None else gripper.open,
+        gripper_closed=None if gripper is None else gripper.closed,
+        gripper_stiffness=None if gripper is None else gripper.stiffness,
+        linkage=None
+        if gripper is None or joint is None
+        else solve_linkage(model, joint, hand, (gripper.open, gripper.closed)),
+        arm_geoms=arm_geoms,
+        gripper_geoms=gripper_geoms,
+        bodies=bodies,
+        object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
+        mocap=lookup.mocap_ids(model, obstacles),
+        supports=supports,
+        touch=unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports),
+        bounds=bounds,
+        limits=planned_limits(bounds, robot),
+        encoders=Encoders.of(robot),
+    )
+
+
+def unintended_pairs(
+    model: mujoco.MjModel,
+    arm: NDArray[np.int_],
+    gripper: NDArray[np.int_],
+    objects: NDArray[np.int_],
+    supports: NDArray[np.int_],
+) -> NDArray[np.bool_]:
+    """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
+
+    Intended are an object on a support, an object in the gripper, the parts of one object and the fingers on each
+    other. Every other contact of arm or object is unintended; the rest of the cell is ignored.
+    """
+    touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    ours = np.union1d(arm, objects)
+    touch[ours, :] = touch[:, ours] = True
+    for first, second in ((objects, supports), (objects, gripper), (gripper, gripper)):
+        touch[np.ix_(first, second)] = touch[np.ix_(second, first)] = False
+    root = model.body_rootid[model.geom_bodyid]
+    touch[np.ix_(objects, objects)] &= root[objects][:, None] != root[objects][None, :]
+    return touch
+
+
+def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return the pairs of geoms, (n, 2), in unintended contact; `touch` is that of `Cell`."""
+    contact = data.contact
+    pairs: NDArray[np.int32] = contact.geom
+    suspects = touch[pairs[:, 0], pairs[:, 1]]
+    if not np.count_nonzero(suspects):  # the usual case, at every substep
+        return pairs[:0]
+    return np.asarray(pairs[suspects & (contact.dist < 0.0)])
+
+
+def start_qpos(cell: Cell) -> NDArray[np.float64]:
+    """Return qpos of the start: arm at home, gripper and all that follows it open, the rest as in the model."""
+    qpos = np.array(cell.model.qpos0)
+    qpos[cell.qpos] = cell.home
+    if cell.linkage is not None and cell.gripper_open is not None:
+        cell.linkage.set(qpos, cell.gripper_open)
+    return qpos
+
+
+def check_start(cell: Cell, robot: RobotConfig) -> None:
+    """Raise `RobotError` when home is outside the limits, too heavy to hold, in unintended contact, or not finite."""
+    for name, q, (low, high) in zip(robot.joints, cell.home, cell.limits.position, strict=True):
+        if not low <= q <= high:
+            raise RobotError(f"robot.home: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid")
+    data = cell.start()
+    if not np.isfinite(data.qacc).all():
+        raise RobotError(f"model '{robot.model}': acceleration at home is not finite; check masses, inertias, gravity")
+    load = np.abs(data.qfrc_bias - data.qfrc_passive)[cell.dof]
+    for name, needed, limit in zip(robot.joints, load, cell.bounds.torque, strict=True):
+        if needed > limit:
+            raise RobotError(
+                f"robot.home: joint '{name}' carries {needed:.4g} N m there; its torque limit is {limit:g}"
+            )
+    for pair in unintended_contacts(data, cell.touch):
+        first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
+        raise RobotError(
+            f"robot.home: '{first}' touches '{second}'; move home or the object, name a support, or exclude the pair"
+        )

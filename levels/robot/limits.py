@@ -1,0 +1,109 @@
+"""Limits of an arm's joints, from config and model, and the resolution of their encoders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.errors import RobotError
+from rack.levels.tables import RobotConfig
+
+VELOCITY_ROOM = 0.05
+"""Part of a velocity limit that planned motion leaves free, so that tracking stays clear of the limit gate."""
+POSITION_ROOM_RAD = 0.005
+"""Distance that planned motion keeps from the ends of a joint's range, for the same reason."""
+EDGE_TIMING_S = 0.1
+"""A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
+the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no filter's lag."""
+MAX_CONTACT_PART = 0.2
+"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a third more than seen in
+tasks."""
+MAX_RESTING_CONTACT_PART = 0.1
+"""The same for an arm that holds a part and hardly moves: dry friction may hide the push at all joints but one."""
+MIN_TURNING_JOINTS = 2
+"""Fewest turning joints at which an arm moves enough for a push to show."""
+SIGMAS = 6.0
+"""Standard deviations of noise that a monitor allows for: fewer than one sample in a billion is farther off."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Limits that the arm never exceeds, fault or not: as config and model give them.
+
+    Slides have m and N where hinges have rad and N m.
+    """
+
+    position: NDArray[np.float64]  # (joints, 2), rad: low and high; -inf and inf for a joint without
+    velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
+    torque: NDArray[np.float64]  # (joints,), N m, both ways
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of planned motion: the bounds, less some room for tracking, and the config's smoothness."""
+
+    position: NDArray[np.float64]  # (joints, 2), rad: low and high
+    velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
+    acceleration: NDArray[np.float64]  # (joints,), rad/s2, both ways
+    jerk: NDArray[np.float64]  # (joints,), rad/s3, both ways
+    torque: NDArray[np.float64]  # (joints,), N m, both ways
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """Resolution and noise of the joints' sensors; of velocities, rad/s, they are these over `EDGE_TIMING_S`."""
+
+    resolution: NDArray[np.float64]  # (joints,), rad: step of a position
+    noise: NDArray[np.float64]  # (joints,), rad: standard deviation of a position
+
+    @classmethod
+    def of(cls, robot: RobotConfig) -> Encoders:
+        """Return the encoders of a `[robot]` table."""
+        joints, sensors = len(robot.joints), robot.sensors
+        return cls(np.broadcast_to(sensors.resolution, joints), np.broadcast_to(sensors.noise, joints))
+
+    @property
+    def exact(self) -> bool:
+        """Whether samples are the truth."""
+        return not (self.resolution.any() or self.noise.any())
+
+    @property
+    def off(self) -> NDArray[np.float64]:
+        """Largest error of a good position, (joints,), rad."""
+        return np.asarray(0.5 * self.resolution + SIGMAS * self.noise)
+
+    @property
+    def speed_off(self) -> NDArray[np.float64]:
+        """Largest error of a good velocity, (joints,), rad/s."""
+        return self.off / EDGE_TIMING_S
+
+
+def joint_bounds(
+    model: mujoco.MjModel, joints: NDArray[np.int_], robot: RobotConfig, torque: NDArray[np.float64]
+) -> Bounds:
+    """Return the bounds; of a position range in both config and model the tighter end applies.
+
+    Raises `RobotError` for an empty range.
+    """
+    ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf])
+    if robot.position is not None:
+        given = np.array(robot.position)
+        ranges = np.stack((np.maximum(ranges[:, 0], given[:, 0]), np.minimum(ranges[:, 1], given[:, 1])), axis=1)
+    for name, (low, high) in zip(robot.joints, ranges, strict=True):
+        if not high - low > 2 * POSITION_ROOM_RAD:
+            raise RobotError(f"robot.position: joint '{name}' has no room from {low:g} to {high:g} rad")
+    return Bounds(position=ranges, velocity=np.array(robot.velocity), torque=torque)
+
+
+def planned_limits(bounds: Bounds, robot: RobotConfig) -> Limits:
+    """Return the limits of planned motion."""
+    return Limits(
+        position=bounds.position + np.array([POSITION_ROOM_RAD, -POSITION_ROOM_RAD]),
+        velocity=bounds.velocity * (1.0 - VELOCITY_ROOM),
+        acceleration=np.array(robot.acceleration),
+        jerk=np.array(robot.jerk),
+        torque=bounds.torque,
+    )

@@ -1,0 +1,128 @@
+"""Look up in a compiled model what a config names. Every mistake is one `RobotError` that lists what the model has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.errors import RobotError
+from rack.levels.robot.model import compile_spec, listed, load_spec
+from rack.levels.tables import RobotConfig, SceneConfig
+
+NOUNS = {
+    mujoco.mjtObj.mjOBJ_SITE: "site",
+    mujoco.mjtObj.mjOBJ_BODY: "body",
+    mujoco.mjtObj.mjOBJ_GEOM: "geom",
+    mujoco.mjtObj.mjOBJ_JOINT: "joint",
+}
+
+
+def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> int:
+    """Return the id of a named element; `place` is the config's key. Raises `RobotError`."""
+    found = mujoco.mj_name2id(model, kind, name)
+    if found >= 0:
+        return int(found)
+    count = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom, "joint": model.njnt}[NOUNS[kind]]
+    have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
+    raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
+
+
+def find_all(model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str) -> NDArray[np.int_]:
+    """Return the ids of named elements. Raises `RobotError`."""
+    return np.array([find(model, kind, name, place) for name in names], dtype=int)
+
+
+def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
+    """Yield a line for every name in the config that the model lacks. Raises `RobotError` for a broken model."""
+    model = compile_spec(load_spec(robot.model), robot.model)
+    kind = mujoco.mjtObj
+    wanted = [(kind.mjOBJ_JOINT, name, "robot.joints") for name in robot.joints]
+    if mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) < 0:
+        wanted.append((kind.mjOBJ_SITE, robot.tool, "robot.tool"))
+    if robot.gripper is not None:
+        wanted.append((kind.mjOBJ_JOINT, robot.gripper.joint, "robot.gripper.joint"))
+    wanted += [(kind.mjOBJ_BODY, name, "scene.objects") for name in scene.objects]
+    wanted += [(kind.mjOBJ_BODY, name, "scene.obstacles") for name in scene.obstacles]
+    wanted += [(kind.mjOBJ_GEOM, name, "scene.supports") for name in scene.supports]
+    for what, name, place in wanted:
+        try:
+            find(model, what, name, place)
+        except RobotError as error:
+            yield str(error)
+
+
+def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_]) -> int:
+    """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm. Raises `RobotError`."""
+    tool = find(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
+    if not moved[model.site_bodyid[tool]]:
+        raise RobotError(f"robot.tool: '{name}' is on a body that the arm does not move")
+    return tool
+
+
+def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.bool_]) -> int | None:
+    """Return the id of the gripper's joint; None: the arm has no gripper. Raises `RobotError`."""
+    if robot.gripper is None:
+        return None
+    name = robot.gripper.joint
+    joint = find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
+    if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
+        raise RobotError(
+            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the arm's own"
+        )
+    return joint
+
+
+def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Mark (nbody,) the body that carries the gripper's linkage, and its descendants.
+
+    The driven joint may be anywhere in the linkage; the joints `arm` are not part of it.
+    """
+    if gripper is None:
+        return np.zeros(model.nbody, dtype=bool)
+    body = model.jnt_bodyid[gripper]
+    while (parent := model.body_parentid[body]) and model.body_jntnum[parent] and parent not in model.jnt_bodyid[arm]:
+        body = parent
+    return below(model, model.body_parentid[[body]])
+
+
+def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return the ids of the objects' free joints. Raises `RobotError` for a body without one."""
+    joints = model.body_jntadr[bodies]
+    for body, joint in zip(bodies, joints, strict=True):
+        if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+            raise RobotError(f"scene.objects: body '{model.body(body).name}' has no free joint; give it <freejoint/>")
+    return np.asarray(joints, dtype=int)
+
+
+def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return the mocap ids of the obstacles. Raises `RobotError` for a body without one."""
+    for body in bodies:
+        if model.body_mocapid[body] < 0:
+            name = model.body(body).name
+            raise RobotError(f"scene.obstacles: body '{name}' cannot move by itself; give it mocap='true'")
+    return np.asarray(model.body_mocapid[bodies], dtype=int)
+
+
+# ==== levels/touches.py: """Which contacts a task means, and which are touches."""
+
+
+def below(model: mujoco.MjModel, roots: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Mark (nbody,) the bodies `roots` and their descendants."""
+    marked = np.zeros(model.nbody, dtype=bool)
+    marked[roots] = True
+    for body in range(1, model.nbody):
+        marked[body] |= marked[model.body_parentid[body]]
+    return marked
+
+
+def geoms_of(model: mujoco.MjModel, bodies: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """Return the ids of the geoms on the bodies marked (nbody,)."""
+    return np.flatnonzero(bodies[model.geom_bodyid])
+
+
+def geom_name(model: mujoco.MjModel, geom: int) -> str:
+    """Return a geom's name or, when it has none, its body's."""
+    return model.geom(geom).name or f"body {model.body(model.geom_bodyid[geom]).name}"

@@ -1,0 +1,111 @@
+"""The servo level's loops: computed torque for the joints, a position loop with limited force for the gripper."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from rack.backplane.message import Message
+from rack.levels.algebra import mat_vec
+from rack.levels.arm import find_arm
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Dynamics, Payload, Terms
+from rack.levels.servo.curves import Motion
+from rack.levels.tables import GripperConfig, Positive, Table
+
+Array = NDArray[np.float64]
+Reacting = Literal["hold", "stop", "brake"]
+
+
+class ServoParams(Table):
+    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
+
+    bandwidth: Positive = Field(60.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
+    damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
+    following: Positive = Field(
+        0.02, description="distance of a joint from its set point at which a motor counts as failed, rad"
+    )
+    on_sensor_fault: Reacting = Field(
+        "brake", description="ramp to rest and hold, or ramp and brake, or brake; without known velocities always brake"
+    )
+    on_actuator_fault: Reacting = Field("brake", description="ramp to rest and hold, or ramp and brake, or brake")
+    good_cycles: int = Field(20, ge=1, le=10_000, description="good cycles in a row after which a fault is over")
+    retry: Positive = Field(
+        0.5, description="time after which a motor that gave too little is retried, or a struck arm resumes, s"
+    )
+    patience: Positive = Field(
+        5.0, description="time for which faults may keep the arm from its set points before they are latched, s"
+    )
+    arm: str = Field(
+        "rack.levels.arm:SimulatedArm", description="class of the arm, package.module:Class; see rack.levels.arm.Arm"
+    )
+
+    @field_validator("arm")
+    @classmethod
+    def _is_an_arm(cls, reference: str) -> str:
+        find_arm(reference)
+        return reference
+
+
+class ComputedTorque:
+    """torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction; M is the planner's.
+
+    Every joint's error is that of a damped oscillator, whatever the arm's state. Torques stay within the torque limits.
+    """
+
+    def __init__(self, cell: Cell, params: ServoParams) -> None:
+        self._dynamics = Dynamics(cell)
+        self._limits = cell.bounds.torque
+        self._stiffness = params.bandwidth**2
+        self._damping = 2.0 * params.damping * params.bandwidth
+        self.cut = 0  # cycles in which a torque limit cut the torque wanted
+
+    def terms(self, position: Array, velocity: Array, plan: Message | None) -> Terms:
+        """Return the equation of motion at rad, rad/s, with the object held. Valid until the next call."""
+        payload = None if plan is None else Payload(plan.payload_mass, plan.payload_offset)
+        return self._dynamics.terms(position, velocity, payload)
+
+    def torque(self, wanted: Motion, position: Array, velocity: Array, terms: Terms, plan: Message | None) -> Array:
+        """Return the torques, (joints,), N m, that lead to the motion wanted."""
+        inertia = terms.inertia if plan is None else plan.inertia
+        acceleration = (
+            wanted.acceleration
+            + self._damping * (wanted.velocity - velocity)
+            + self._stiffness * (wanted.position - position)
+        )
+        torque = mat_vec(inertia, acceleration) + terms.bias + self._dynamics.friction(wanted.velocity)
+        possible = np.minimum(np.maximum(torque, -self._limits), self._limits)
+        self.cut += bool(np.count_nonzero(possible != torque))
+        return np.asarray(possible)
+
+
+class Grip:
+    """The gripper's force, N: a spring and damper to the commanded opening, limited to the commanded force.
+
+    Before the first set point the gripper opens or, after `keep`, keeps its force.
+    """
+
+    def __init__(self, config: GripperConfig) -> None:
+        self._config = config
+        self._least, self._most = sorted((config.open, config.closed))
+        self._opening, self._limit = config.open, config.force
+        self._kept: float | None = None
+
+    def keep(self, force: float) -> None:
+        """Keep `force`, N, until the first set point: the grip on an object must survive a restart of the board."""
+        self._kept = force
+
+    def force(self, command: Message, opening: float, velocity: float) -> float:
+        """Return the force, N, at `opening`, m, and its `velocity`, m/s, given the newest `JOINT_SET_POINT`."""
+        if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
+            self._opening = min(max(command.opening, self._least), self._most)
+            self._limit = min(max(command.force, 0.0), self._config.force)
+            self._kept = None
+        if self._kept is not None:
+            return self._kept
+        force = self._config.stiffness * (self._opening - opening) - self._config.damping * velocity
+        return min(max(force, -self._limit), self._limit)

@@ -1,0 +1,85 @@
+"""An operator's commands to the servo level: hold, or bring the joints to a set point; then back the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.backplane.mailbox import Reading
+from rack.backplane.message import Message
+from rack.levels.operator import Commands, Operation, Orders, joints_of
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.reference import Reference
+
+Array = NDArray[np.float64]
+
+
+class OperatorControl:
+    """Follows the operator.
+
+    To resume, the arm returns through the places from which it set out: the level above finds it on its path, and the
+    way out was free. A restarted board has forgotten the way: the level above then continues from where the arm is.
+    """
+
+    def __init__(self, commands: Commands, joints: Sequence[str], ranges: Array) -> None:
+        """Permit set points within `ranges` (joints, 2), rad."""
+        self.orders = Orders(commands)
+        self.stands = False  # the level follows the operator, not the level above
+        self._joints, self._ranges = joints, ranges
+        self._goal: Array | None = None  # (joints,), rad
+        self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
+
+    def take(self, operator: Reading) -> None:
+        """Take up new commands."""
+        if not self.orders.take(operator, self._judge):
+            return
+        if self.orders.standing is Operation.NONE and self._way:
+            self.orders.under_way()
+        self.stands = self.orders.standing is not Operation.NONE or bool(self._way)
+
+    @property
+    def reason(self) -> str:
+        """Why the arm does not follow the level above; empty: it does."""
+        if not self.stands:
+            return ""
+        if self.orders.standing is Operation.NONE:
+            return "returning to where the operator took over, then follows the level above"
+        what = "held" if self.orders.standing is Operation.HOLD else f"at the {self.orders.standing.name.lower()}"
+        return f"{what} by the operator; `resume` releases it"
+
+    def _judge(self, command: Message) -> None:
+        """Take the goal of a set point, or refuse it."""
+        if self.orders.standing is Operation.SETPOINT:
+            try:
+                self._goal = joints_of(command, self._joints, self._ranges)
+            except ValueError as error:
+                self.orders.refuse(str(error))
+
+    def wanted(self, reference: Reference, tick: int) -> Motion:
+        """Return the motion wanted at `tick`, while the level follows the operator."""
+        goal = self._aim()
+        if goal is None:
+            motion = reference.rest(tick)
+        else:
+            before, motion = reference.goal, reference.to(goal, tick)
+            if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
+                self._way.append(motion.position.copy())
+        if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
+            self._arrive()
+        return motion
+
+    def _aim(self) -> Array | None:
+        """Return where the joints are to go, (joints,), rad; None: nowhere."""
+        if self.orders.standing is Operation.SETPOINT:
+            return self._goal
+        return self._way[-1] if self.orders.standing is Operation.NONE and self._way else None
+
+    def _arrive(self) -> None:
+        """React to the arm resting where it should."""
+        if self.orders.standing is Operation.NONE and self._way:
+            self._way.pop()
+        if self.orders.standing is not Operation.NONE or not self._way:
+            self.stands = self.orders.standing is not Operation.NONE
+            self.orders.done()

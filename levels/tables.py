@@ -1,0 +1,126 @@
+"""Config tables that levels read: `[robot]`, `[scene]`, and the base of `[board.<name>.params]`.
+
+An arm is data: an MJCF file, and in `[robot]` what the file does not say. `rack.levels.robot` builds the cell from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rack.levels.errors import LevelError
+
+# No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them stay finite.
+# pydantic keeps one bound of each kind, so a narrower field says so with `le` and `ge`.
+Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+LAST_TICK = 10**15
+"""Ticks are 64-bit words: this many of the shortest last 300 years."""
+
+
+class Table(BaseModel):
+    """Base of every config table: unknown keys are errors, values are frozen, `true` does not pass for 1."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_tuples(cls, table: Any) -> Any:
+        """Turn TOML's lists into tuples, which are frozen."""
+        return {key: _tuple(value) for key, value in table.items()} if isinstance(table, dict) else table
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
+
+
+Params = TypeVar("Params", bound=Table)
+
+
+def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
+    """Return `params` as `kind`. Raises `LevelError` with the key, its value and the valid keys."""
+    try:
+        return kind(**params)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        valid = ", ".join(kind.model_fields)
+        raise LevelError(f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}") from error
+
+
+class SensorConfig(Table):
+    """Resolution and noise of the joints' encoders: one value for all joints, or a list with one per joint; 0: exact.
+
+    Velocities have ten times as much of both, in rad/s: see `rack.levels.robot.limits.Encoders`.
+    """
+
+    resolution: NotNegative | tuple[NotNegative, ...] = Field(
+        0.0, description="step of a joint position as sensed, rad"
+    )
+    noise: NotNegative | tuple[NotNegative, ...] = Field(
+        0.0, description="standard deviation of a joint position as sensed, rad"
+    )
+
+
+class GripperConfig(Table):
+    """A gripper driven by one actuator along one joint."""
+
+    actuator: str = Field(description="MJCF actuator that drives the gripper")
+    joint: str = Field(description="MJCF joint whose position is the opening")
+    open: Finite = Field(description="joint position when open, m or rad")
+    closed: Finite = Field(description="joint position when closed on nothing, m or rad")
+    force: Positive = Field(description="largest force or torque of the actuator, N or N m")
+    stiffness: Positive = Field(2000.0, description="position loop, N/m")
+    damping: Positive = Field(60.0, description="position loop, N s/m")
+
+
+class RobotConfig(Table):
+    """`[robot]`: an arm, its MJCF file and what the file does not say. Lists have one value per joint."""
+
+    model: Path = Field(strict=False, description="MJCF file of the arm and its cell; relative to the config")
+    joints: tuple[str, ...] = Field(min_length=1, max_length=16, description="MJCF joints of the arm, base to tool")
+    tool: str = Field(description="MJCF site whose pose is the tool's; for a model without one, its last body")
+    home: tuple[Finite, ...] = Field(description="joint positions at the start, rad")
+    velocity: tuple[Positive, ...] = Field(description="velocity limits, rad/s")
+    acceleration: tuple[Positive, ...] = Field(description="acceleration limits of planned motion, rad/s2")
+    jerk: tuple[Positive, ...] = Field(description="jerk limits of planned motion, rad/s3")
+    torque: tuple[Positive, ...] | None = Field(
+        None, description="torque limits, N m; default: the model's actuator limits"
+    )
+    position: tuple[tuple[Finite, Finite], ...] | None = Field(
+        None, description="position limits, rad; default: the model's joint ranges"
+    )
+    gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
+    sensors: SensorConfig = Field(SensorConfig(), description="resolution and noise of the joints' encoders")
+    substeps: int = Field(5, ge=1, le=50, description="MuJoCo steps in one servo cycle")
+    min_armature: Finite = Field(
+        0.05, ge=0, description="least drive inertia of every joint, kg m2: light wrists need it"
+    )
+
+
+class MotionConfig(Table):
+    """A move of an obstacle, made by the simulated cell at a fixed time: a mocap body goes to a place."""
+
+    body: str = Field(description="obstacle that moves")
+    at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it starts, s")
+    to: tuple[Finite, Finite, Finite] = Field(description="where its origin goes, m")
+    speed: Positive = Field(0.25, description="speed along the straight line, m/s")
+
+
+class SceneConfig(Table):
+    """`[scene]`: objects and obstacles in the cell, by their names in the MJCF."""
+
+    objects: tuple[str, ...] = Field((), description="free bodies that tasks may move")
+    obstacles: tuple[str, ...] = Field((), description="mocap bodies that may move by themselves")
+    supports: tuple[str, ...] = Field((), description="geoms on which objects may stand")
+    clearance: Positive = Field(0.015, description="distance that planned motion keeps from everything, m")
+    motion: tuple[MotionConfig, ...] = Field((), description="moves of obstacles, by time")
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Objects, then obstacles: the order of the world model's rows."""
+        return self.objects + self.obstacles

@@ -1,0 +1,58 @@
+"""Two levels without an arm that an operator can command; their output depends on when a command arrives."""
+
+from __future__ import annotations
+
+from rack.backplane.message import Field, Message, State, command, status
+from rack.levels.level import Executor, Input, Ports
+from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, Operation, Orders
+
+STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: do not go on"))
+COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that were not held"))
+
+
+class Upper(Executor):
+    """Says hold when an operator does; refuses to go home."""
+
+    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "status": Input(COUNTED, "below.status")}
+    outputs = {"command": STEP, "status": COUNTED}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.HOME,)}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Take up what is said, and hand it down."""
+        orders = self.orders
+        orders.take(read.operator, self._judge)
+        write.command.hold = orders.standing is Operation.HOLD
+        write.command.operator = orders.rests_on(0)
+        if read.status.value.operator >= orders.basis:
+            orders.done()
+        orders.report(write.status)
+        write.status.state = State.EXECUTING
+
+    def _judge(self, command: Message) -> None:
+        if self.orders.standing is Operation.GOTO:
+            self.orders.refuse("the way home is closed")
+
+    def self_test(self) -> None:
+        """Begin without orders."""
+        self.orders = Orders(self.commands)
+
+
+class Lower(Executor):
+    """Counts, unless it is held from above or here."""
+
+    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "command": Input(STEP, "above.command")}
+    outputs = {"status": COUNTED}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Take up what is said; count."""
+        self.orders.take(read.operator)
+        held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
+        write.status.count += not held
+        self.orders.done()
+        self.orders.report(write.status, read.command.value.operator)
+        write.status.state = State.EXECUTING
+
+    def self_test(self) -> None:
+        """Begin without orders."""
+        self.orders = Orders(self.commands)

@@ -1,0 +1,116 @@
+"""From config to layout: who writes, who reads, how long it takes, how much is kept."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.layout import depth_for
+from rack.backplane.slots import message_dtype
+from rack.boards.config import load, resolve, shared_out, wire
+from rack.boards.config import resolved as resolved
+from rack.boards.config.layout import field_specs, obtained_core
+from rack.boards.config.mistakes import disagreements
+from rack.levels.messages import TASK_COMMAND, TASK_PLAN
+
+SIZES = {"joints": 6, "bodies": 3, "state": 120}
+
+
+def test_mailboxes_have_one_writer_and_the_readers_that_the_levels_name(small: Path) -> None:
+    layout = wire(load(small))
+    assert {m.name: (m.writer, m.readers) for m in layout.mailboxes} == {
+        "upper.command": ("upper", ("lower", "lower.planner")),
+        "upper.status": ("upper", ()),
+        "lower.status": ("lower", ("upper",)),
+        "lower.plan": ("lower.planner", ("lower",)),
+    }
+
+
+def test_a_message_is_delayed_by_its_writers_slice(small: Path) -> None:
+    layout = wire(load(small))
+    assert {m.name: (m.every, m.delay) for m in layout.mailboxes} == {
+        "upper.command": (8, 8),
+        "upper.status": (8, 8),
+        "lower.status": (1, 1),
+        "lower.plan": (1, 4),
+    }
+
+
+def test_mailboxes_keep_two_seconds_and_never_less_than_their_readers_slice(small: Path) -> None:
+    layout = wire(load(small, ["board.lower.within_cycles=9000"]))
+    assert layout.mailbox("lower.status").depth == depth_for(800, 1)
+    assert layout.mailbox("upper.command").depth == depth_for(9008, 8)
+
+
+def test_protocols_are_set_for_the_rack_and_for_one_mailbox(small: Path) -> None:
+    settings = ["protocol.default=double-buffer", "protocol.mailbox={ 'lower.plan' = 'lock' }"]
+    layout = wire(load(small, settings))
+    assert layout.mailbox("lower.plan").protocol == "lock"
+    assert layout.mailbox("upper.command").protocol == "double-buffer"
+
+
+def test_a_tight_planner_shares_its_executors_board(small: Path) -> None:
+    layout = wire(load(small, ["board.lower.priority=50"]))
+    executor, planner = layout.task("lower"), layout.task("lower.planner")
+    assert (planner.slot, planner.core) == (executor.slot, executor.core)
+    assert (executor.priority, planner.priority) == (50, 0)
+    assert (executor.within_cycles, planner.within_cycles) == (1, 4)
+
+
+def test_a_loose_planner_has_a_board_of_its_own(small: Path) -> None:
+    settings = ["board.lower.coupling=loose", "board.lower.planner_slot=9", "board.lower.planner_priority=20"]
+    planner = wire(load(small, settings)).task("lower.planner")
+    assert (planner.slot, planner.priority) == (9, 20)
+
+
+def test_a_port_can_be_wired_to_another_mailbox(small: Path) -> None:
+    tasks = {
+        task.task: task for task in resolve(load(small, ["board.lower.reads={ command = 'upper.command' }"])).tasks
+    }
+    assert tasks["lower"].inputs == {"command": "upper.command", "plan": "lower.plan"}
+
+
+@pytest.mark.parametrize("kind", [TASK_COMMAND, TASK_PLAN], ids=lambda kind: kind.name)
+def test_field_specs_describe_the_very_bytes_of_a_message(kind) -> None:
+    dtype = kind.dtype(SIZES)
+    described = message_dtype(field_specs(kind, SIZES), dtype.itemsize)
+    assert described.itemsize == dtype.itemsize
+    for name in dtype.names:
+        assert described.fields[name][1] == dtype.fields[name][1]
+        assert described[name].shape == dtype[name].shape
+    assert described["moves"].base.fields["position"][1] == dtype["moves"].base.fields["position"][1]
+
+
+def test_cores_that_the_machine_lacks_are_shared_out_and_reported(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
+    assert [obtained_core(core) for core in range(6)] == [2, 3, 2, 3, 2, 3]
+    assert shared_out(load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])) == [
+        "core 5 is not available (available: 2, 3): upper on core 3"
+    ]
+
+
+def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
+    upper, lower, _ = (task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks)
+    assert (lower.board, lower.every, lower.within_cycles, lower.clock_ns, lower.seed) == ("lower", 1, 4, 2_500_000, 5)
+    assert lower.below is None
+    assert upper.below == (1, 4)
+    assert lower.params == {"gain": 2}
+
+
+def test_all_that_a_launch_needs_is_resolved_and_checked_once(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = []
+    monkeypatch.setattr(resolved, "disagreements", lambda *of: checked.append(of) or disagreements(*of))
+    settings = ["fault=[{ kind = 'self-test', board = 'upper' }]", "board.lower.transfer.read_ms=0.5"]
+    found = resolve(load(small, settings))
+    assert len(checked) == 1
+    assert [(task.task, task.fails_self_test, task.guards_clock) for task in found.tasks] == [
+        ("upper", True, False),
+        ("lower", False, True),
+        ("lower.planner", False, False),
+    ]
+    assert (len(found.faults), found.commands, found.ends_run) == (1, (), "upper.status")
+    assert found.tasks[1].transfer.read_ns == 500_000
+    clock = found.clock(10.0)
+    assert (clock.stop_tick, clock.linger, clock.silent, clock.history) == (4000, 200, 12_000, 400)

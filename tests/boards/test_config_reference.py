@@ -1,0 +1,115 @@
+"""The reference of all keys: complete, from the models that validate, with units and meanings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.config import FAULTS, load, names
+from rack.boards.config.files import read, with_faults
+from rack.boards.config.reference import Key, find_tables, key_tables
+from rack.boards.errors import ConfigError
+from rack.levels.servo.control import ServoParams
+
+DIMENSIONLESS = {
+    *("speed", "small_share", "phase", "damping", "braking", "quaternion", "direction"),  # ratios and directions
+    *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
+    "for",  # s, or text with its unit
+}
+WHOLE = ("reads", "planner_reads", "mailbox")
+"""Keys whose tables hold names of the user's own."""
+
+
+def reference(config: str | Path) -> dict[str, dict[str, Key]]:
+    """Return the keys by table of a config; tables that differ in their kind are put together."""
+    found: dict[str, dict[str, Key]] = {}
+    for table in key_tables(load(config)):
+        place = table.heading.partition(" with ")[0].strip("[]").replace("(top of the file)", "")
+        found.setdefault(place, {}).update({key.name: key for key in table.keys})
+    return found
+
+
+def used(tables: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, str]]:
+    """Yield table and key for everything that plain tables hold."""
+    for key, value in tables.items():
+        for item in value if isinstance(value, list) else [value]:
+            if isinstance(item, dict) and key not in WHOLE:
+                yield from used(item, f"{at}.{key}".lstrip("."))
+            else:
+                yield at, key
+
+
+def general(place: str) -> str:
+    """Return the place of a table as the reference has it: boards are alike, except for their parameters."""
+    parts = place.split(".")
+    return ".".join(["board", "<name>", *parts[2:]]) if parts[0] == "board" and parts[-1] != "params" else place
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_reference_has_every_key_of_every_shipped_config(name: str) -> None:
+    known = reference(name)
+    tables = read(name)
+    assert {(at, key) for at, key in used(tables) if key not in known.get(general(at), {})} == set()
+
+
+def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
+    known = reference("nasrem")["fault"]
+    scripts = [with_faults({}, name)["fault"] for name in names(FAULTS)]
+    assert {key for script in scripts for fault in script for key in fault} <= set(known)
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_key_has_a_meaning_and_every_quantity_a_unit(name: str) -> None:
+    for place, found in reference(name).items():
+        for key in found.values():
+            assert key.meaning, f"{place}.{key.name}"
+            if "number" in key.type and key.name not in DIMENSIONLESS:
+                assert key.unit, f"{place}.{key.name}: {key.meaning}"
+            for suffix, unit in (("_ms", "ms"), ("_s", "s"), ("_hz", "Hz")):
+                assert not key.name.endswith(suffix) or key.unit == unit
+
+
+def test_ranges_and_defaults_are_those_of_the_models() -> None:
+    known = reference("nasrem")
+    assert known["board.<name>"]["slot"] == Key(
+        "slot", "integer", "", "2 to 21", "required", known["board.<name>"]["slot"].meaning
+    )
+    bandwidth = known["board.servo.params"]["bandwidth"]
+    declared = ServoParams.model_fields["bandwidth"]
+    assert (bandwidth.unit, bandwidth.default) == ("rad/s", str(declared.default))
+    assert bandwidth.permitted == "above 0, at most 400"
+    assert known["board.<name>"]["coupling"].permitted == '"tight", "loose", "none"'
+    assert known["robot"]["joints"].type == "list of strings"
+    assert known["fault"]["by"].unit == "cycles"
+
+
+def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
+    path = small.with_name("own.toml")
+    path.write_text('extends = ["small.toml"]\n[board.upper]\nexecutor = "two_levels:Programmed"\n')
+    assert reference(path)["task"]["count"].meaning == "counts to reach, one after the other"
+    path.write_text('extends = ["small.toml"]\n[board.upper]\nexecutor = "two_levels:Nobody"\n')
+    with pytest.raises(ConfigError, match="has no class 'Nobody'"):
+        reference(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("clock", ["clock"]),
+        ("[board.servo.budget]", ["board.budget"]),
+        ("board.servo", ["board"]),
+        ("board.servo.params", ["board.servo.params"]),
+        ("board.<name>", ["board"]),
+        ("task", ["task.action.goto", "task.action.home", "task.action.transfer"]),
+    ],
+)
+def test_tables_are_found_by_the_names_that_a_config_uses(name: str, found: list[str]) -> None:
+    assert [table.name for table in find_tables(name, load("nasrem"))] == found
+
+
+def test_an_unknown_table_is_refused_with_those_there_are() -> None:
+    with pytest.raises(LookupError, match=r"no such table; tables: rack, clock, protocol, .*task"):
+        find_tables("bord", load("nasrem"))

@@ -1,0 +1,151 @@
+"""The brakes of the simulated arm: they act without the motors, close by themselves, and keep the limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.levels.arm import SimulatedArm
+from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import Cell, sizes
+from rack.levels.robot.dynamics import Dynamics
+from tests.levels.arms import CLOCK_NS, cell, config
+
+Array = NDArray[np.float64]
+
+
+def moving(name: str = "puma560", every: int = 1) -> tuple[SimulatedArm, Cell, Callable[[], Array]]:
+    """Return an arm under way, and torques that would keep it under way."""
+    made = cell(name)
+    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    arm, dynamics = SimulatedArm(made, config(name)[1], CLOCK_NS, every), Dynamics(made)
+    side = np.where(np.arange(len(made.home)) % 2, -1.0, 1.0) * made.limits.acceleration
+
+    def torque() -> Array:
+        sensed = arm.sense()
+        inertia, bias = dynamics.terms(sensed.position, sensed.velocity)
+        return np.asarray(inertia @ (0.5 * side) + bias)
+
+    for _ in range(80):
+        arm.drive(torque(), 0.0)
+        arm.step(1)
+    assert np.abs(arm.sense().velocity).max() > 0.2
+    return arm, made, torque
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_the_brakes_close_after_two_torque_cycles_without_a_command(every: int) -> None:
+    arm, _, torque = moving(every=every)
+    arm.drive(torque(), 0.0)
+    arm.step(2 * every)
+    assert not arm.braked
+    arm.step(1)
+    assert arm.braked
+    assert not arm.torque.any()
+
+
+def test_closed_brakes_stop_and_hold_an_arm_all_of_whose_motors_are_off() -> None:
+    arm, _, torque = moving()
+    arm.weaken(np.zeros(6))
+    arm.brake()
+    arm.step(600)
+    assert np.abs(arm.sense().velocity).max() < 1e-3
+    rest = arm.sense().position.copy()
+    arm.step(400)
+    assert arm.sense().position == pytest.approx(rest, abs=1e-3)
+    assert arm.violations == 0
+    for _ in range(60):
+        arm.drive(torque(), 0.0)
+        arm.step(1)
+    assert np.abs(arm.sense().position - rest).max() > 0.02  # without brakes it falls
+
+
+def test_a_command_opens_the_brakes() -> None:
+    arm, _, torque = moving()
+    arm.brake()
+    arm.step(5)
+    assert arm.braked
+    assert arm.drive(torque(), 0.0) is None
+    assert not arm.braked
+    assert arm.torque.any()
+
+
+def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
+    arm, made, _ = moving()
+    arm.brake()
+    arm.step(30)
+    arm.brake()
+    saved = Message(ARM_STATE.dtype(sizes(made)))
+    arm.save(saved)
+    again = SimulatedArm(cell("puma560"), config("puma560")[1], CLOCK_NS)
+    again._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    again.restore(saved)
+    ends = []
+    for one in (arm, again):
+        one.step(300)
+        end = Message(saved.record.dtype)
+        one.save(end)
+        ends.append(end.raw)
+    assert saved.braked == 1
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize(
+    ("value", "alarm"), [(np.nan, Alarm.COMMAND_INVALID), (np.inf, Alarm.COMMAND_INVALID), (1e3, Alarm.COMMAND_LIMIT)]
+)
+def test_a_torque_that_no_servo_level_gives_closes_the_brakes_and_is_named(value: float, alarm: Alarm) -> None:
+    arm, made, torque = moving()
+    command = torque()
+    command[3] = -value
+    found = arm.drive(command, 0.0)
+    assert found is not None
+    assert (found.alarm, found.subject) == (alarm, 3)
+    assert arm.braked
+    assert not arm._data.ctrl[made.actuators].any()
+    assert arm.drive(torque(), 0.0) is None
+    assert not arm.braked
+
+
+def test_a_torque_at_its_limit_is_a_command_like_any_other() -> None:
+    arm, made, _ = moving()
+    assert arm.drive(made.bounds.torque.copy(), 0.0) is None
+
+
+@pytest.mark.parametrize("name", ["puma560", "k1607"])
+def test_limits_hold_at_every_step_when_brakes_close_and_open_at_any_time(name: str) -> None:
+    arm, made, _ = moving(name)
+    rng = np.random.default_rng(3)
+    for _ in range(60):
+        torque = rng.choice([-1.0, 1.0], len(made.home)) * made.bounds.torque
+        for _ in range(int(rng.integers(1, 30))):
+            arm.drive(torque, 0.0)
+            arm.step(1)
+        arm.brake()
+        arm.step(int(rng.integers(1, 20)))
+    assert (arm.violations, arm.first_violation) == (0, "")
+
+
+def test_the_limit_monitor_counts_every_step_beyond_a_limit_and_names_the_first() -> None:
+    arm, made, torque = moving()
+    arm._data.qvel[made.dof[1]] = 3.0
+    arm.drive(torque(), 0.0)
+    arm.step(1)
+    assert 1 <= arm.violations <= 5
+    assert arm.first_violation.startswith("velocity 2.")
+    assert "of joint 'j2' at 0.2000 s, step 0; -1.51 to 1.51 is permitted" in arm.first_violation
+
+
+def test_the_limit_monitor_sees_a_torque_that_motor_and_brake_give_together() -> None:
+    arm, made, _ = moving()
+    arm._data.ctrl[made.actuators[0]] = 60.0
+    arm._data.qfrc_applied[made.dof[0]] = 60.0
+    arm._given = True
+    arm.step(1)
+    assert arm.violations == 5
+    assert "torque 120 N m of joint 'j1'" in arm.first_violation

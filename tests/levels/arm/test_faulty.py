@@ -1,0 +1,161 @@
+"""Faults between servo level and arm: they do what they say, where they say it, and repeat with the same seed."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.alarms import Alarm
+from rack.boards.faults import KINDS
+from rack.levels.arm import FaultyLink, SimulatedArm
+from rack.levels.level import Fault
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Dynamics
+from tests.levels.arms import CLOCK_NS, cell, config
+
+
+def linked(*faults: Fault) -> tuple[FaultyLink, SimulatedArm, list[int]]:
+    made, acted = cell("puma560"), list[int]()
+    arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
+    link = FaultyLink(arm, made, 1, acted)
+    link.inject(faults)
+    return link, arm, acted
+
+
+def fault(kind: str, seed: int = 7, **parameters: float) -> Fault:
+    return Fault(kind, parameters, seed, 0, KINDS[kind].step)
+
+
+HOLDING = Dynamics(cell("puma560")).terms(cell("puma560").home, np.zeros(6)).bias.copy()
+
+
+def test_a_bias_is_on_its_joint_alone() -> None:
+    link, arm, acted = linked(fault("sensor-bias", size=0.3, joint=2))
+    assert link.sense().position - arm.sense().position == pytest.approx([0, 0, 0.3, 0, 0, 0])
+    assert acted == [0]
+
+
+def test_a_position_that_is_no_number_hides_nothing_else() -> None:
+    link, _, _ = linked(fault("sensor-nan", joint=-1))
+    sample = link.sense()
+    assert np.isnan(sample.position).all()
+    assert np.isfinite(sample.velocity).all()
+
+
+def test_noise_is_the_same_again_with_the_same_seed_and_tick_and_has_its_size() -> None:
+    draws = []
+    for seed in (7, 7, 8):
+        link, arm, _ = linked(fault("sensor-noise", seed=seed, size=0.01, joint=-1))
+        noise = []
+        for _ in range(100):
+            noise.append(link.sense().position - arm.sense().position)
+            arm.step(1)
+        draws.append(np.array(noise))
+    assert np.array_equal(draws[0], draws[1])
+    assert not np.array_equal(draws[0], draws[2])
+    assert np.std(draws[0]) == pytest.approx(0.01, rel=0.1)
+
+
+def test_a_stuck_sensor_counts_as_acting_once_it_differs_from_the_truth() -> None:
+    link, arm, acted = linked(fault("sensor-stuck", joint=0))
+    first = link.sense().position.copy()
+    assert acted == []
+    torque = HOLDING + np.array([8.0, 0, 0, 0, 0, 0])
+    for _ in range(20):
+        link.drive(torque, 0.0)
+        arm.step(1)
+        sample = link.sense()
+        assert sample.position[0] == first[0]
+    assert arm.sense().position[0] > first[0] + 1e-4
+    assert sample.position[1] == arm.sense().position[1]
+    assert 0 < len(acted) < 20
+
+
+def test_a_dropout_leaves_the_tick_of_the_last_sample() -> None:
+    link, arm, acted = linked(fault("sensor-dropout"))
+    for _ in range(3):
+        assert link.sense().tick == -1
+        arm.step(1)
+    assert len(acted) == 3
+
+
+def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -> None:
+    link, arm, acted = linked(fault("actuator-off", joint=1))
+    link.drive(HOLDING, 0.0)
+    given = arm._data.ctrl[arm.cell.actuators]
+    assert given[1] == 0.0
+    assert given[2] == HOLDING[2]
+    assert arm.torque[1] == HOLDING[1]  # nobody tells the servo level
+    assert acted == [0]
+    link.inject([])
+    link.drive(HOLDING, 0.0)
+    assert arm._data.ctrl[arm.cell.actuators][1] == HOLDING[1]
+
+
+def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_not_at_fault() -> None:
+    link, arm, acted = linked(fault("actuator-saturated", part=0.1, joint=-1))
+    link.drive(HOLDING, 0.0)
+    limits = arm.cell.bounds.torque
+    assert (np.abs(arm._data.ctrl[arm.cell.actuators]) <= 0.1 * limits + 1e-12).all()
+    acted.clear()
+    link.drive(0.05 * limits, 0.0)
+    assert acted == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "alarm"),
+    [("command-nan", {}, Alarm.COMMAND_INVALID), ("command-limit", {"factor": 1.1}, Alarm.COMMAND_LIMIT)],
+)
+def test_a_corrupted_command_never_reaches_the_motors(kind: str, parameters: dict[str, float], alarm: Alarm) -> None:
+    link, arm, acted = linked(fault(kind, joint=4, **parameters))
+    found = link.drive(HOLDING, 0.0)
+    assert found is not None
+    assert (found.alarm, found.subject) == (alarm, 4)
+    assert arm.braked
+    assert acted == [0]
+    assert np.isfinite(HOLDING).all()  # the level's own torques stay as they are
+
+
+def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:
+    link, arm, acted = linked(
+        fault("sensor-bias", size=0.1, joint=0),
+        fault("command-nan", joint=0),
+        fault("sensor-bias", size=0.2, joint=0),
+    )
+    assert (link.sense().position - arm.sense().position)[0] == pytest.approx(0.3)
+    link.drive(HOLDING, 0.0)
+    assert acted == [0, 2, 1]
+
+
+def test_a_joint_that_the_arm_lacks_is_never_struck() -> None:
+    link, arm, acted = linked(fault("sensor-nan", joint=9), fault("actuator-off", joint=9))
+    assert np.array_equal(link.sense().position, arm.sense().position)
+    link.drive(HOLDING, 0.0)
+    assert acted == []
+
+
+@pytest.mark.parametrize(("blocks", "more", "acts"), [(0, 0.0, [0]), (1, 0.0, []), (1, 20.0, [0]), (2, 20.0, [])])
+def test_a_motor_that_is_off_counts_later_where_an_arm_at_rest_holds_a_part_or_leans_on_it(
+    blocks: int, more: float, acts: list[int]
+) -> None:
+    made, acted = cell("puma560"), list[int]()
+    arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
+    lay_against_a_finger(made, arm, blocks)
+    assert (arm.holds, arm.leans) == (blocks > 0, blocks > 1)
+    link = FaultyLink(arm, made, 1, acted)
+    link.inject([fault("actuator-off", joint=1)])
+    link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
+    assert acted == acts
+
+
+def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
+    """Put a block where one finger is, so that it is held, and another so that it touches the first alone."""
+    data = arm._data
+    mujoco.mj_forward(made.model, data)
+    finger = next(int(geom) for geom in made.gripper_geoms if made.model.geom(int(geom)).name.startswith("pad"))
+    place = data.geom_xpos[finger].copy()
+    for nth, body in enumerate(made.bodies[:blocks]):
+        address = made.model.jnt_qposadr[made.model.body_jntadr[body]]
+        data.qpos[address : address + 3] = place + np.array([0.049 * nth, 0.0, 0.0])
+    mujoco.mj_forward(made.model, data)

@@ -1,0 +1,134 @@
+"""An arm of the user's own: a class named in the config takes the place of the simulated one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.boards.config import load, wire
+from rack.boards.errors import ConfigError
+from rack.levels.algebra import solve
+from rack.levels.arm import Arm, Sensed
+from rack.levels.level import Finding
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.tables import SceneConfig
+from tests.levels.arms import pendulum
+from tests.levels.servo.rig import Course, ServoRig
+
+Array = NDArray[np.float64]
+START, GOAL = np.array([0.0, 0.5]), np.array([0.6, -0.4])
+SUBSTEPS = 10
+
+
+class IdealArm(Arm):
+    """Integrates the equation of motion; its brakes stop it at once."""
+
+    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+        super().__init__(cell, scene, clock_ns, every, seed)
+        self._dynamics, self._step_s = Dynamics(cell), clock_ns * 1e-9 / SUBSTEPS
+        self._q, self._qd = cell.home.copy(), np.zeros(len(cell.home))
+
+    def sense(self) -> Sensed:
+        return Sensed(self._q.copy(), self._qd.copy(), 0.0, 0.0, self.tick)
+
+    def drive(self, torque: Array, grip_force: float) -> Finding | None:
+        finding = self.refused(torque)
+        if finding is not None:
+            self.brake()
+        else:
+            self.torque, self.waited, self.braked = torque.copy(), 0, False
+        return finding
+
+    def brake(self) -> None:
+        self.braked = True
+        self._qd[:] = self.torque[:] = 0.0
+
+    def step(self, ticks: int) -> None:
+        for _ in range(ticks):
+            if self.waited >= self.patience:
+                self.brake()
+            for _ in range(0 if self.braked else SUBSTEPS):
+                inertia, bias = self._dynamics.terms(self._q, self._qd)
+                self._qd += self._step_s * solve(inertia, self.torque - bias)
+                self._q += self._step_s * self._qd
+            self.waited += 1
+            self.tick += 1
+
+    def save(self, state: Message) -> None:
+        super().save(state)
+        state.state[: 2 * len(self._q)] = [*self._q, *self._qd]
+
+    def restore(self, state: Message) -> None:
+        super().restore(state)
+        self._q[:], self._qd[:] = state.state[: 2 * len(self._q)].reshape(2, -1)
+
+
+class HalfAnArm(Arm):
+    """Lacks all that an arm must do but one thing."""
+
+    def sense(self) -> Sensed:
+        return Sensed(np.zeros(2), np.zeros(2), 0.0, 0.0, self.tick)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> ServoRig:
+    return ServoRig(pendulum(tmp_path), SceneConfig(), arm="tests.levels.arm.test_own_arm:IdealArm")
+
+
+def test_an_arm_named_in_the_config_is_driven_and_follows_its_set_points(rig: ServoRig) -> None:
+    course = Course(START, GOAL, 0.8)
+    rig.run(400, course.at)
+    assert isinstance(rig.servo.arm, IdealArm)
+    assert np.abs(rig.errors(course.at)).max() < 5e-3
+    assert np.abs(rig.status.position - GOAL).max() < 1e-3
+    assert not rig.alarms()
+    assert (rig.status.touches, rig.status.violations, rig.status.clipped) == (0, 0, 0)
+    # The default scene shows the tool where the sensed joints put it.
+    scene = rig.rack.read("servo.scene")
+    position, _ = Dynamics(rig.servo.arm.cell).pose(rig.positions[-2])
+    assert np.abs(scene.tool_position - position).max() < 1e-3
+
+
+def test_its_brakes_engage_when_the_servo_level_misses_cycles(rig: ServoRig) -> None:
+    rig.run(200, Course(START, GOAL, 2.0).at)
+    rig.miss(10)
+    rig.run(12)
+    assert rig.alarms() == [Alarm.BRAKES_CLOSED]
+
+
+def test_a_restarted_board_restores_it(rig: ServoRig) -> None:
+    rig.run(500, Course(START, GOAL, 1.0).at)
+    rig.restart()
+    rig.run(100, lambda _: (GOAL, np.zeros(2)))
+    assert np.abs(np.array(rig.positions[-100:]) - GOAL).max() < 5e-3
+
+
+def test_a_torque_that_is_nan_is_refused_by_every_arm(rig: ServoRig) -> None:
+    rig.run(100, Course(START, GOAL, 1.0).at)
+    rig.inject("command-nan", joint=1)
+    rig.run(2)
+    assert rig.servo.arm.braked
+    assert Alarm.COMMAND_INVALID in rig.alarms()
+
+
+@pytest.mark.parametrize(
+    ("reference", "why"),
+    [
+        ("nobody:Arm", "cannot import 'nobody': ModuleNotFoundError: No module named 'nobody'"),
+        ("tests.levels.arm.test_own_arm:Missing", "module 'tests.levels.arm.test_own_arm' has no class 'Missing'"),
+        ("rack.levels.arm:Sensed", "'Sensed' is not a subclass of rack.levels.arm.Arm"),
+        ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, drive, step"),
+    ],
+)
+def test_a_class_that_is_no_arm_is_refused_before_launch(reference: str, why: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        wire(load("nasrem", [f"board.servo.params.arm={reference!r}"]))
+    (mistake,) = caught.value.mistakes
+    assert mistake.place == "board.servo.params.arm"
+    assert mistake.why.startswith(why)

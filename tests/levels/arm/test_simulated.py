@@ -1,0 +1,255 @@
+"""The simulated arm: exact time, exact restarts, limits at every step, and unintended contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.message import Message
+from rack.levels.arm import SimulatedArm
+from rack.levels.arm.arm import PATIENCE_CYCLES
+from rack.levels.arm.simulated import ObstacleMotion
+from rack.levels.messages import ARM_STATE, SCENE
+from rack.levels.robot.cell import Cell, sizes
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.tables import MotionConfig, SceneConfig
+from tests.levels.arms import CLOCK_NS, cell, config
+
+Array = NDArray[np.float64]
+Torque = Callable[[int], Array]
+TICK_S = CLOCK_NS * 1e-9
+
+
+def arm_of(name: str) -> tuple[SimulatedArm, Cell]:
+    made = cell(name)
+    return SimulatedArm(made, config(name)[1], CLOCK_NS), made
+
+
+def saved(arm: SimulatedArm, made: Cell) -> Message:
+    state = Message(ARM_STATE.dtype(sizes(made)))
+    arm.save(state)
+    return state
+
+
+def wobble(made: Cell) -> Torque:
+    """Torques that swing the arm about home, a function of the tick alone."""
+    bias = Dynamics(made).terms(made.home, np.zeros(len(made.home))).bias.copy()
+    return lambda tick: bias + 0.2 * made.bounds.torque * np.sin(0.05 * tick + np.arange(len(bias)))
+
+
+@dataclass
+class Extremes:
+    """What a run of the simulation reached, looked at after every MuJoCo step."""
+
+    made: Cell
+    speed: float = 0.0
+    torque: float = 0.0
+    beyond: float = -np.inf
+    steps: int = field(default=0)
+
+    def look(self, _: mujoco.MjModel, data: mujoco.MjData) -> None:
+        q, qd, bounds = data.qpos[self.made.qpos], data.qvel[self.made.dof], self.made.bounds
+        self.speed = max(self.speed, float(np.max(np.abs(qd) / bounds.velocity)))
+        self.torque = max(self.torque, float(np.max(np.abs(data.qfrc_actuator[self.made.dof]) / bounds.torque)))
+        self.beyond = max(self.beyond, float(np.max([bounds.position[:, 0] - q, q - bounds.position[:, 1]])))
+        self.steps += 1
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> Callable[[Cell], Extremes]:
+    """Let every MuJoCo step of this test be looked at."""
+
+    def watch(made: Cell) -> Extremes:
+        extremes, step = Extremes(made), mujoco.mj_step
+
+        def stepping(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            step(model, data)
+            extremes.look(model, data)
+
+        monkeypatch.setattr(mujoco, "mj_step", stepping)
+        return extremes
+
+    return watch
+
+
+def test_simulated_time_is_the_tick_times_the_period_exactly() -> None:
+    arm, made = arm_of("puma560")
+    time = mujoco.mj_stateSize(made.model, mujoco.mjtState.mjSTATE_TIME)
+    for ticks in (1, 1, 7, 1, 30):
+        arm.drive(np.zeros(6), 0.0)
+        arm.step(ticks)
+        assert saved(arm, made).state[:time] == [arm.tick * CLOCK_NS * 1e-9]
+    assert arm.tick == 40
+
+
+def test_a_restored_arm_continues_bit_for_bit() -> None:
+    arm, made = arm_of("puma560")
+    torque, middle = wobble(made), Message(ARM_STATE.dtype(sizes(made)))
+    for tick in range(200):
+        if tick == 120:
+            arm.save(middle)
+        arm.drive(torque(tick), 20.0)
+        arm.step(1)
+    again, _ = arm_of("puma560")
+    again.restore(middle)
+    assert again.tick == 120
+    for tick in range(120, 200):
+        again.drive(torque(tick), 20.0)
+        again.step(1)
+    assert saved(again, made).raw == saved(arm, made).raw
+
+
+def test_a_restored_arm_keeps_the_torque_that_it_was_given_last() -> None:
+    arm, made = arm_of("puma560")
+    arm.drive(wobble(made)(3), 17.0)
+    state = saved(arm, made)
+    again, _ = arm_of("puma560")
+    again.restore(state)
+    arm.step(2)
+    again.step(2)
+    assert again.grip_force == 17.0
+    assert np.array_equal(again.torque, arm.torque)
+    assert saved(again, made).raw == saved(arm, made).raw
+
+
+@pytest.mark.parametrize("name", ["puma560", "k1607"])
+def test_an_arm_without_commands_stands_still(name: str) -> None:
+    arm, made = arm_of(name)
+    arm.step(400)
+    assert arm.sense().position == pytest.approx(made.home, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["puma560", "k1607"])
+def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Callable[[Cell], Extremes]) -> None:
+    arm, made = arm_of(name)
+    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # what hits something is stopped by that
+    extremes, rng = watched(made), np.random.default_rng(7)
+    for block in range(60):
+        side = rng.choice([-1.0, 1.0], len(made.home)) if block < 40 else np.ones(len(made.home))
+        for _ in range(20):
+            arm.drive(side * made.bounds.torque, 0.0)
+            arm.step(1)
+    assert extremes.steps == 60 * 20 * 5
+    assert 0.9 < extremes.speed <= 1.0
+    assert 0.9 < extremes.torque <= 1.0
+    assert extremes.beyond <= 0.0
+    assert arm.clipped > 60 * 20 / 2
+    assert arm.violations == 0
+
+
+def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(watched: Callable[[Cell], Extremes]) -> None:
+    arm, made = arm_of("puma560")
+    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    extremes, torque = watched(made), made.bounds.torque * [1, -1, 1, 1, -1, 1]
+    for missed in (1, 3, 10, 1, 80):
+        for _ in range(60):
+            arm.drive(torque, 0.0)
+            arm.step(1)
+        arm.step(missed)
+    assert extremes.speed <= 1.0
+    assert extremes.beyond <= 0.0
+
+
+def test_drives_keep_the_last_torque_for_a_while_then_brake_to_standstill() -> None:
+    arm, made = arm_of("puma560")
+    torque = wobble(made)
+    for tick in range(100):
+        arm.drive(torque(tick), 0.0)
+        arm.step(1)
+    given = arm.torque.copy()
+    for _ in range(PATIENCE_CYCLES - 1):
+        arm.step(1)
+        assert np.array_equal(arm.torque, given)
+    assert np.abs(arm.sense().velocity).max() > 0.2
+    arm.step(800)
+    rest = arm.sense().position.copy()
+    assert np.abs(arm.sense().velocity).max() < 1e-3
+    arm.step(400)
+    assert arm.sense().position == pytest.approx(rest, abs=1e-3)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_command_that_is_no_number_never_reaches_the_arm(wrong: float) -> None:
+    arm, made = arm_of("puma560")
+    command = wobble(made)(0)
+    command[2] = wrong
+    for _ in range(50):
+        arm.drive(command, wrong)
+        arm.step(1)
+    assert arm.clipped == 50
+    assert arm.fault == ""
+    assert arm.grip_force == 0.0
+    assert arm.sense().position == pytest.approx(made.home, abs=1e-3)
+
+
+def test_a_broken_simulation_is_a_fault_that_leaves_the_last_sound_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arm, made = arm_of("puma560")
+    arm.step(5)
+    sound = saved(arm, made)
+    made.model.dof_damping[0] = np.nan
+    arm.step(3)
+    assert "MuJoCo warning mjWARN_BAD" in arm.fault
+    assert arm.tick == 8
+    after = saved(arm, made)
+    assert np.array_equal(after.state[1:], sound.state[1:])  # all but the time
+    assert not list(tmp_path.iterdir())  # MuJoCo's own log file
+
+
+def test_arm_and_table_touching_is_counted_and_named_objects_on_the_table_are_not() -> None:
+    arm, made = arm_of("puma560")
+    for _ in range(200):
+        arm.drive(wobble(made)(0), 0.0)
+        arm.step(1)
+    assert (arm.touches, arm.first_touch) == (0, "")
+    for _ in range(800):
+        arm.drive(np.zeros(6), 0.0)
+        arm.step(1)
+    assert arm.touches > 0
+    assert " touches " in arm.first_touch
+    assert arm.first_touch.endswith(" s")
+
+
+def test_obstacle_motion_is_a_function_of_time_and_moves_follow_each_other() -> None:
+    moves = (
+        MotionConfig(body="post", at=5.0, to=(0.0, 0.0, 0.0), speed=1.0),
+        MotionConfig(body="post", at=1.0, to=(2.0, 0.0, 0.0), speed=0.5),
+    )
+    motion = ObstacleMotion(np.array([0.0, 0.0, 0.0]), moves)
+    expected = {0.0: 0.0, 1.0: 0.0, 2.0: 0.5, 4.9: 1.95, 5.0: 2.0, 5.5: 1.5, 9.0: 0.0}
+    for time_s in (9.0, 2.0, 5.5, 0.0, 4.9, 1.0, 5.0):
+        assert motion.position(time_s) == pytest.approx([expected[time_s], 0.0, 0.0])
+
+
+def test_a_move_cut_short_by_the_next_continues_from_where_it_was() -> None:
+    moves = (
+        MotionConfig(body="post", at=0.0, to=(2.0, 0.0, 0.0), speed=0.5),
+        MotionConfig(body="post", at=2.0, to=(1.0, 3.0, 0.0), speed=1.0),
+    )
+    assert ObstacleMotion(np.zeros(3), moves).position(3.0) == pytest.approx([1.0, 1.0, 0.0])
+
+
+def test_the_scene_shows_moving_obstacles_objects_and_the_tool_where_they_are() -> None:
+    robot_and_scene = config("puma560_crossing")
+    made, scene = cell("puma560_crossing"), robot_and_scene[1]
+    soon = SceneConfig(**{**scene.model_dump(), "motion": [{"body": "post", "at": 0.1, "to": (0.62, 0.0, 0.9)}]})
+    arm = SimulatedArm(made, soon, CLOCK_NS)
+    arm.step(240)
+    seen = Message(SCENE.dtype(sizes(made)))
+    arm.look(seen)
+    post = len(scene.objects)
+    assert seen.position[post] == pytest.approx([0.62, 0.85 - 0.25 * (239 * TICK_S - 0.1), 0.9])
+    assert seen.position[0] == pytest.approx([0.5, 0.3, 0.475], abs=1e-3)
+    position, rotation = Dynamics(made).pose(arm.sense().position)
+    assert seen.tool_position == pytest.approx(position, abs=1e-12)
+    quaternion = np.zeros(9)
+    mujoco.mju_quat2Mat(quaternion, seen.tool_quaternion)
+    assert quaternion == pytest.approx(rotation.ravel(), abs=1e-12)

@@ -1,0 +1,115 @@
+"""The equation of motion against published numbers, and against MuJoCo's own motion."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.robot.dynamics import Dynamics, Payload
+from rack.levels.tables import SceneConfig
+from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
+
+DATA = Path(__file__).parent / "data"
+PUMA: dict[str, Any] = json.loads((DATA / "puma560_oracle.json").read_text())
+K1607: dict[str, Any] = json.loads((DATA / "k1607_vectors.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
+    """The PUMA without hand and friction, as the published numbers have it."""
+    tree = ElementTree.parse(ROBOTS / "puma560.xml")
+    root = tree.getroot()
+    for name, parent in [(n, p) for p in root.iter() for n in list(p)]:
+        of_hand = name.get("name") in ("hand", "grip") or "hand" in (name.get("body1"), name.get("body2"))
+        fingers = "finger" in name.get("body1", "") + name.get("joint1", "")
+        if of_hand or fingers:
+            parent.remove(name)
+    for joint in root.iter("joint"):
+        joint.attrib.pop("damping", None)
+    model = tmp_path_factory.mktemp("puma") / "bare.xml"
+    tree.write(model)
+    robot = config("puma560")[0].model_copy(update={"model": model, "tool": "wrist", "gripper": None})
+    return build_cell(robot, SceneConfig(), CLOCK_NS)
+
+
+@pytest.mark.parametrize("pose", PUMA)
+def test_puma_kinematics_match_the_robotics_toolbox(puma: Cell, pose: str) -> None:
+    position, rotation = Dynamics(puma).pose(np.array(PUMA[pose]["q"]))
+    wanted = np.array(PUMA[pose]["T"])
+    assert position == pytest.approx(wanted[:3, 3], abs=1e-12)
+    assert rotation == pytest.approx(wanted[:3, :3], abs=1e-10)
+
+
+@pytest.mark.parametrize("pose", PUMA)
+def test_puma_gravity_inertia_and_coriolis_torques_match_the_robotics_toolbox(puma: Cell, pose: str) -> None:
+    dynamics, published = Dynamics(puma), PUMA[pose]
+    q, qd, qdd = (np.array(published[name]) for name in ("q", "qd", "qdd"))
+    inertia, bias = (x.copy() for x in dynamics.terms(q, np.zeros(6)))
+    assert bias == pytest.approx(published["grav"], abs=1e-9)
+    assert inertia == pytest.approx(np.array(published["M"]), abs=1e-9)
+    moving = dynamics.terms(q, qd).bias
+    assert moving - bias == pytest.approx(published["Cqd"], abs=1e-8)
+    assert inertia @ qdd + moving == pytest.approx(published["rne_nofric"], abs=1e-8)
+
+
+@pytest.mark.parametrize("row", range(len(K1607["vectors"]["gravity"])))
+def test_k1607_gravity_matches_the_published_vectors(row: int) -> None:
+    q, torque = K1607["vectors"]["gravity"][row]
+    bias = Dynamics(cell("k1607")).terms(np.array(q), np.zeros(7)).bias
+    assert -bias == pytest.approx(torque, abs=1e-3)
+
+
+def test_k1607_masses_are_the_published_ones() -> None:
+    model = cell("k1607").model
+    assert [model.body(f"k{n}").mass[0] for n in range(1, 7)] == pytest.approx([x["m"] for x in K1607["links"][:6]])
+
+
+@pytest.mark.parametrize("name", ["puma560", "k1607"])
+def test_torques_from_the_equation_give_the_acceleration_that_was_wanted(name: str) -> None:
+    made = cell(name)
+    dynamics, rng = Dynamics(made), np.random.default_rng(3)
+    joints = len(made.qpos)
+    qd, wanted = rng.uniform(-1, 1, joints), rng.uniform(-2, 2, joints)
+    inertia, bias = dynamics.terms(made.home, qd)
+    data = made.start()
+    data.qvel[made.dof] = qd
+    data.ctrl[made.actuators] = inertia @ wanted + bias + made.model.dof_frictionloss[made.dof] * np.sign(qd)
+    if made.gripper_dof is not None:  # fingers that do not fly apart
+        data.qvel[made.gripper_dof] = 0.0
+    mujoco.mj_forward(made.model, data)
+    assert data.qacc[made.dof] == pytest.approx(wanted, abs=0.05)
+
+
+def test_terms_do_not_depend_on_what_was_asked_before(puma: Cell) -> None:
+    rng = np.random.default_rng(4)
+    asked, fresh = Dynamics(puma), Dynamics(puma)
+    q, qd = rng.uniform(-1, 1, (2, 6))
+    for _ in range(5):
+        asked.terms(*rng.uniform(-1, 1, (2, 6)), Payload(2.0, rng.uniform(-0.1, 0.1, 3)))
+    first, second = asked.terms(q, qd), fresh.terms(q, qd)
+    assert np.array_equal(first.inertia, second.inertia)
+    assert np.array_equal(first.bias, second.bias)
+
+
+def test_a_payload_acts_like_a_small_mass_fixed_to_the_tool(tmp_path: Path) -> None:
+    robot, _ = config("puma560")
+    mass, offset = 1.7, np.array([0.02, -0.03, 0.05])
+    text = (ROBOTS / "puma560.xml").read_text()
+    x, y, z = offset + np.array([0.0, 0.0, 0.13])  # the tool's site on the hand
+    inertia = f'<inertial mass="{mass}" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/>'
+    ball = f'<body pos="{x} {y} {z}">{inertia}</body>'
+    loaded = tmp_path / "loaded.xml"
+    loaded.write_text(text.replace('<site name="tcp"', ball + '<site name="tcp"'))
+    heavy = Dynamics(build_cell(robot.model_copy(update={"model": loaded}), SceneConfig(), CLOCK_NS))
+    bare = Dynamics(build_cell(robot.model_copy(update={"model": ROBOTS / "puma560.xml"}), SceneConfig(), CLOCK_NS))
+    q, qd = np.random.default_rng(5).uniform(-1, 1, (2, 6))
+    carried, welded = bare.terms(q, qd, Payload(mass, offset)), heavy.terms(q, qd)
+    assert carried.inertia == pytest.approx(welded.inertia, abs=1e-7)
+    assert carried.bias == pytest.approx(welded.bias, abs=1e-7)

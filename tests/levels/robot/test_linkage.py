@@ -1,0 +1,109 @@
+"""Grippers whose joints follow one that is driven: geared, in closed loops, on springs and stops."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.message import State
+from rack.levels.errors import RobotError
+from rack.levels.robot.cell import Cell, build_cell
+from tests.levels.arms import CLOCK_NS, cell, four_bar
+from tests.levels.whole_rack import WholeRack
+
+TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
+
+
+def built(folder: Path, old: str = "", new: str = "") -> Cell:
+    """Return the cell with the four-bar gripper, with one change to its model."""
+    robot, scene = four_bar(folder)
+    arm = folder / "puma560.xml"
+    arm.write_text(arm.read_text().replace(old, new, 1) if old else arm.read_text())
+    return build_cell(robot, scene, CLOCK_NS)
+
+
+def settled(made: Cell, force: float) -> mujoco.MjData:
+    """Return the simulated cell after a second with `force` on the gripper, its arm held at home."""
+    data = made.start()
+    data.ctrl[made.gripper_actuator] = force
+    for _ in range(2000):
+        data.qpos[made.qpos], data.qvel[made.dof] = made.home, 0.0
+        mujoco.mj_step(made.model, data)
+    return data
+
+
+def away(made: Cell, data: mujoco.MjData) -> float:
+    """Return how far the farthest joint of the gripper is from where the linkage puts it, in rad."""
+    assert made.linkage is not None
+    posed = np.array(data.qpos)
+    made.linkage.set(posed, float(data.qpos[made.gripper_qpos]))
+    return float(np.max(np.abs(posed - data.qpos)[made.linkage.joints]))
+
+
+def test_geared_finger_follows_over_the_whole_range() -> None:
+    made = cell("puma560")
+    assert made.linkage is not None
+    for opening in (0.0, 0.0123, 0.04):
+        qpos = np.array(made.model.qpos0)
+        made.linkage.set(qpos, opening)
+        assert qpos[made.model.joint("finger_right").qposadr[0]] == pytest.approx(opening, abs=1e-9)
+
+
+def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> None:
+    made = built(tmp_path)
+    assert made.linkage is not None
+    assert len(made.linkage.joints) == 5
+    assert away(made, made.start()) == 0.0
+    data = made.start()
+    data.qpos[made.gripper_qpos] = 0.35
+    made.linkage.set(data.qpos, 0.35)
+    mujoco.mj_forward(made.model, data)
+    equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    assert np.abs(data.efc_pos[equality]).max() < 1e-5
+    assert away(made, settled(made, -1.0)) < 1e-3
+
+
+def test_joint_on_a_spring_is_posed_at_its_stop(tmp_path: Path) -> None:
+    # Without its loop the left tip has a spring that presses it outwards against a stop, as underactuated fingers have.
+    robot, scene = four_bar(tmp_path)
+    arm = tmp_path / "puma560.xml"
+    text = arm.read_text().replace('name="loop_left"', 'name="loop_left" active="false"')
+    spring = '<joint name="tip_left" range="-10 20" stiffness=".5" springref="40" '
+    text = text.replace('<joint name="rod_left" ', '<joint name="rod_left" stiffness=".1" ')
+    arm.write_text(text.replace('<joint name="tip_left" ', spring))
+    made = build_cell(robot, scene, CLOCK_NS)
+    assert made.linkage is not None
+    qpos = np.array(made.model.qpos0)
+    made.linkage.set(qpos, 0.3)
+    assert qpos[made.model.joint("tip_left").qposadr[0]] == pytest.approx(np.deg2rad(20), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('<connect name="loop_left"', '<weld name="loop_left"', r"robot\.gripper: equality 'loop_left' is \d"),
+        ('<connect name="loop_left"', "<weld", "equality <weld> of 'rod_left' and 'tip_left' is"),
+    ],
+)
+def test_linkage_that_cannot_move_as_wanted_is_refused_by_the_name_of_its_equality(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    with pytest.raises(RobotError, match=words):
+        built(tmp_path, old, new)
+
+
+@pytest.mark.parametrize(("equality", "joint"), [("gear", "crank_right"), ("loop_right", "tip_right")])
+def test_joint_that_nothing_determines_is_refused_by_name(tmp_path: Path, equality: str, joint: str) -> None:
+    with pytest.raises(RobotError, match=rf"robot\.gripper: joint '{joint}' follows nothing"):
+        built(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')
+
+
+def test_task_with_a_gripper_of_closed_loops_is_done(tmp_path: Path) -> None:
+    rack = WholeRack(arm=four_bar(tmp_path), actions=[TRANSFER])
+    assert rack.run_to_end(25.0).state == State.DONE
+    assert rack.move.replans == 0
+    assert rack.read("servo.status").touches == 0
+    assert rack.read("world.model").position[0] == pytest.approx(TRANSFER["to"], abs=0.002)

@@ -1,0 +1,132 @@
+"""A servo level alone, under the set points of a test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import Message
+from rack.boards.faults import KINDS
+from rack.levels.level import Fault, Finding
+from rack.levels.messages import JOINT_SET_POINT
+from rack.levels.servo import ServoExecutor, ServoPlanner
+from rack.levels.tables import RobotConfig, SceneConfig
+from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
+
+Array = NDArray[np.float64]
+TICK_S = CLOCK_NS * 1e-9
+PERIOD = 8
+"""Ticks between set points: 50 Hz."""
+
+
+class Course(NamedTuple):
+    """A smooth move from one place to another, (joints,) rad, from second 0 on: the minimum-jerk one."""
+
+    start: Array
+    goal: Array
+    duration_s: float
+
+    def at(self, time_s: float) -> tuple[Array, Array]:
+        """Return position and velocity."""
+        u = min(max(time_s / self.duration_s, 0.0), 1.0)
+        way = self.goal - self.start
+        return self.start + way * u**3 * (10 - 15 * u + 6 * u * u), way * 30 * u * u * (1 - u) ** 2 / self.duration_s
+
+
+class Found(NamedTuple):
+    """A finding and the tick of the cycle that found it."""
+
+    tick: int
+    finding: Finding
+
+
+class ServoRig:
+    """Runs executor and planner of the servo level tick by tick; the set points come from a function of time."""
+
+    def __init__(self, robot: RobotConfig, scene: SceneConfig, **params: float | str) -> None:
+        board = BoardSpec("servo", 1, ServoExecutor, ServoPlanner, PERIOD, above="primitive", params=params)
+        self.rack = Lockstep([board], robot, scene, outside={"primitive.command": JOINT_SET_POINT})
+        self.command: Message = self.rack.message("primitive.command")
+        self.command.opening, self.command.force, self.command.held = 0.04, 20.0, -1
+        self.targets: list[Array] = []
+        self.positions: list[Array] = []
+        self.found: list[Found] = []
+        self.acted: list[int] = []
+        self._faults: list[Fault] = []
+
+    @property
+    def servo(self) -> ServoExecutor:
+        """The executor, as it is now: a restart replaces it."""
+        return cast(ServoExecutor, self.rack.tasks["servo"].level)
+
+    @property
+    def status(self) -> Message:
+        """The status that the executor wrote last."""
+        return cast(Message, self.rack.tasks["servo"].write.status)
+
+    @property
+    def state(self) -> Message:
+        """The arm's state that the executor wrote last."""
+        return cast(Message, self.rack.tasks["servo"].write.state)
+
+    def set_point(self, position: Array, velocity: Array, due: int) -> None:
+        """Give one set point."""
+        self.command.id += 1
+        self.command.position, self.command.velocity, self.command.due = position, velocity, due
+        self.rack.write("primitive.command", self.command)
+
+    def run(self, ticks: int, motion: Callable[[float], tuple[Array, Array]] | None = None) -> None:
+        """Run `ticks` ticks; while `motion` is given, set points for it come every `PERIOD` ticks, one period ahead."""
+        for _ in range(ticks):
+            if motion is not None and self.rack.tick % PERIOD == 0:
+                due = self.rack.tick + PERIOD
+                self.set_point(*motion(due * TICK_S), due)
+            self.step()
+            self.targets.append(self.status.target.copy())
+            self.positions.append(self.status.position.copy())
+
+    def step(self) -> None:
+        """Run one tick as a board does: take out what was found and which faults acted."""
+        servo = self.servo
+        self.rack.step()
+        self.found += [Found(self.rack.tick - 1, finding) for finding in servo.findings]
+        self.acted += [self.rack.tick - 1] * bool(servo.acted)
+        servo.findings.clear()
+        servo.acted.clear()
+
+    def inject(self, kind: str, seed: int = 5, **parameters: float) -> int:
+        """Let a fault begin in the next tick, which is returned, beside those that are active."""
+        self._faults.append(Fault(kind, parameters, seed, self.rack.tick, KINDS[kind].step))
+        self.servo.inject(self._faults)
+        return self.rack.tick
+
+    def heal(self) -> None:
+        """Let all faults be over from the next tick on."""
+        self._faults = []
+        self.servo.inject([])
+
+    def restart(self) -> None:
+        """Replace the executor by a fresh one, under the same faults."""
+        self.rack.restart("servo")
+        self.servo.inject(self._faults)
+
+    def alarms(self, *but: Alarm) -> list[Alarm]:
+        """Return what was found, in order, without `but`."""
+        return [finding.alarm for _, finding in self.found if finding.alarm not in but]
+
+    def miss(self, ticks: int) -> None:
+        """Let the executor miss its next `ticks` cycles."""
+        self.rack.tasks["servo"].due += ticks
+
+    def stop_planner(self) -> None:
+        """Let the planner never be released again."""
+        self.rack.tasks["servo.planner"].due = -1
+
+    def errors(self, motion: Callable[[float], tuple[Array, Array]]) -> Array:
+        """Return how far the arm was from `motion` at each tick, (ticks, joints), rad."""
+        wanted = [motion(tick * TICK_S)[0] for tick in range(len(self.positions))]
+        return np.array(self.positions) - np.array(wanted)

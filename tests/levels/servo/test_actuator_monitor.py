@@ -1,0 +1,249 @@
+"""The servo level when motors or torques fail: found in bounded cycles, limits kept; and the monitor by itself."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.alarms import Alarm
+from rack.levels.level import Finding
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.limits import MAX_CONTACT_PART
+from rack.levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
+from tests.levels.arms import cell, config
+from tests.levels.servo.rig import TICK_S, Course, ServoRig
+
+Array = NDArray[np.float64]
+
+APPROACH_S = 1.5
+
+
+class Dash:
+    """A motion that brings one joint of an arm to its highest planned speed, from second 1.5 on."""
+
+    def __init__(self, rig: ServoRig, name: str, joint: int, side: float) -> None:
+        robot, bounds = config(name)[0], rig.servo.arm.cell.bounds
+        self._home, self._joint, self._side = np.array(robot.home), joint, side
+        self.speed, self._hardest = 0.95 * bounds.velocity[joint], 0.9 * robot.acceleration[joint]
+        self.way = self.speed**2 / self._hardest + 0.3
+        low, high = np.clip(bounds.position[joint], -2.6, 2.6)
+        self._start = self._home.copy()
+        middle = np.clip(self._home[joint], low + 0.05 + self.way / 2, high - 0.05 - self.way / 2)
+        self._start[joint] = middle - side * self.way / 2
+
+    @property
+    def fastest_at(self) -> int:
+        """Tick at which the joint has come to that speed."""
+        return round((APPROACH_S + self.speed / self._hardest) / TICK_S) + 4
+
+    def at(self, time_s: float) -> tuple[Array, Array]:
+        """Return position and velocity."""
+        u = min(max(time_s / APPROACH_S, 0.0), 1.0)
+        way = self._start - self._home
+        position = self._home + way * u**3 * (10 - 15 * u + 6 * u * u)
+        velocity = way * 30 * u * u * (1 - u) ** 2 / APPROACH_S
+        done, speed = self._along(max(time_s - APPROACH_S, 0.0))
+        position[self._joint] += self._side * done
+        velocity[self._joint] += self._side * speed
+        return position, velocity
+
+    def _along(self, time_s: float) -> tuple[float, float]:
+        rising = self.speed / self._hardest
+        cruising = 0.3 / self.speed
+        left = 2 * rising + cruising - time_s
+        if time_s < rising:
+            return 0.5 * self._hardest * time_s**2, self._hardest * time_s
+        if left > rising:
+            return 0.5 * self.speed * rising + self.speed * (time_s - rising), self.speed
+        left = max(left, 0.0)
+        return self.way - 0.5 * self._hardest * left**2, self._hardest * left
+
+
+def dashing(name: str, joint: int, side: float, **params: float | str) -> tuple[ServoRig, Dash]:
+    rig = ServoRig(*config(name), **params)
+    # What hits something is stopped by that.
+    rig.servo.arm._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # type: ignore[attr-defined]
+    dash = Dash(rig, name, joint, side)
+    rig.run(dash.fastest_at, dash.at)
+    assert rig.status.velocity[joint] * side == pytest.approx(dash.speed, rel=0.01)
+    return rig, dash
+
+
+def found(rig: ServoRig) -> list[int]:
+    """Return the ticks in which a motor was found at fault."""
+    return [tick for tick, finding in rig.found if finding.alarm is Alarm.ACTUATOR]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize(
+    ("name", "joint"), [("puma560", joint) for joint in range(6)] + [("k1607", joint) for joint in (1, 3, 5)]
+)
+def test_a_motor_off_at_top_speed_is_found_in_five_cycles_and_breaks_no_limit(
+    name: str, joint: int, side: float
+) -> None:
+    rig, dash = dashing(name, joint, side)
+    rig.inject("actuator-off", joint=-1)
+    rig.run(150, dash.at)
+    assert found(rig)[0] - rig.acted[0] <= 5
+    assert (rig.status.stopped, rig.status.braked) == (1, 1)
+    assert (rig.status.violations, rig.servo.arm.first_violation) == (0, "")
+    assert rig.status.reason.startswith("motor of '")
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"), [("actuator-off", {"joint": 1}), ("actuator-saturated", {"joint": 1, "part": 0.05})]
+)
+def test_a_shoulder_that_loses_its_torque_at_rest_hardly_falls(kind: str, parameters: dict[str, float]) -> None:
+    rig = ServoRig(*config("puma560"))
+    rig.run(200)
+    home = rig.status.position.copy()
+    rig.inject(kind, **parameters)
+    rig.run(150)
+    assert found(rig)[0] - rig.acted[0] <= 5
+    assert np.abs(rig.servo.arm.sense().position - home).max() < 0.01
+
+
+def test_a_failed_motor_is_retried_and_set_points_are_followed_once_it_works() -> None:
+    rig, dash = dashing("puma560", 1, 1.0, retry=0.1)
+    rig.inject("actuator-off", joint=1)
+    rig.run(400, dash.at)
+    assert len(found(rig)) == 1  # once, however often it is tried
+    assert rig.alarms().count(Alarm.BRAKES_OPENED) >= 3
+    assert rig.status.stopped == 1
+    rig.heal()
+    rig.run(100, dash.at)
+    assert (rig.status.stopped, rig.status.braked, rig.status.reason) == (0, 0, "")
+    goal = dash.at(60.0)
+    rig.run(1200, lambda _: goal)
+    assert rig.status.position == pytest.approx(goal[0], abs=1e-3)
+    assert (rig.status.violations, len(found(rig))) == (0, 1)
+
+
+@pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
+def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(reaction: str, braked: int) -> None:
+    rig, dash = dashing("puma560", 0, 1.0, on_actuator_fault=reaction)
+    rig.inject("actuator-saturated", joint=0, part=0.1)
+    rig.run(195, dash.at)
+    assert len(found(rig)) == 1
+    assert (rig.status.stopped, rig.status.braked) == (1, braked)
+    assert np.abs(rig.status.velocity).max() < 0.01
+    assert rig.status.violations == 0
+
+
+def test_an_arm_that_falls_while_it_is_to_ramp_to_rest_is_braked() -> None:
+    rig, dash = dashing("k1607", 0, 1.0, on_actuator_fault="stop")
+    rig.inject("actuator-saturated", joint=3, part=0.05)
+    rig.run(6, dash.at)
+    assert (rig.status.stopped, rig.status.braked) == (1, 0)
+    rig.run(150, dash.at)
+    assert (rig.status.violations, rig.status.stopped, rig.status.braked) == (0, 1, 1)
+
+
+def test_a_motor_that_is_asked_for_nothing_is_not_missed() -> None:
+    rig = ServoRig(*config("puma560"))
+    rig.run(200)
+    rig.inject("actuator-off", joint=0)
+    rig.run(200)
+    assert (rig.acted, rig.found) == ([], [])
+
+
+@pytest.mark.parametrize("kind", ["command-nan", "command-limit"])
+@pytest.mark.parametrize("cycles", [1, 120])
+def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torques_are_valid(
+    kind: str, cycles: int
+) -> None:
+    rig, dash = dashing("puma560", 0, 1.0)
+    parameters = {"factor": 5.0} if kind == "command-limit" else {}
+    begun = rig.inject(kind, joint=0, **parameters)
+    rig.run(cycles, dash.at)
+    alarm = Alarm.COMMAND_INVALID if kind == "command-nan" else Alarm.COMMAND_LIMIT
+    assert [(f.tick, f.finding.alarm) for f in rig.found if f.finding.alarm is alarm] == [(begun, alarm)]
+    assert (rig.status.stopped, rig.status.braked) == (1, 1)
+    assert not rig.status.torque.any()
+    rig.heal()
+    rig.run(1, dash.at)
+    assert (rig.status.stopped, rig.status.braked) == (0, 0)
+    goal = dash.at(60.0)
+    rig.run(1600, lambda _: goal)
+    assert rig.status.position == pytest.approx(goal[0], abs=1e-3)
+    assert rig.status.violations == 0
+
+
+def test_a_dead_motor_is_found_where_dry_friction_changes_sign_and_hides_it() -> None:
+    rig = ServoRig(*config("puma560"))
+    home = np.array(config("puma560")[0].home)
+    # The first joint comes to rest while the others go on.
+    first, others = Course(home, home + 0.4, 1.0), Course(home, home + 0.4, 2.0)
+    turning = np.array([True, *[False] * 5])
+
+    def motion(time_s: float) -> tuple[Array, Array]:
+        (q1, v1), (q, v) = first.at(time_s), others.at(time_s)
+        return np.where(turning, q1, q), np.where(turning, v1, v)
+
+    rig.run(380, motion)
+    begun = rig.inject("actuator-off", joint=0)
+    rig.run(10, motion)
+    assert [tick - begun for tick in found(rig)] == [4]
+
+
+Array = NDArray[np.float64]
+
+CELL = cell("puma560")
+REST = np.zeros(6)
+HELD_BY_FRICTION = math.tanh(2.0) * CELL.model.dof_frictionloss[CELL.dof]
+"""Torques that dry friction takes at rest, N m."""
+
+
+class Bench:
+    """An arm that rests in its home, with torques left over as a test says."""
+
+    def __init__(self) -> None:
+        self.monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)
+        self.terms = Dynamics(CELL).terms(CELL.home, REST)
+
+    def leave(self, cycles: int, holds: bool = False, **left: float) -> list[Finding]:
+        """Leave these torques over, N m, by joint from `j1` on, for some cycles; return what is found."""
+        over = REST.copy()
+        for joint, torque in left.items():
+            over[int(joint[1:]) - 1] = torque
+        found = []
+        for _ in range(cycles):
+            taken = np.where(over, np.copysign(HELD_BY_FRICTION, over), 0.0)
+            self.monitor.begin(REST, self.terms, self.terms.bias + over + taken)
+            found.append(self.monitor.look(REST, self.terms, REST, holds))
+        return [finding for finding in found if finding is not None]
+
+
+def test_a_part_that_is_pressed_on_its_support_is_no_motor_at_fault() -> None:
+    bench = Bench()
+    assert bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1) == []
+    # The arm has turned to it: only the wrist still presses, and is told a little more in every cycle.
+    for cycle in range(40):
+        assert bench.leave(1, j5=1.6 + 0.01 * cycle) == []
+
+
+def test_a_motor_that_lacks_more_than_a_contact_takes_is_found_while_a_part_presses() -> None:
+    bench = Bench()
+    bench.leave(10, j2=-2.5, j3=-1.4, j5=2.2)
+    much = (MAX_CONTACT_PART + 0.01) * CELL.bounds.torque[1]
+    found = bench.leave(SURE_CYCLES, j2=much, j3=-9.8, j5=0.4)
+    assert [finding.subject for finding in found] == [1]
+
+
+def test_a_wrist_that_lacks_torque_is_found_again_once_nothing_presses() -> None:
+    bench = Bench()
+    bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1)
+    bench.leave(1)
+    found = [bench.leave(1, j5=2.0 + cycle) for cycle in range(SURE_CYCLES)]
+    assert [finding.subject for finding in found[-1]] == [4]
+
+
+def test_a_part_that_presses_a_little_more_in_every_cycle_is_no_motor_at_fault() -> None:
+    # Dry friction hides the push at all joints but one.
+    bench = Bench()
+    for cycle in range(100):
+        assert bench.leave(1, holds=True, j5=0.41 + 0.03 * min(cycle, 30)) == []

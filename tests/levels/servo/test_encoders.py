@@ -1,0 +1,117 @@
+"""Encoders with a resolution and noise: what the arm samples, and monitors that know what a good sample may be off."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import State
+from rack.levels.arm import SimulatedArm
+from rack.levels.errors import RobotError
+from rack.levels.messages import Error
+from rack.levels.robot.cell import build_cell
+from rack.levels.tables import RobotConfig, SensorConfig
+from tests.levels.arms import CLOCK_NS, config, pendulum
+from tests.levels.servo.rig import Course, ServoRig
+from tests.levels.whole_rack import WholeRack
+
+GOAL = np.array([0.6, 1.0, -2.6, 0.4, -1.2, 0.5])
+BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
+
+
+def coarse(robot: RobotConfig, resolution: float, noise: float = 0.0) -> RobotConfig:
+    return robot.model_copy(update={"sensors": SensorConfig(resolution=resolution, noise=noise)})
+
+
+def move() -> Course:
+    return Course(np.array(config("puma560")[0].home), GOAL, 2.0)
+
+
+def test_samples_are_steps_of_the_resolution_a_joint_and_brakes_and_gate_see_the_truth() -> None:
+    robot, scene = config("puma560")
+    steps = (1e-3, 0.0, 1e-4, 1e-3, 1e-3, 1e-3)
+    robot = robot.model_copy(update={"sensors": SensorConfig(resolution=steps), "home": (0.1234567, *robot.home[1:])})
+    arm = SimulatedArm(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS)
+    position = arm.sense().position
+    assert position[0] == pytest.approx(0.123, abs=1e-12)
+    assert position[1] == robot.home[1]
+    arm.brake()
+    assert arm._brake.rest[0] == 0.1234567
+
+
+def test_noise_is_that_of_its_tick_and_seed_and_has_its_size() -> None:
+    robot, scene = config("puma560")
+    cell = build_cell(coarse(robot, 0.0, 1e-3), scene, CLOCK_NS)
+    arm, other = (SimulatedArm(cell, scene, CLOCK_NS, seed=seed) for seed in (1, 2))
+    noise = []
+    for _ in range(200):
+        noise.append(arm.sense().position - arm._state()[0])
+        assert np.array_equal(arm.sense().position, arm.sense().position)
+        assert not np.array_equal(arm.sense().position, other.sense().position)
+        arm.step(1)
+        other.step(1)
+    assert np.std(noise) == pytest.approx(1e-3, rel=0.1)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+@pytest.mark.parametrize("resolution", [1e-5, 1e-4, 3e-4, 1e-3])
+def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(resolution: float, noise: float) -> None:
+    robot, scene = config("puma560")
+    rig = ServoRig(coarse(robot, resolution, noise), scene)
+    rig.run(1000, move().at)
+    assert rig.alarms(*BRAKES) == []
+    assert rig.servo.arm._state()[0] == pytest.approx(GOAL, abs=2e-3)  # type: ignore[attr-defined]
+
+
+@pytest.mark.timeout(200)
+def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from tests.levels import whole_rack
+
+    load = whole_rack.load
+    monkeypatch.setattr(
+        whole_rack,
+        "load",
+        lambda name: (lambda c: c.model_copy(update={"robot": coarse(c.robot, 1e-3)}))(load(name)),
+    )
+    rack = WholeRack("nasrem")
+    servo = rack.tasks["servo"].level
+    found: list[Alarm] = []
+    while rack.seconds < 20.0 and rack.move.held < 0:
+        rack.run(0.25)
+        found += [f.alarm for f in servo.findings if f.alarm not in BRAKES]  # type: ignore[union-attr]
+        servo.findings.clear()  # type: ignore[union-attr]
+    assert (rack.move.held >= 0, found) == (True, [])
+    assert (rack.read("servo.status").violations, rack.read("servo.status").touches) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "error"),
+    [
+        ("sensor-stuck", {"joint": 1}, Error.SENSORS),
+        ("sensor-stuck", {"joint": 4}, Error.SENSORS),
+        ("sensor-bias", {"joint": 4, "size": 0.02}, Error.SENSORS),
+        ("actuator-off", {"joint": 1}, Error.MOTORS),
+    ],
+)
+def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
+    kind: str, parameters: dict[str, float], error: Error
+) -> None:
+    robot, scene = config("puma560")
+    rig = ServoRig(coarse(robot, 1e-3), scene, patience=0.4, retry=0.1)
+    rig.run(300, move().at)
+    rig.inject(kind, **parameters)
+    rig.run(60, move().at)
+    assert rig.status.state == State.HOLDING
+    rig.run(600, move().at)
+    assert (rig.status.state, rig.status.error) == (State.ERROR, error)
+
+
+def test_a_list_of_another_length_is_refused_with_both_numbers(tmp_path: Path) -> None:
+    robot = pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1)))
+    with pytest.raises(RobotError, match=r"robot.sensors.noise: 3 values; one for all joints, or one per joint: 2"):
+        build_cell(robot, config("puma560")[1], CLOCK_NS)

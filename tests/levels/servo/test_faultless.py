@@ -1,0 +1,48 @@
+"""Without a fault nothing is found: whole tasks with contacts and payloads, missed cycles, boards that start anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import State
+from rack.boards.config import load
+from rack.levels.level import Finding
+from tests.levels.whole_rack import WholeRack
+
+BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
+
+pytestmark = pytest.mark.timeout(300)  # half a minute of an arm's time each, on a machine that others use as well
+
+
+def run(rack: WholeRack, most_s: float, seed: int | None = None) -> list[tuple[int, Finding]]:
+    """Run to the end of the task; with a seed, cycles are missed and boards start anew at random."""
+    found: list[tuple[int, Finding]] = []
+    rng = np.random.default_rng(seed)
+    while rack.seconds < most_s and rack.task.state not in (State.DONE, State.ERROR):
+        for _ in range(100):
+            if seed is not None and rng.random() < 0.002:
+                rack.tasks["servo"].due += int(rng.choice([1, 2, 3, 5, 8, 20]))
+            if seed is not None and rng.random() < 0.0005:
+                rack.restart(str(rng.choice(["servo", "servo.planner", "world", "task.planner"])))
+            rack.step()
+            servo = rack.tasks["servo"].level
+            found += [(rack.tick - 1, finding) for finding in servo.findings if finding.alarm not in BRAKES]
+            servo.findings.clear()
+    return found
+
+
+@pytest.mark.parametrize("name", ["nasrem", "crossing", "k1607"])
+def test_a_whole_task_finds_nothing_and_breaks_no_limit(name: str) -> None:
+    rack = WholeRack(name, motion=load(name).scene.motion)
+    assert run(rack, 60.0) == []
+    assert rack.task.state == State.DONE
+    assert (rack.read("servo.status").violations, rack.read("servo.status").touches) == (0, 0)
+
+
+@pytest.mark.parametrize(("name", "seed"), [("nasrem", 1), ("k1607", 2)])
+def test_missed_cycles_and_restarted_boards_are_not_faults_of_the_arm(name: str, seed: int) -> None:
+    rack = WholeRack(name, motion=load(name).scene.motion)
+    assert run(rack, 15.0, seed) == []
+    assert rack.read("servo.status").violations == 0

@@ -1,0 +1,150 @@
+"""The servo level under an operator: it holds, goes to set points within its limits, and comes back the way it went."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.words import Demand
+from rack.levels.operator import Answer, Operation
+from tests.levels.arms import cell, config
+from tests.levels.lockstep import Operator
+from tests.levels.servo.rig import TICK_S, Course, ServoRig
+
+Array = NDArray[np.float64]
+HOME = cell("puma560").home
+LIMITS = cell("puma560").limits
+AWAY = HOME + np.array([0.3, -0.2, 0.2, 0.1, -0.2, 0.3])
+COURSE = Course(HOME, HOME + 0.5 * np.array([1.0, -0.4, 0.4, 0.5, 0.5, 1.0]), 2.0)
+SECOND = round(1.0 / TICK_S)
+
+
+@pytest.fixture
+def rig() -> ServoRig:
+    return ServoRig(*config("puma560"))
+
+
+def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None:
+    rig.run(SECOND, COURSE.at)
+    assert np.abs(rig.status.target_velocity).max() > 0.1
+    serial = Operator(rig.rack).say("servo", Operation.HOLD)
+    rig.run(1, COURSE.at)
+    assert (rig.status.order, rig.status.operator, rig.status.answer) == (serial, serial, Answer.TAKEN)
+    rig.run(2 * SECOND, COURSE.at)
+    held = rig.status.position.copy()
+    rig.run(SECOND, COURSE.at)
+    assert (rig.status.answer, rig.status.standing) == (Answer.DONE, Operation.HOLD)
+    assert (rig.status.holding, rig.status.stopped, rig.status.braked) == (1, 1, 0)
+    assert np.abs(rig.status.position - held).max() < 1e-4
+
+
+def test_a_hold_brakes_no_joint_harder_than_planned_motion(rig: ServoRig) -> None:
+    rig.run(SECOND, COURSE.at)
+    Operator(rig.rack).say("servo", Operation.HOLD)
+    rig.run(SECOND, COURSE.at)
+    assert_within_limits(np.array(rig.targets[SECOND:]))
+
+
+def test_after_a_hold_set_points_are_followed_again(rig: ServoRig) -> None:
+    operator = Operator(rig.rack)
+    rig.run(SECOND, COURSE.at)
+    operator.say("servo", Operation.HOLD)
+    rig.run(SECOND // 2, COURSE.at)
+    serial = operator.say("servo", Operation.RESUME)
+    rig.run(3 * SECOND, COURSE.at)
+    assert (rig.status.order, rig.status.answer, rig.status.standing) == (serial, Answer.DONE, Operation.NONE)
+    assert (rig.status.holding, rig.status.stopped) == (0, 0)
+    assert np.abs(rig.status.position - COURSE.goal).max() < 1e-3
+
+
+def test_a_set_point_is_reached_within_the_limits_of_every_joint(rig: ServoRig) -> None:
+    rig.run(SECOND // 2)
+    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
+    rig.run(1)
+    assert rig.status.answer == Answer.TAKEN
+    rig.run(3 * SECOND)
+    assert rig.status.answer == Answer.DONE
+    assert np.array_equal(rig.status.target, AWAY)
+    assert np.abs(rig.status.position - AWAY).max() < 1e-3
+    assert_within_limits(np.array(rig.targets))
+
+
+def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
+    rig.run(SECOND, COURSE.at)
+    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
+    rig.run(3 * SECOND, COURSE.at)
+    assert np.abs(rig.status.position - AWAY).max() < 1e-3
+    assert_within_limits(np.array(rig.targets[SECOND:]))
+
+
+def test_from_its_set_points_the_arm_returns_the_same_way(rig: ServoRig) -> None:
+    operator = Operator(rig.rack)
+    rig.run(SECOND // 2)
+    second = AWAY + 0.1
+    for goal in (AWAY, second):
+        operator.say("servo", Operation.SETPOINT, goal)
+        rig.run(2 * SECOND)
+    operator.say("servo", Operation.RESUME)
+    rig.run(1)
+    assert (rig.status.answer, rig.status.standing, rig.status.stopped) == (Answer.TAKEN, Operation.NONE, 1)
+    began = len(rig.targets)
+    rig.run(3 * SECOND)
+    assert (rig.status.answer, rig.status.stopped) == (Answer.DONE, 0)
+    assert np.abs(rig.status.target - HOME).max() < 1e-6
+    assert min(np.abs(target - AWAY).max() for target in rig.targets[began:]) < 1e-9
+
+
+def test_a_hold_on_the_way_to_a_set_point_stops_there(rig: ServoRig) -> None:
+    operator = Operator(rig.rack)
+    rig.run(SECOND // 2)
+    operator.say("servo", Operation.SETPOINT, AWAY)
+    rig.run(SECOND // 4)
+    operator.say("servo", Operation.HOLD)
+    rig.run(SECOND)
+    assert rig.status.answer == Answer.DONE
+    assert 0.01 < np.abs(rig.status.target - HOME).max() < np.abs(AWAY - HOME).max() - 0.01
+    assert_within_limits(np.array(rig.targets))
+
+
+def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force(rig: ServoRig) -> None:
+    operator = Operator(rig.rack)
+    operator.say("servo", Operation.HOLD)
+    rig.run(SECOND // 2, COURSE.at)
+    beyond = AWAY.copy()
+    beyond[1] = LIMITS.position[1, 1] + 0.001
+    operator.say("servo", Operation.SETPOINT, beyond)
+    rig.run(SECOND // 2, COURSE.at)
+    assert (rig.status.answer, rig.status.standing) == (Answer.REFUSED, Operation.HOLD)
+    assert rig.status.objection.startswith(f"joint '{config('puma560')[0].joints[1]}' at ")
+    assert np.abs(rig.status.position - HOME).max() < 1e-3
+
+
+def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
+    operator = Operator(rig.rack)
+    rig.run(SECOND // 2)
+    operator.say("servo", Operation.SETPOINT, AWAY)
+    rig.run(SECOND // 4)
+    rig.rack.stop(Demand.BRAKE, SECOND)
+    rig.run(SECOND)
+    assert (rig.status.braked, rig.status.standing) == (1, Operation.SETPOINT)
+    assert np.abs(rig.status.position - AWAY).max() > 0.01
+    rig.run(3 * SECOND)
+    assert np.abs(rig.status.position - AWAY).max() < 1e-3
+
+
+def test_a_restarted_board_continues_with_the_command_in_force(rig: ServoRig) -> None:
+    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
+    rig.run(2 * SECOND, COURSE.at)
+    rig.restart()
+    rig.run(SECOND, COURSE.at)
+    assert (rig.status.standing, rig.status.answer) == (Operation.SETPOINT, Answer.DONE)
+    assert np.abs(rig.status.position - AWAY).max() < 1e-3
+
+
+def assert_within_limits(targets: Array) -> None:
+    """Hold the reference, (ticks, joints), rad, against the limits of planned motion, by differences."""
+    velocity = np.diff(targets, axis=0) / TICK_S
+    acceleration = np.diff(velocity, axis=0) / TICK_S
+    assert (np.abs(velocity) <= LIMITS.velocity * 1.001).all()
+    assert (np.abs(acceleration[1:]) <= LIMITS.acceleration * 1.05).all()

@@ -1,0 +1,240 @@
+"""The servo level with faulty sensors: found in bounded cycles, braked, and resumed from where the arm stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.alarms import Alarm
+from tests.levels.arms import config
+from tests.levels.servo.rig import Course, ServoRig
+
+Array = NDArray[np.float64]
+
+BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
+GOAL = np.array([0.6, 1.0, -2.6, 0.4, -1.2, 0.5])
+KINDS = [
+    ("sensor-nan", {"joint": 0}, Alarm.SENSOR_RANGE, 0),
+    ("sensor-nan", {"joint": -1}, Alarm.SENSOR_RANGE, 0),
+    ("sensor-stuck", {"joint": 1}, Alarm.SENSOR_STUCK, 1),
+    ("sensor-stuck", {"joint": -1}, Alarm.SENSOR_STUCK, 1),
+    ("sensor-dropout", {}, Alarm.SENSOR_SILENT, 1),
+    ("sensor-bias", {"size": 0.02, "joint": 2}, Alarm.SENSOR_MODEL, 0),
+    ("sensor-bias", {"size": -0.003, "joint": 5}, Alarm.SENSOR_MODEL, 0),
+    ("sensor-bias", {"size": 3.0, "joint": 1}, Alarm.SENSOR_MODEL, 0),
+    ("sensor-noise", {"size": 0.005, "joint": 0}, Alarm.SENSOR_MODEL, 1),
+]
+
+
+def move() -> Course:
+    return Course(np.array(config("puma560")[0].home), GOAL, 2.0)
+
+
+def rig_under_way(**params: float | str) -> ServoRig:
+    rig = ServoRig(*config("puma560"), **params)
+    rig.run(400, move().at)
+    return rig
+
+
+@pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
+def test_sensor_fault_is_found_in_time_the_arm_braked_and_motion_resumed(
+    kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
+) -> None:
+    rig = rig_under_way()
+    begun = rig.inject(kind, **parameters)
+    rig.run(200, move().at)
+    first = rig.found[0]
+    assert alarm in rig.alarms()
+    assert first.tick - begun <= bound
+    assert (rig.status.stopped, rig.status.braked, rig.status.holding) == (1, 1, 1)
+    assert rig.status.reason.startswith("sensor")
+    assert "; latched at tick " in rig.status.reason
+    assert rig.alarms().count(alarm) == 1  # once, however long it lasts
+    rig.heal()
+    rig.run(40, move().at)
+    assert (rig.status.stopped, rig.status.braked, rig.status.reason) == (0, 0, "")
+    rig.run(800, lambda _: (GOAL, np.zeros(6)))
+    assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
+    assert (rig.status.violations, rig.status.touches) == (0, 0)
+    assert rig.alarms().count(alarm) == 1
+
+
+@pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
+def test_the_status_stays_near_the_truth_meanwhile(
+    kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
+) -> None:
+    rig = rig_under_way()
+    rig.inject(kind, **parameters)
+    for _ in range(300):
+        rig.run(1, move().at)
+        true = rig.servo.arm.sense()
+        assert rig.status.position == pytest.approx(true.position, abs=0.01)
+        assert np.isfinite(rig.status.velocity).all()
+    assert rig.status.target == pytest.approx(rig.status.position)
+
+
+def test_a_biased_sensor_is_not_trusted_until_the_bias_is_gone() -> None:
+    rig = rig_under_way()
+    rig.inject("sensor-bias", size=0.01, joint=1)
+    rig.run(1900, move().at)
+    assert rig.status.stopped == 1
+    rig.heal()
+    rig.run(21, move().at)
+    assert rig.status.stopped == 0
+
+
+def test_a_bias_is_seen_by_a_restarted_servo_as_well() -> None:
+    rig = rig_under_way()
+    rig.inject("sensor-bias", size=0.02, joint=1)
+    rig.run(5, move().at)
+    for _ in range(3):
+        rig.restart()
+        rig.run(100, move().at)
+        assert rig.status.stopped == 1
+    rig.heal()
+    rig.run(30, move().at)
+    assert rig.status.stopped == 0
+
+
+def test_a_bias_that_begins_while_the_servo_is_dead_is_found_when_it_is_back() -> None:
+    rig = rig_under_way()
+    rig.miss(10_000)
+    for _ in range(20):
+        rig.step()
+    rig.inject("sensor-bias", size=0.05, joint=1)
+    rig.restart()
+    rig.run(1, move().at)
+    assert Alarm.SENSOR_MODEL in rig.alarms()
+
+
+def test_a_sensor_stuck_at_rest_is_found_once_its_joint_is_to_move() -> None:
+    rig = ServoRig(*config("puma560"))
+    home = move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    rig.inject("sensor-stuck", joint=0)
+    rig.run(300, lambda _: (home, np.zeros(6)))
+    assert rig.alarms() == []
+    begun = rig.rack.tick
+    later = Course(home, GOAL, 2.0)
+    rig.run(100, lambda t: later.at(t - begun * 0.0025))
+    found = next(f for f in rig.found if f.finding.alarm not in BRAKES)
+    assert found.finding.alarm in (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL)
+    assert found.finding.subject == 0
+    assert all(found.tick - acted <= 20 for acted in rig.acted[:1])
+    rig.heal()
+    rig.run(60, lambda _: (home, np.zeros(6)))
+    rig.run(800, lambda _: (home, np.zeros(6)))
+    assert rig.status.position == pytest.approx(home, abs=1e-3)
+
+
+@pytest.mark.parametrize("speed", [2e-4, 2e-3, 2e-2])
+def test_a_stuck_sensor_is_found_before_its_joint_runs_away_however_slow_the_set_points_are(speed: float) -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(60, lambda _: (home, np.zeros(6)))
+    begun, slow = rig.inject("sensor-stuck", joint=-1), np.full(6, speed)
+    rig.run(200, lambda t: (home + slow * (t - begun * 0.0025), slow))
+    # A joint that does not seem to start may as well have a motor at fault.
+    assert rig.alarms()[0] in (Alarm.SENSOR_STUCK, Alarm.ACTUATOR)
+    assert rig.servo.arm.sense().position == pytest.approx(home, abs=2e-3)
+
+
+def test_a_joint_that_crept_while_its_sensor_was_stuck_is_trusted_again_where_it_is() -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    rig.inject("sensor-stuck", joint=3)
+    begun, crept = rig.rack.tick, home + np.array([0.0, 0.0, 0.0, 4e-5, 0.0, 0.0])
+    rig.run(200, lambda t: Course(home, crept, 0.5).at(t - begun * 0.0025))
+    assert rig.alarms() == []
+    rig.heal()
+    rig.run(40, lambda _: (crept, np.zeros(6)))
+    assert rig.alarms(*BRAKES) == [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED]
+    assert rig.status.reason == ""
+    assert rig.status.position == pytest.approx(rig.servo.arm.sense().position, abs=1e-6)
+
+
+def test_noise_on_a_joint_that_was_in_doubt_is_not_taken_for_where_it_is() -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    rig.inject("sensor-nan", joint=0)
+    rig.run(40, lambda _: (home, np.zeros(6)))
+    rig.heal()
+    rig.run(40, lambda _: (home, np.zeros(6)))
+    assert rig.status.stopped == 0
+    rig.inject("sensor-noise", size=0.01, joint=5)
+    for _ in range(100):
+        rig.run(1, lambda _: (home, np.zeros(6)))
+        assert rig.status.position == pytest.approx(home, abs=1e-3)
+    assert rig.alarms(*BRAKES)[-1] is Alarm.SENSOR_MODEL
+    rig.heal()
+    rig.run(40, lambda _: (home, np.zeros(6)))
+    assert rig.status.stopped == 0
+
+
+def test_a_bias_at_rest_is_not_accepted_because_another_sensor_was_faulty_before() -> None:
+    rig, home = ServoRig(*config("puma560")), move().start
+    rig.run(200, lambda _: (home, np.zeros(6)))
+    for joint in (0, 4):
+        rig.inject("sensor-nan" if joint == 0 else "sensor-bias", joint=joint, **({"size": 0.03} if joint else {}))
+        rig.run(60, lambda _: (home, np.zeros(6)))
+        assert rig.status.stopped == 1
+        rig.heal()
+        rig.run(40, lambda _: (home, np.zeros(6)))
+        assert rig.status.stopped == 0
+    assert Alarm.RE_REFERENCED not in rig.alarms()
+
+
+def test_an_offset_too_small_to_matter_is_accepted_at_rest() -> None:
+    rig, slow = ServoRig(*config("puma560")), Course(move().start, GOAL, 30.0)
+    rig.run(400, slow.at)
+    rig.inject("sensor-bias", size=3e-4, joint=0)
+    rig.run(100, slow.at)
+    assert (rig.alarms(*BRAKES), rig.status.stopped) == ([Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED], 0)
+    rig.heal()
+    rig.run(100, slow.at)
+    assert (rig.alarms(*BRAKES), rig.status.stopped) == ([Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED] * 2, 0)
+
+
+def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:
+    rig = rig_under_way()
+    torque = rig.status.torque.copy()
+    rig.inject("sensor-dropout")
+    rig.run(1, move().at)
+    rig.heal()
+    assert (rig.status.stopped, rig.status.braked) == (0, 0)
+    assert rig.status.torque == pytest.approx(torque, rel=0.1)
+    rig.run(500, move().at)
+    assert rig.alarms() == []
+    assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
+
+
+@pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
+def test_with_known_velocities_the_arm_may_ramp_to_rest_instead(reaction: str, braked: int) -> None:
+    rig = rig_under_way(on_sensor_fault=reaction)
+    rig.inject("sensor-nan", joint=0)
+    rig.run(1, move().at)
+    assert (rig.status.stopped, rig.status.braked) == (1, 0)
+    rig.run(300, move().at)
+    assert (rig.status.stopped, rig.status.braked) == (1, braked)
+    assert np.abs(rig.servo.arm.sense().velocity).max() < 1e-3
+    rig.heal()
+    rig.run(800, lambda _: (GOAL, np.zeros(6)))
+    assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
+
+
+def delay(kind: str, size: float, cycles: int = 200) -> int | None:
+    """Return the cycles from a fault of this size until it is found; None: it is not in `cycles`."""
+    rig = rig_under_way()
+    begun = rig.inject(kind, size=size, joint=1)
+    rig.run(cycles, move().at)
+    found = [f.tick - begun for f in rig.found if f.finding.alarm is Alarm.SENSOR_MODEL]
+    return found[0] if found else None
+
+
+def test_the_greater_a_fault_the_sooner_it_is_found() -> None:
+    assert [delay("sensor-bias", size) for size in (1e-5, 2e-4, 3e-2)] == [None, 0, 0]
+    noise = [delay("sensor-noise", size) for size in (1e-6, 3e-5, 1e-3)]
+    assert noise[0] is None
+    assert noise[2] is not None
+    assert noise[2] <= 1
+    assert noise[1] is None or noise[1] >= noise[2]

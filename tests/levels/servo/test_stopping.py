@@ -1,0 +1,192 @@
+"""The servo level stops on a demand and when something hits the arm: a collision, named by geoms, is nobody's fault."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.alarms import Alarm
+from rack.backplane.message import State
+from rack.levels.level import Demand
+from rack.levels.messages import Error
+from rack.levels.tables import MotionConfig
+from tests.levels.arms import config
+from tests.levels.servo.rig import TICK_S, Course, ServoRig
+
+Array = NDArray[np.float64]
+
+BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
+ROBOT, SCENE = config("puma560_crossing")
+HOME = np.array(ROBOT.home)
+FOREARM, HAND = (0.35, 1.3), (0.5, 1.1)
+"""x and z, m, at which the post meets them on its way in y."""
+
+
+def turn(time_s: float) -> tuple[Array, Array]:
+    """Turn about the base, back and forth."""
+    base = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return HOME + 0.6 * base * (1.0 - np.cos(2.0 * time_s)), 1.2 * base * np.sin(2.0 * time_s)
+
+
+def stand(_: float) -> tuple[Array, Array]:
+    """Stay at home."""
+    return HOME, np.zeros(6)
+
+
+def under_fire(at: tuple[float, float], end_y: float, speed: float) -> ServoRig:
+    """Return an arm towards which the post comes, from second 0.4 on."""
+    (x, z), begin_y = at, 0.85
+    motion = (
+        MotionConfig(body="post", at=0.0, to=(x, begin_y, z), speed=50.0),
+        MotionConfig(body="post", at=0.4, to=(x, end_y, z), speed=speed),
+    )
+    return ServoRig(ROBOT, SCENE.model_copy(update={"motion": motion}), patience=1.0)
+
+
+@pytest.mark.parametrize("motion", [stand, turn])
+@pytest.mark.parametrize("at", [FOREARM, HAND])
+def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_broken_limit(
+    at: tuple[float, float], motion: type
+) -> None:
+    rig = under_fire(at, -0.85, 4.0)
+    rig.run(300, motion)
+    (found,) = (f for f in rig.found if f.finding.alarm not in BRAKES)
+    assert found.finding.alarm is Alarm.COLLISION
+    names = {rig.servo.arm._model.geom(int(g)).name for g in found.finding[1:]}  # type: ignore[attr-defined]
+    assert "post" in names
+    assert (rig.status.state, rig.status.braked) == (State.HOLDING, 1)
+    assert "'post'" in rig.status.reason
+    assert rig.status.violations == 0
+    assert rig.status.pushed > 0
+    rig.run(400, motion)
+    assert (rig.status.stopped, rig.status.braked, rig.status.state) == (0, 0, State.EXECUTING)
+    assert [f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES] == [Alarm.COLLISION]
+
+
+def test_a_lasting_contact_is_latched_with_the_names_of_both_geoms() -> None:
+    rig = under_fire(HAND, 0.2, 4.0)
+    rig.run(1200, turn)
+    assert (rig.status.state, rig.status.error, rig.status.braked) == (State.ERROR, Error.TOUCHED, 1)
+    assert rig.status.reason.startswith("unintended contact: '")
+    assert "'post'" in rig.status.reason
+    assert {f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES} == {Alarm.COLLISION, Alarm.LATCHED}
+
+
+def test_a_limit_that_the_arm_itself_breaks_is_a_violation_with_or_without_a_blow() -> None:
+    rig = under_fire(FOREARM, -0.85, 4.0)
+    rig.run(200, stand)
+    arm = rig.servo.arm
+    arm._data.qvel[arm.cell.dof[1]] = 3.0
+    rig.run(1, stand)
+    assert rig.status.violations > 0
+    assert rig.status.pushed == 0
+    assert rig.status.error == Error.LIMIT
+
+
+GOAL = np.array([0.6, 1.0, -2.6, 0.4, -1.2, 0.5])
+
+
+def rig_under_way() -> tuple[ServoRig, Course]:
+    rig, move = ServoRig(*config("puma560")), Course(np.array(config("puma560")[0].home), GOAL, 2.0)
+    rig.run(400, move.at)
+    return rig, move
+
+
+def test_a_brake_demand_engages_the_brakes_in_its_own_cycle() -> None:
+    rig, move = rig_under_way()
+    rig.rack.demand = Demand.BRAKE
+    rig.run(1, move.at)
+    status = rig.status
+    assert (status.stopped, status.braked, status.holding, status.demand) == (1, 1, 1, Demand.BRAKE)
+    assert status.reason == "demand 'brake' on the arm, until boards and emergency stop are in order"
+    assert not status.torque.any()
+    rig.run(200, move.at)
+    assert np.abs(rig.status.velocity).max() < 1e-3
+    assert rig.alarms() == [Alarm.BRAKES_CLOSED]
+
+
+def test_stop_ramps_to_rest_within_the_acceleration_limits_and_then_brakes() -> None:
+    rig, move = rig_under_way()
+    limits = np.array(config("puma560")[0].acceleration)
+    rig.rack.demand = Demand.STOP
+    rig.run(1, move.at)
+    assert (rig.status.stopped, rig.status.braked) == (1, 0)
+    begin = len(rig.targets) - 2
+    while not rig.status.braked:
+        rig.run(1, move.at)
+        assert rig.rack.tick < 700
+    ramp = np.diff(np.array(rig.targets[begin:-1]), n=2, axis=0) / TICK_S**2
+    assert (np.abs(ramp) <= limits * 1.01).all()
+    assert np.abs(rig.status.velocity).max() < 0.02
+    assert rig.alarms() == [Alarm.BRAKES_CLOSED]
+    rig.rack.demand = Demand.BRAKE
+    rig.run(10, move.at)
+    rig.rack.demand = Demand.STOP
+    rig.run(10, move.at)
+    assert rig.status.braked == 1  # what has come to rest stays braked
+
+
+@pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
+@pytest.mark.parametrize("ticks", [1, 30, 300])
+def test_afterwards_motion_starts_where_the_arm_stands_and_joins_the_set_points(demand: Demand, ticks: int) -> None:
+    rig, move = rig_under_way()
+    limits = np.array(config("puma560")[0].acceleration)
+    rig.rack.demand = demand
+    rig.run(ticks, move.at)
+    rig.rack.demand = Demand.NONE
+    before = rig.status.position.copy()
+    rig.run(1)
+    assert (rig.status.stopped, rig.status.braked, rig.status.demand) == (0, 0, Demand.NONE)
+    assert np.abs(rig.status.target - before).max() < 0.01
+    begin = len(rig.targets)
+    rig.run(-rig.rack.tick % 8)
+    rig.run(1200, move.at)
+    steps = np.diff(np.array(rig.targets[begin:]), n=2, axis=0) / TICK_S**2
+    assert (np.abs(steps) <= 2.2 * limits).all()
+    assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
+    assert rig.status.violations == 0
+    assert set(rig.alarms()) <= {Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED}
+
+
+def test_an_arm_braked_from_the_start_stays_where_it_is_without_an_alarm() -> None:
+    rig = ServoRig(*config("puma560"))
+    rig.rack.demand = Demand.BRAKE
+    rig.run(100, lambda _: (GOAL, np.zeros(6)))
+    assert (rig.status.braked, rig.found) == (1, [])
+    assert rig.status.position == pytest.approx(config("puma560")[0].home, abs=1e-3)
+
+
+@pytest.mark.parametrize(("missed", "told"), [(1, None), (2, 2), (40, 40)])
+def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(missed: int, told: int | None) -> None:
+    rig, move = rig_under_way()
+    rig.miss(missed)
+    rig.run(100, move.at)
+    values = [(f.finding.alarm, f.finding.value) for f in rig.found]
+    assert values[:1] == ([] if told is None else [(Alarm.BRAKES_CLOSED, told)])
+    assert rig.status.stopped == 0
+
+
+def test_a_restarted_servo_reports_how_long_the_arm_was_without_torque() -> None:
+    rig, move = rig_under_way()
+    rig.miss(10_000)
+    for _ in range(50):
+        rig.step()
+    rig.restart()
+    rig.run(1, move.at)
+    assert next((f.finding.alarm, f.finding.value) for f in rig.found) == (Alarm.BRAKES_CLOSED, 50)
+    assert rig.status.stopped == 0
+
+
+def test_a_servo_that_dies_while_the_arm_is_braked_finds_it_braked() -> None:
+    rig, move = rig_under_way()
+    rig.rack.demand = Demand.BRAKE
+    rig.run(200, move.at)
+    rest = rig.status.position.copy()
+    rig.miss(10_000)
+    for _ in range(3):
+        rig.step()
+    rig.restart()
+    rig.run(100, move.at)
+    assert rig.status.braked == 1
+    assert rig.servo.arm.sense().position == pytest.approx(rest, abs=1e-4)
