@@ -112,7 +112,8 @@ class FaultRules:
     def mistakes(self) -> Iterator[Mistake]:
         """Yield everything wrong with the fault."""
         yield from self._once_each()
-        tasks, fault = self._tasks(), self.fault
+        fault = self.fault
+        tasks: dict[str, Role] = {place.name: place.role for place in self.config.tasks()}
         # The levels' modules may add kinds.
         driving = self._driving()
         kind = KINDS.names.get(fault.kind)
@@ -200,14 +201,6 @@ class FaultRules:
             if wanted not in locked if wanted is not None else not locked:
                 why = f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' with it: {_listed(locked)}"
                 yield self._mistake("mailbox", why)
-
-    def _tasks(self) -> dict[str, Role]:
-        tasks: dict[str, Role] = {}
-        for name, board in self.config.board.items():
-            tasks[name] = "executor"
-            if board.planner is not None:
-                tasks[f"{name}.planner"] = "planner"
-        return tasks
 
     def _driving(self) -> dict[str, Steps]:
         """Return the classes of steps that can strike what each board's executor drives."""
