@@ -1,4 +1,4 @@
-"""`rack analyze`: what a run says of the timing model."""
+"""`rack analyze`: a run compared with the timing model."""
 
 from __future__ import annotations
 
@@ -9,8 +9,14 @@ from typing import Annotated
 
 import typer
 
+from rack.tools.analysis.analysis import Analysis
+from rack.tools.analysis.document import document
+from rack.tools.analysis.tables import text
 from rack.tools.answer import Json, print_json
+from rack.tools.live_table import print_wrapped, terminal_width
 from rack.tools.report import RunFolder
+from rack.tools.runs.recording import Recording, reading_progress
+from rack.tools.timing.operator_response import show
 
 Percentile = Annotated[
     float,
@@ -18,14 +24,12 @@ Percentile = Annotated[
         metavar="P",
         min=1.0,
         max=100.0,
-        help="judge the longest of P in 100 cycles, as 99.9; 100: of all, as eq. 3.6 has it",
+        help="judge the longest of P in 100 cycles, as in 99.9; 100: the longest of all, as in eq. 3.6",
     ),
 ]
-Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder for what is written; default: the run's own")]
-
-
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder for the results; default: the run's own")]
 OnlyResponse = Annotated[
-    bool, typer.Option("--response", help="instead: the response to an operator's commands, beside its bounds")
+    bool, typer.Option("--response", help="instead: the response to an operator's commands, with its bounds")
 ]
 
 
@@ -36,33 +40,25 @@ def analyze(
     out: Out = None,
     as_json: Json = False,
 ) -> None:
-    """Say of a run what `rack check` says of a config: every equation of the timing model, predicted beside measured.
+    """Compare a run with the timing model: every equation that `rack check` predicts, with its measurement.
 
-    Times of levels are processor time: neither waiting nor being preempted counts. A virtual machine that its host
-    stalls counts that as processor time too; --percentile 99 leaves out what happens less than once in 100 cycles.
-    Tells which cycle broke which equation, and who had its core meanwhile. Writes analysis.json, residuals.png and
-    residuals.svg. The exit status is 0 when every equation held, 1 when one did not.
+    Times of levels are processor time: they exclude waiting and preemption. A virtual machine stalled by its host
+    counts the stall as processor time; --percentile 99 leaves out whatever happens less than once in 100 cycles.
+    Lists the cycles that broke an equation, and the tasks that had their core meanwhile. Writes analysis.json,
+    residuals.png and residuals.svg. Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
     """
-    from rack.tools.analysis.analysis import Analysis
-    from rack.tools.analysis.document import document
-    from rack.tools.analysis.plot import plot
-    from rack.tools.analysis.text import text
-    from rack.tools.charting.progress import part_for
-    from rack.tools.live_table import print_wrapped, terminal_width
-    from rack.tools.recording import Recording
+    from rack.tools.analysis.residuals import plot  # matplotlib takes a second to import
 
+    folder = run if out is None else out
     if response:
-        from rack.tools.timing.operator_response import show
-
-        sys.exit(0 if show(Recording(run), run if out is None else out, as_json) else 1)
-    with part_for(silent=as_json) as told:
-        analysis = Analysis.of(Recording(run), percentile, told)
-        folder = run if out is None else out
-        folder.mkdir(parents=True, exist_ok=True)
-        found = document(analysis)
-        told(0.9)
-        (folder / "analysis.json").write_text(json.dumps(found, indent=2) + "\n")
-        plot(analysis, folder / "residuals")
+        sys.exit(0 if show(Recording(run), folder, as_json) else 1)
+    progress = reading_progress(silent=as_json)
+    analysis = Analysis.of(Recording(run), percentile, progress)
+    found = document(analysis)
+    progress(0.9)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "analysis.json").write_text(json.dumps(found, indent=2) + "\n")
+    plot(analysis, folder / "residuals")
     if as_json:
         print_json(found)
     else:

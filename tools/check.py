@@ -95,8 +95,8 @@ def check(
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     """Return a config with the budgets measured in a run. Raises `Failure` for a run of another rack."""
     # Only --from needs them, and they take long to load.
-    from rack.tools.analysis.measured_budgets import measured_budgets
-    from rack.tools.recording import Recording
+    from rack.tools.runs.cycles import measured_budgets
+    from rack.tools.runs.recording import Recording
 
     recording = Recording(run)
     ran, asked = sorted({task.board for task in recording.layout.tasks}), sorted(config.board)

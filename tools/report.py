@@ -1,4 +1,4 @@
-"""`rack report`: the report of a run, from its recording."""
+"""`rack report`: report on a run, from its recording."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Annotated, Any
 
 import typer
 
+from rack.tools.analysis.report import write_report
+from rack.tools.analysis.report_markdown import show
 from rack.tools.answer import Json, print_json
+from rack.tools.live_table import console
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
-
 
 Against = Annotated[
     Path | None, typer.Option(metavar="RUN", help="another run: find the first tick at which the two diverge")
@@ -23,25 +25,20 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
 
     Writes report.json and report.md again. On a terminal the tables show as many columns as fit; report.md has all.
 
-    Exit status: 0 a report was made; 1 with --against the runs diverge before any miss; 2 the folder holds no run.
+    Exit status: 0 the report was written; 1 with --against: the runs diverge before any miss; 2 not a run.
 
     \b
     Examples:
       rack report runs/nasrem-20250101-120000
       rack report runs/a --against runs/b
     """
-    from rack.tools.reporting.report import write_report
-
     data, text = write_report(run, against)
     print_report(data, text, as_json)
     sys.exit(0 if against is None or data["against"]["explained"] else 1)
 
 
 def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print a report: one JSON document; on a terminal as much as fits; elsewhere `text`, as for a run not recorded."""
-    from rack.tools.live_table import console
-    from rack.tools.reporting.markdown import show
-
+    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no recording, `text`."""
     if as_json:
         print_json(data)
     elif (terminal := console()).is_terminal and data["folder"] is not None:

@@ -59,7 +59,6 @@ def run(
       rack run nasrem
       rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
     """
-    import rack.tools.reporting.report  # noqa: F401  now, and not when somebody waits for the end
     from rack.boards.config import load
     from rack.tools.display import display_for
     from rack.tools.folders import folder_of
@@ -86,7 +85,7 @@ def run(
 
 def _report(config: RackConfig, folder: Path | None, result: RunResult) -> tuple[dict[str, Any], str]:
     """Make the report; a recording that cannot be read spoils no run."""
-    from rack.tools.reporting.report import unrecorded, write_report
+    from rack.tools.analysis.report import unrecorded, write_report
 
     try:
         if folder is not None:

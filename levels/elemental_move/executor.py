@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message, MessageType, State
-from rack.levels.elemental_move.params import ElementalMoveParams
-from rack.levels.elemental_move.plans import PlansAtHand, joins
-from rack.levels.elemental_move.segments import SegmentWindow
+from rack.backplane.message import Message, State
+from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlansAtHand, SegmentWindow, joins
 from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
 from rack.levels.messages import (
     MOVE_COMMAND,
@@ -22,18 +19,18 @@ from rack.levels.messages import (
     SegmentKind,
     Verb,
 )
-from rack.levels.operator import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Commands, Operation, Orders
+from rack.levels.operator import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Operation, Orders
 from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
     """Hands segments down as soon as their plans are there, and asks for another path where the arm is blocked.
 
-    It reads back what it wrote itself, so that it goes on where it was when its board has been restarted. While the
-    board above is lost, it says hold, or an operator does, the arm is held on its path.
+    It reads its own last messages, so that it continues where it was when its board is restarted. The arm is held on
+    its path while the board above is lost, and on `hold` from above or from an operator.
     """
 
-    inputs: ClassVar[Mapping[str, Input]] = {
+    inputs = {
         "command": Input(TASK_COMMAND, "above.command"),
         "status": Input(PRIMITIVE_STATUS, "below.status"),
         "plan": Input(MOVE_PLAN, "own.plan"),
@@ -41,9 +38,9 @@ class ElementalMoveExecutor(Executor):
         "last_status": Input(MOVE_STATUS, "own.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    # The status first: killed between the two, the board finds a window whose done moves it only takes out again.
-    outputs: ClassVar[Mapping[str, MessageType]] = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
-    commands: ClassVar[Commands] = {Operation.HOLD: (), Operation.RESUME: ()}
+    # The status first: a board killed between the two finds a window whose done moves it only removes again.
+    outputs = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = ElementalMoveParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -53,38 +50,39 @@ class ElementalMoveExecutor(Executor):
         self._plans = PlansAtHand()
         self._orders = Orders(self.commands)
         self._started = False
-        self._done = 0
-        self._handed_down = 0
-        self._request = 0
-        self._replans = 0
-        self._replans_of_move = 0
-        self._waiting_since: int | None = None
+        self._done = 0  # newest move done
+        self._handed_down = 0  # newest move handed down
+        self._request = 0  # open request for another path; 0: none
+        self._replans = 0  # other paths taken, by all moves
+        self._replans_of_move = 0  # and by the present one
+        self._waiting_since: int | None = None  # tick of the first refusal of the path that is awaited
         self._error = Error.NONE
         self._reason = ""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take up what came from above, below and the planner; keep the window of segments full."""
+        """Read command, status and plan; keep the window of segments full."""
         segments = SegmentWindow(write.command)
         if not self._started:
-            self._go_on(read, write, segments)
-        status = read.status.value
+            self._recall(read, write, segments)
+        command, status = read.command, read.status.value
         self._orders.take(read.operator)
         self._plans.take(read.plan, self._done, self._handed_down, write.status.end)
-        self._take_window(read.command.value, status, segments)
+        self._take_window(command.value, status, segments)
         if not self._error:
             self._take_done(status, segments)
-            self._watch(status, segments)
+            self._check_below(status, segments)
         if not self._error:
-            self._mind_the_way(status, segments, tick)
-            self._fill(read.command.value, segments, tick)
+            self._replan_if_blocked(status, segments, tick)
+            self._fill(command.value, segments, tick)
         if self._error:
             segments.clear()
-        write.command.hold = self._request > 0 or self._error > 0 or read.command.is_lost or self._is_told_to(read)
+        held = command.is_lost or bool(command.value.hold) or self._orders.standing is Operation.HOLD
+        write.command.hold = self._request > 0 or self._error > 0 or held
         self._report(read, segments, write.status)
         self._answer(read, write)
 
-    def _go_on(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
-        """Go on from the last command and status in the mailboxes; plans that were at hand are lost."""
+    def _recall(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
+        """Continue from the last command and status in the mailboxes; plans that were at hand are lost."""
         self._started = True
         write.status.end = read.status.value.position
         if read.last_command.is_there and read.last_status.is_there:
@@ -101,7 +99,7 @@ class ElementalMoveExecutor(Executor):
                 write.status.end = end
 
     def _take_window(self, command: Message, status: Message, segments: SegmentWindow) -> None:
-        """Start anew on a window that does not go on where the last one stood, once the arm rests."""
+        """Start anew, once the arm rests, on a window that does not continue the last one."""
         first = int(command.moves["id"][0]) if command.count else 0
         if first <= self._handed_down + 1:
             return
@@ -117,18 +115,22 @@ class ElementalMoveExecutor(Executor):
             self._done, self._replans_of_move = int(taken["move"]), 0
             gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
             if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
-                self._fail(Error.GRASP_MISSED, f"the gripper is shut to {status.opening * 1e3:.1f} mm, without object")
+                self._fail(
+                    Error.GRASP_MISSED, f"the gripper has closed to {status.opening * 1e3:.1f} mm: it holds nothing"
+                )
 
-    def _watch(self, status: Message, segments: SegmentWindow) -> None:
-        """Fail with the level below, and when what was held is gone."""
+    def _check_below(self, status: Message, segments: SegmentWindow) -> None:
+        """Fail with the level below, and when the held object is gone."""
         if status.state == State.ERROR:
             self._fail(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
         if moving and status.held >= 0 and self._is_shut(status):
-            self._fail(Error.OBJECT_LOST, f"the gripper is shut to {status.opening * 1e3:.1f} mm: what it held is gone")
+            self._fail(
+                Error.OBJECT_LOST, f"the gripper has closed to {status.opening * 1e3:.1f} mm: the object is lost"
+            )
 
-    def _mind_the_way(self, status: Message, segments: SegmentWindow, tick: int) -> None:
-        """Where the arm rests because something is in its way, ask for another path; drop that when the way is free."""
+    def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
+        """Ask for another path where the arm rests because something is in its way; cancel when the way is free."""
         blocked = bool(
             segments.count
             and status.blocked
@@ -141,28 +143,29 @@ class ElementalMoveExecutor(Executor):
         elif not self._request and self._replans_of_move >= self._params.replans:
             self._fail(Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}")
         elif not self._request:
-            # The cycle's number: no request of an earlier life of this board has the same.
-            self._request = tick // self.context.every
-        elif (plan := self._plans.anew(self._request)) is not None:
-            if not (plan.error or joins(plan, status.position)):
-                # The arm has been moved meanwhile.
-                self._request = tick // self.context.every
-                return
+            self._open_request(tick)
+        elif (plan := self._plans.answer(self._request)) is not None:
             if plan.error:
                 self._wait(plan, tick)
-                return
-            segments.replace_first(plan)
-            self._handed_down = int(plan.move)
-            self._close_request()
-            self._replans += 1
-            self._replans_of_move += 1
+            elif not joins(plan, status.position):  # the arm has been moved meanwhile
+                self._open_request(tick)
+            else:
+                segments.replace_first(plan)
+                self._handed_down = int(plan.move)
+                self._close_request()
+                self._replans += 1
+                self._replans_of_move += 1
+
+    def _open_request(self, tick: int) -> None:
+        # The number of the cycle: no request made before a restart has the same.
+        self._request = tick // self.context.every
 
     def _close_request(self) -> None:
         if self._request:
             self._request, self._waiting_since, self._reason = 0, None, ""
 
     def _fill(self, command: Message, segments: SegmentWindow, tick: int) -> None:
-        """Hand down the moves behind the last one, as far as their plans are there and the window has room."""
+        """Hand down the moves after the last one, as far as their plans are there and the window has room."""
         while not (self._request or self._error or segments.is_full):
             at = np.flatnonzero(command.moves["id"][: command.count] == self._handed_down + 1)
             if not at.size or not self._hand_down(command.moves[at[0]], segments, tick):
@@ -193,7 +196,7 @@ class ElementalMoveExecutor(Executor):
         return True
 
     def _wait(self, refusal: Message, tick: int) -> None:
-        """Wait for a free path as long as patience lasts; nothing else that was refused gets better by waiting."""
+        """Wait for a free path as long as patience lasts; waiting does not help against any other refusal."""
         if self._waiting_since is None:
             self._waiting_since = tick
         self._reason = refusal.reason
@@ -202,10 +205,10 @@ class ElementalMoveExecutor(Executor):
             self._fail(Error(refusal.error), refusal.reason)
 
     def _time_below(self, by_s: float) -> float:
-        """Return the time by which the level below must be done so that this level has said so at `by_s`."""
+        """Return the time by which the level below must be done for this level to report it by `by_s`."""
         if by_s <= 0.0:
             return 0.0
-        # A status from below waits up to a cycle to be read, and what is written then shows a cycle later.
+        # A status from below waits up to a cycle to be read, and this level's takes another to be seen.
         return by_s - 2.0 * self.context.period_s - self._params.answer
 
     def _is_shut(self, status: Message) -> bool:
@@ -218,18 +221,20 @@ class ElementalMoveExecutor(Executor):
             self._request = 0
 
     def _report(self, read: Ports, segments: SegmentWindow, report: Message) -> None:
-        command, status = read.command, read.status.value
-        report.echo = command.value.id
-        report.state = self._state(command.value)
-        kept_from = self._kept_from(command, read.status) if report.state == State.EXECUTING else ""
-        if kept_from:
+        command, status = read.command.value, read.status.value
+        report.echo = command.id
+        report.state = self._state(command)
+        waits = self._reason_to_wait(read.command, read.status) if report.state == State.EXECUTING else ""
+        if waits:
             report.state = State.HOLDING
-        report.error, report.reason = self._error, self._reason if self._error else kept_from
+        report.error, report.reason = self._error, self._reason if self._error else waits
         report.operated = status.operated or self._orders.standing is not Operation.NONE
-        self._report_work(command.value, status, segments, report)
+        self._report_move(command, status, segments, report)
+        self._report_plans(command, status, segments, report)
+        report.replan, report.start = self._request, status.position
 
-    def _report_work(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
-        """Say what is done, and how far the move under way has come."""
+    def _report_move(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
+        """Report what is done, and the progress of the move under way."""
         under_way = segments.first if segments.count else None
         report.done, report.held, report.replans = self._done, status.held, self._replans
         report.current = int(under_way["move"]) if under_way is not None else 0
@@ -237,38 +242,31 @@ class ElementalMoveExecutor(Executor):
         report.progress = status.progress if is_begun else 0.0
         under_way_at = np.flatnonzero(command.moves["id"][: command.count] == report.current)
         report.verb = int(command.moves["verb"][under_way_at[0]]) if report.current and under_way_at.size else Verb.NONE
-        self._report_plans(command, status, segments, report)
-        report.replan = self._request
-        report.start = status.position
 
     def _report_plans(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
-        """Say how far plans are at hand: from there the planner goes on."""
+        """Report how far plans are at hand: the planner continues from there."""
         report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
         end = self._plans.end(report.planned)
         if end is None:
-            # Handed down before this board started anew, or in place of such a path since.
+            # Handed down before a restart of this board, or has replaced such a path since.
             end = segments.end()
         if report.planned <= self._done and status.resting:
             report.end = status.position
         elif end is not None:
             report.end = end
 
-    def _is_told_to(self, read: Ports) -> bool:
-        """Say whether the level above, or an operator here, says hold."""
-        return bool(read.command.value.hold) or self._orders.standing is Operation.HOLD
-
     def _answer(self, read: Ports, write: Ports) -> None:
-        """Answer the operator, and hand down what this cycle rests on."""
+        """Answer the operator, and hand down the newest command that this cycle is based on."""
         above, below = read.command.value.operator, read.status.value
         write.command.operator = self._orders.rests_on(above)
-        # What rests must have heard of it.
+        # Rest counts only once the level below has received the command.
         write.status.resting = below.resting and below.operator >= write.command.operator
         if write.status.resting:
             self._orders.done()
         self._orders.report(write.status, above)
 
-    def _kept_from(self, command: Reading, below: Reading) -> str:
-        """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
+    def _reason_to_wait(self, command: Reading, below: Reading) -> str:
+        """Return what keeps the level from its work, and what ends that; empty: nothing does."""
         if self._orders.standing is not Operation.NONE:
             return self._orders.keeps(self.context.board)
         if command.is_lost:

@@ -1,1 +1,3 @@
-"""Planning for an arm: inverse kinematics, collisions, paths. Equal questions get equal answers, in any process."""
+"""Planning for an arm: inverse kinematics, collisions, payloads, paths. Equal questions give equal answers, in any
+process.
+"""

@@ -1,6 +1,6 @@
-"""Collisions of the arm, and of what it holds, with the cell and with itself.
+"""Collisions of the arm and its load with the cell and with each other.
 
-MuJoCo finds the pairs; a matrix of required distances, one entry a pair of geoms, says which of them count.
+MuJoCo finds the close pairs of geoms. A matrix of required distances, one entry per pair, decides which of them count.
 """
 
 from __future__ import annotations
@@ -11,34 +11,44 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rack.levels.algebra import mat_vec
+from rack.levels.algebra import Array, mat_vec
+from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import geom_name
 from rack.levels.tables import SceneConfig
 
-Array = NDArray[np.float64]
+MAX_TOUCH_DEPTH_M = 0.003
+"""Depth of an intended contact: simulated bodies are soft and sensed poses are not exact."""
+MAX_HELD_DEPTH_M = 0.01
+"""Depth of a contact between a held object and its supports: the object slides by some millimetres in the gripper when
+it moves fast, and its support pushes it back as it is put down."""
 
-TOUCH_DEPTH_M = 0.003
-"""How deep a contact that is meant may go: simulated bodies are soft and sensed poses are not exact."""
-HELD_DEPTH_M = 0.01
-"""The same between what is held and its supports: it slides by some millimetres in the gripper when it is moved fast,
-and its support pushes it back as it is put down."""
+ANY_DISTANCE = -np.inf
+"""Required distance of a pair that may overlap."""
 
-NO_MATTER = -np.inf
+
+def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
+    """Place objects and obstacles in `data` at the world model's poses: (bodies, 3) in m, (bodies, 4) as w, x, y, z."""
+    for row, address in enumerate(cell.object_qpos):
+        data.qpos[address : address + 3] = positions[row]
+        data.qpos[address + 3 : address + 7] = quaternions[row]
+    for row, mocap in enumerate(cell.mocap, start=len(cell.object_qpos)):
+        data.mocap_pos[mocap] = positions[row]
+        data.mocap_quat[mocap] = quaternions[row]
 
 
 class CollisionChecker:
-    """Says whether a configuration of the arm is free, on a cell of its own.
+    """Decides whether a configuration of the arm is free, on its own copy of the cell.
 
-    The arm, its gripper open and whatever it holds included, keeps `scene.clearance` from everything that is not the
-    arm; links must only not touch each other or what carries the arm. One instance belongs to one task; a check takes
+    The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links may come close to
+    each other and to the body that carries the arm, but must not touch. One instance serves one task; a check takes
     some microseconds.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig) -> None:
         self.cell = cell
-        self.clearance = scene.clearance
-        self.held: int | None = None
+        self.clearance = scene.clearance  # m
+        self.held: int | None = None  # row of the object that is carried
         self._touched: int | None = None
         self._model = copy.copy(cell.model)
         self._data = mujoco.MjData(self._model)
@@ -51,17 +61,18 @@ class CollisionChecker:
         self._base = self._required_distances()
         self._required = self._base.copy()
 
+    def tool_at(self, q: Array) -> Pose:
+        """Return the tool's pose at `q` (joints,), rad."""
+        self._data.qpos[self.cell.qpos] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        return site_pose(self._data, self.cell.tool)
+
     def place(self, positions: Array, quaternions: Array) -> None:
-        """Put objects and obstacles at the world model's poses: (bodies, 3) in m, (bodies, 4) as w, x, y, z."""
-        for row, address in enumerate(self.cell.object_qpos):
-            self._data.qpos[address : address + 3] = positions[row]
-            self._data.qpos[address + 3 : address + 7] = quaternions[row]
-        for row, mocap in enumerate(self.cell.mocap, start=len(self.cell.object_qpos)):
-            self._data.mocap_pos[mocap] = positions[row]
-            self._data.mocap_quat[mocap] = quaternions[row]
+        """Place objects and obstacles, as `place_bodies`."""
+        place_bodies(self.cell, self._data, positions, quaternions)
 
     def open_gripper(self, opening: float) -> None:
-        """Set the gripper to `opening`, m or rad; at first it is as open as it goes, its widest."""
+        """Set the gripper to `opening`, m or rad; initially it is at its widest."""
         if self.cell.linkage is not None:
             self.cell.linkage.set(self._data.qpos, opening)
 
@@ -75,16 +86,16 @@ class CollisionChecker:
         self._apply()
 
     def permit(self, row: int | None, touch: bool = True) -> None:
-        """Let object `row` touch supports and gripper, and the gripper come close to supports; or no longer."""
+        """Let object `row` touch supports and gripper, and the gripper come close to supports; or forbid it again."""
         self._touched = row if touch else None
         self._apply()
 
     def free(self, q: Array, clearance: float | None = None) -> bool:
-        """Say whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, in m, may lower the scene's."""
+        """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may lower the scene's."""
         return not bool(np.any(self._shortfalls(q, clearance) > 0))
 
     def room(self, q: Array) -> float:
-        """Return the largest clearance, in m and at most the scene's, with which `q` is free; negative if none is."""
+        """Return the largest clearance, in m and at most the scene's, with which `q` is free; negative: with none."""
         short = self._shortfalls(q, None)
         pairs = self._data.contact.geom
         required = self._required[pairs[:, 0], pairs[:, 1]]
@@ -93,12 +104,12 @@ class CollisionChecker:
         return self.clearance - max(0.0, float(np.max(short, initial=0.0)))
 
     def why(self, q: Array, clearance: float | None = None) -> str:
-        """Name the pair that is nearest its bound or beyond it, with distance and bound; empty when `q` is free."""
+        """Name the pair of geoms that violates its distance most at `q`, and both distances; empty: `q` is free."""
         self._shortfalls(q, clearance)
         return self.nearest()
 
     def nearest(self) -> str:
-        """Name the same pair of the configuration that was checked last."""
+        """Name that pair for the configuration checked last."""
         short = self._short
         if not np.any(short > 0):
             return ""
@@ -110,7 +121,7 @@ class CollisionChecker:
         return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {least * 1e3:.1f} mm"
 
     def _shortfalls(self, q: Array, clearance: float | None) -> Array:
-        """Return what each close pair lacks to its required distance, in m."""
+        """Return by how much each close pair falls short of its required distance, in m."""
         m, d = self._model, self._data
         d.qpos[self.cell.qpos] = q
         mujoco.mj_kinematics(m, d)
@@ -134,7 +145,7 @@ class CollisionChecker:
         mujoco.mju_mulQuat(d.qpos[address + 3 : address + 7], self._tool_quaternion, self._offset[1])
 
     def _filter_to_arm(self) -> NDArray[np.int32]:
-        """Leave MuJoCo only the pairs with the arm in them: a tenth of the work. Return the contact types."""
+        """Restrict MuJoCo to the pairs that involve the arm, a tenth of the work. Return the contact types."""
         m = self._model
         solid = (m.geom_contype | m.geom_conaffinity) != 0
         arm = np.zeros(m.ngeom, dtype=bool)
@@ -148,22 +159,22 @@ class CollisionChecker:
         return np.array(m.geom_contype)
 
     def _required_distances(self) -> Array:
-        """Return (geoms, geoms), in m: clearance for arm and cell, 0 for what the cell lets touch itself."""
+        """Return (geoms, geoms), in m: the clearance between arm and cell, 0 between links that may collide."""
         m, arm = self.cell.model, self.cell.arm_geoms
         typ, affinity = m.geom_contype, m.geom_conaffinity
         collide = (typ[:, None] & affinity[None, :]) | (typ[None, :] & affinity[:, None]) != 0
-        required = np.full((m.ngeom, m.ngeom), NO_MATTER)
+        required = np.full((m.ngeom, m.ngeom), ANY_DISTANCE)
         required[arm, :] = self.clearance
         required[:, arm] = self.clearance
         own = np.union1d(arm, self._carriers())
         for some, others in ((arm, own), (own, arm)):
-            required[np.ix_(some, others)] = np.where(collide[np.ix_(some, others)], 0.0, NO_MATTER)
-        # Links of a gripper meet in their pins, and its motion is not planned.
-        required[np.ix_(self.cell.gripper_geoms, self.cell.gripper_geoms)] = NO_MATTER
+            required[np.ix_(some, others)] = np.where(collide[np.ix_(some, others)], 0.0, ANY_DISTANCE)
+        # Links of a gripper meet at their pins, and its motion is not planned.
+        required[np.ix_(self.cell.gripper_geoms, self.cell.gripper_geoms)] = ANY_DISTANCE
         return required
 
     def _carriers(self) -> NDArray[np.int_]:
-        """Return the geoms of the fixed bodies that carry the arm: its links come near them at every joint angle."""
+        """Return the geoms of the fixed bodies that carry the arm: its links are near them at every joint angle."""
         m = self.cell.model
         body = m.body_parentid[m.dof_bodyid[self.cell.dof[0]]]
         chain = []
@@ -173,19 +184,19 @@ class CollisionChecker:
         return np.flatnonzero(np.isin(m.geom_bodyid, chain))
 
     def _apply(self) -> None:
-        """Work out the required distances for what is held and what may be touched."""
+        """Set the required distances for the held object and the one that may be touched."""
         self._required[:] = self._base
         arm, gripper, supports = self.cell.arm_geoms, self.cell.gripper_geoms, self.cell.supports
         if self.held is not None:
             held = self._row_geoms[self.held]
             self._require(held, np.arange(self._model.ngeom), self.clearance)
             self._require(held, arm, 0.0)
-            self._require(held, gripper, NO_MATTER)
-            self._require(held, held, NO_MATTER)
+            self._require(held, gripper, ANY_DISTANCE)
+            self._require(held, held, ANY_DISTANCE)
         if self._touched is not None:
             touched, is_held = self._row_geoms[self._touched], self._touched == self.held
-            self._require(touched, gripper, NO_MATTER if is_held else -TOUCH_DEPTH_M)
-            self._require(touched, supports, -HELD_DEPTH_M if is_held else -TOUCH_DEPTH_M)
+            self._require(touched, gripper, ANY_DISTANCE if is_held else -MAX_TOUCH_DEPTH_M)
+            self._require(touched, supports, -MAX_HELD_DEPTH_M if is_held else -MAX_TOUCH_DEPTH_M)
             self._require(gripper, supports, 0.0)
 
     def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:

@@ -1,7 +1,7 @@
 """Inverse kinematics: configurations that put the tool at a pose, by damped least squares with restarts.
 
-A step is a quadratic program whose bounds are the joints' limits; MuJoCo solves it. Mink, which does the same on numpy
-and a solver of choice, was left for its matrix products: their bits depend on the processor.
+A step is a quadratic program bounded by the joints' limits; MuJoCo solves it. Alternative considered: mink, which does
+the same on numpy and a solver of choice, but the bits of its matrix products depend on the processor.
 """
 
 from __future__ import annotations
@@ -10,35 +10,31 @@ from collections.abc import Callable, Iterable
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import gram, norm, transposed_mat_vec
-from rack.levels.planning.pose import Pose, pose
-from rack.levels.planning.reach import sampling_range
+from rack.levels.algebra import Array, gram, norm, transposed_mat_vec
+from rack.levels.planning.pose import Pose, pose, site_pose
 from rack.levels.robot.cell import Cell
 
-Array = NDArray[np.float64]
-
-RESTARTS = 60
-"""Random starts for one pose, at most: of 300 random poses of the K-1607, 40 starts missed one."""
-PATIENCE = 12
-"""Starts in a row that bring no new solution and end the search, once there is one."""
-MOST_SOLUTIONS = 8
-"""Solutions of one pose, at most: a redundant arm has infinitely many."""
-ITERATIONS = 25
+MAX_RESTARTS = 60
+"""Random starts for one pose: of 300 random poses of the K-1607, 40 starts missed one."""
+MAX_IDLE_STARTS = 12
+"""Consecutive starts without a new solution that end the search, once there is a solution."""
+MAX_SOLUTIONS = 8
+"""Solutions of one pose: a redundant arm has infinitely many."""
+MAX_ITERATIONS = 25
 STALLED_ITERATIONS = 5
 STALLED_PART = 0.7
-"""A descent whose error has not come down to this part within that many iterations is given up."""
+"""A descent is abandoned when its error has not fallen to this part within `STALLED_ITERATIONS`."""
 POSITION_TOLERANCE_M = 1e-5
 ANGLE_TOLERANCE_RAD = 1e-5
 SAME_RAD = 1e-2
-"""Solutions nearer than this in every joint are one solution."""
+"""Solutions closer than this in every joint count as one."""
 LIMIT_MARGIN_RAD = 1e-2
 """Solutions stay this far inside the position limits: the limit gate of the servo level brakes there."""
-MEET_RAD = 0.5
+MAX_BRANCH_STEP_RAD = 0.5
 """A warm start that ends farther away than this in a joint has left its branch."""
 DAMPING = 1e-6
-"""Of a step, in the square of a tool's error a radian, and as much again for an error of 1 m or 1 rad."""
+"""Damping of a step, in squared tool error per rad, and as much again for an error of 1 m or 1 rad."""
 LIMIT_PART = 0.95
 """Part of the way to a position limit that one step may take."""
 
@@ -60,16 +56,15 @@ class InverseKinematics:
 
     def tool_at(self, q: Array) -> Pose:
         """Return the tool's pose at `q` (joints,), rad."""
-        self._move_to(q)
-        tool, quaternion = self._cell.tool, np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, self._data.site_xmat[tool])
-        return pose(self._data.site_xpos[tool], quaternion)
+        self._data.qpos[self._cell.qpos] = q
+        mujoco.mj_kinematics(self._cell.model, self._data)
+        return pose(*site_pose(self._data, self._cell.tool))
 
     def reach(self, target: Pose, start: Array) -> Array | None:
-        """Return the configuration (joints,) at `target` that one descent from `start` finds, or None."""
+        """Return the configuration (joints,) at `target` found by one descent from `start`, or None."""
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
-        for _ in range(ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             error = self._error(target, q)
             if max(abs(error[:3])) < POSITION_TOLERANCE_M and max(abs(error[3:])) < ANGLE_TOLERANCE_RAD:
                 return q
@@ -83,19 +78,19 @@ class InverseKinematics:
         return None
 
     def nearby(self, target: Pose, start: Array) -> Array | None:
-        """Return the configuration at `target` on the branch of `start`, or None when there is none near."""
+        """Return the configuration at `target` on the branch of `start`; None: there is none nearby."""
         found = self.reach(target, start)
-        return found if found is not None and bool(np.all(np.abs(found - start) < MEET_RAD)) else None
+        return found if found is not None and bool(np.all(np.abs(found - start) < MAX_BRANCH_STEP_RAD)) else None
 
     def solutions(self, target: Pose, reference: Array, free: Callable[[Array], bool]) -> list[Array]:
-        """Return distinct free configurations at `target`, the quickest to get to from `reference` first.
+        """Return distinct free configurations at `target`, the quickest to reach from `reference` first.
 
-        The list is empty when `target` is out of reach or everything there collides.
+        Empty when `target` is out of reach or everything there collides.
         """
         return [q for q in self.reachable(target, reference) if free(q)]
 
     def reachable(self, target: Pose, reference: Array) -> list[Array]:
-        """Return distinct configurations at `target`, free or not, the quickest to get to first."""
+        """Return distinct configurations at `target`, free or not, the quickest to reach first."""
         rng = np.random.default_rng(self._seed)
         found: list[Array] = []
         idle = 0
@@ -105,7 +100,7 @@ class InverseKinematics:
             idle = idle + 1 if known else 0
             if q is not None and not known:
                 found.append(q)
-            if len(found) == MOST_SOLUTIONS or (found and idle >= PATIENCE):
+            if len(found) == MAX_SOLUTIONS or (found and idle >= MAX_IDLE_STARTS):
                 break
         return sorted(found, key=lambda q: self.time_between(reference, q))
 
@@ -115,11 +110,11 @@ class InverseKinematics:
 
     def _starts(self, reference: Array, rng: np.random.Generator) -> Iterable[Array]:
         yield reference
-        for _ in range(RESTARTS):
+        for _ in range(MAX_RESTARTS):
             yield rng.uniform(self._low, self._high)
 
     def _error(self, target: Pose, q: Array) -> Array:
-        """Return (6,): how far `target` is from the tool at `q`, m, and the turn that is left, rad; world frame."""
+        """Return (6,): the way, m, and the turn, rad, from the tool at `q` to `target`; world frame."""
         tool = self.tool_at(q)
         turn, error = np.zeros(3), np.zeros(6)
         error[:3] = target.position - tool.position
@@ -128,7 +123,7 @@ class InverseKinematics:
         return error
 
     def _step(self, error: Array, q: Array) -> Array | None:
-        """Return the step (joints,), rad, that best takes away `error`, which is that at `q`; None: there is none."""
+        """Return the step (joints,), rad, that best reduces `error`, the error at `q`; None: there is none."""
         m, d = self._cell.model, self._data
         mujoco.mj_comPos(m, d)
         mujoco.mj_jacSite(m, d, self._jacobian[:3], self._jacobian[3:], self._cell.tool)
@@ -140,6 +135,8 @@ class InverseKinematics:
         rank = mujoco.mju_boxQP(step, self._factor, None, hessian, gradient, low, high)
         return step if rank >= 0 else None
 
-    def _move_to(self, q: Array) -> None:
-        self._data.qpos[self._cell.qpos] = q
-        mujoco.mj_kinematics(self._cell.model, self._data)
+
+def sampling_range(cell: Cell) -> tuple[Array, Array]:
+    """Return low and high (joints,), in rad: the limits, or one turn for a joint without limits."""
+    low, high = cell.limits.position[:, 0], cell.limits.position[:, 1]
+    return np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)

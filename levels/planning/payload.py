@@ -1,8 +1,8 @@
 """Whether the arm can carry an object: its weight against the friction of the grip and the torques of the motors.
 
-The grip is known where a straight line through the tool's origin, along its y axis, meets the object and a finger on
-either side, as in every grasp that the task level plans. The force there follows from the actuator's by virtual work
-over the linkage, whatever that is. Where the line meets nothing, the grip is not known and only the motors are checked.
+The grip is known if a straight line through the tool's origin, along its y axis, meets the object and a finger on
+either side, as in every grasp that the task level plans. Virtual work over the linkage, whatever its kind, gives the
+force there from the actuator's. If the line misses, the grip is unknown and only the motors are checked.
 """
 
 from __future__ import annotations
@@ -13,34 +13,33 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
-from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.pose import Pose, pose, site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 
-Array = NDArray[np.float64]
-
-GRIP_FACTOR = 1.5
-"""Grip wanted for the weight of an object, for it to be held while the arm accelerates: the PUMA loses one at 1.22."""
-MOTOR_PART = 0.9
-"""Part of a motor's torque that weights may take: what is left moves the arm."""
-REACH_M = 1.0
-"""Fingers and surfaces are looked for this far from the tool."""
+MIN_GRIP_FACTOR = 1.5
+"""Grip required per weight of an object, to hold it while the arm accelerates: the PUMA loses one at 1.22."""
+MAX_MOTOR_PART = 0.9
+"""Part of a motor's torque that weights may take: the rest moves the arm."""
+RAY_RANGE_M = 1.0
+"""Fingers and surfaces are searched up to this distance from the tool."""
 SIDES = (1.0, -1.0)
 
 
 class Jaws(NamedTuple):
-    """The fingers at one opening, m or rad: their `gap`, m, the actuator's `length`, and the geoms that meet."""
+    """The fingers at one opening of the gripper."""
 
-    opening: float
-    gap: float
-    length: float
-    geoms: tuple[int, int]
+    opening: float  # m or rad
+    gap: float  # between the fingers, m
+    length: float  # of the actuator, m or rad
+    geoms: tuple[int, int]  # that face each other
 
 
 class Payloads:
-    """Checks what one arm may carry. `names` are the objects by their rows."""
+    """Checks the payloads of one arm. `names` are the objects by their rows."""
 
     def __init__(self, cell: Cell, names: tuple[str, ...]) -> None:
         self._cell, self._names = cell, names
@@ -52,18 +51,18 @@ class Payloads:
         self._jaws = self._closing()
 
     def check_grip(self, row: int, grip: Pose) -> None:
-        """Raise `Refused` with both forces when friction does not hold object `row` at `grip` in the tool's frame."""
-        needed = GRIP_FACTOR * self._mass(row) * self._gravity
+        """Raise `Refused` with both forces if friction does not hold object `row` at `grip` in the tool's frame."""
+        needed = MIN_GRIP_FACTOR * self._mass(row) * self._gravity
         holds = self._holding_force(row, grip)
         if holds is not None and holds < needed:
             why = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
             raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
 
     def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
-        """Raise `Refused` with both torques when a motor cannot carry object `row` at one of (k, joints), rad."""
+        """Raise `Refused` with both torques if a motor cannot carry object `row` at one of (k, joints), rad."""
         model = self._cell.model
         centre = grip @ pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
-        payload, limit = Payload(self._mass(row), centre.position), MOTOR_PART * self._cell.bounds.torque
+        payload, limit = Payload(self._mass(row), centre.position), MAX_MOTOR_PART * self._cell.bounds.torque
         for q in configurations:
             load = np.abs(self._dynamics.terms(q, self._rest, payload).bias)
             worst = int(np.argmax(load - limit))
@@ -83,7 +82,7 @@ class Payloads:
         return f"'{self._names[row]}' {self._mass(row):.3g} kg"
 
     def _holding_force(self, row: int, grip: Pose) -> float | None:
-        """Return the friction, N, that can carry object `row`; None where that is not known."""
+        """Return the friction, N, that can carry object `row`; None: unknown."""
         surfaces = self._surfaces(row, grip)
         wide, narrow = self._around(surfaces[0] + surfaces[1]) if surfaces is not None else (None, None)
         if surfaces is None or wide is None or narrow is None or wide.gap <= narrow.gap:
@@ -98,26 +97,27 @@ class Payloads:
         return normal * sum(max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms)
 
     def _around(self, width: float) -> tuple[Jaws | None, Jaws | None]:
-        """Return the last jaws wider than `width`, m, and the first that are not; None: there are none."""
+        """Return the last jaws wider than `width`, m, and the first that are not; None: there are no such jaws."""
         for wide, narrow in zip(self._jaws, self._jaws[1:], strict=False):
             if wide.gap > width >= narrow.gap:
                 return wide, narrow
         return None, None
 
     def _surfaces(self, row: int, grip: Pose) -> tuple[float, float] | None:
-        """Return how far the object reaches from the tool to either side, m; None: the line passes by it."""
+        """Return how far the object reaches from the tool to either side, m; None: the line misses it."""
         cell, data = self._cell, self._data
         address = cell.object_qpos[row]
-        data.qpos[address : address + 7] = np.concatenate(self._tool() @ grip)
+        tool = pose(*site_pose(data, cell.tool))
+        data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
         found = []
         for side in SIDES:
-            distance, _ = self._nearest(self._objects[row], REACH_M * side, -side)
-            found.append(REACH_M - distance)
+            distance, _ = self._nearest(self._objects[row], RAY_RANGE_M * side, -side)
+            found.append(RAY_RANGE_M - distance)
         return (found[0], found[1]) if all(np.isfinite(found)) else None
 
     def _closing(self) -> list[Jaws]:
-        """Return the jaws from open to closed, as long as there is a gap and a finger on either side."""
+        """Return the jaws from open to closed, while there is a gap and a finger on either side."""
         cell, data = self._cell, self._data
         if cell.linkage is None:
             return []
@@ -132,7 +132,7 @@ class Payloads:
             mujoco.mj_fwdPosition(cell.model, data)
             sides = [self._nearest(fingers, 0.0, side) for side in SIDES]
             gap = sides[0][0] + sides[1][0]
-            # Closed, the tool's origin is in a finger, and the line leaves it on the far side.
+            # When closed, the tool's origin is inside a finger, and the line leaves it on the far side.
             if not np.isfinite(gap) or (jaws and gap >= jaws[-1].gap):
                 break
             length = float(data.actuator_length[cell.gripper_actuator])
@@ -140,7 +140,7 @@ class Payloads:
         return jaws
 
     def _nearest(self, geoms: NDArray[np.int_], start: float, way: float) -> tuple[float, int]:
-        """Return distance, m, and geom that the tool's y axis meets first, from `start`, m, on; inf: none."""
+        """Return distance, m, and geom that the tool's y axis meets first from `start`, m; inf: none."""
         model, data, tool = self._cell.model, self._data, self._cell.tool
         axis = data.site_xmat[tool].reshape(3, 3)[:, 1].copy()
         begin, along = data.site_xpos[tool] + start * axis, way * axis
@@ -156,14 +156,9 @@ class Payloads:
                 found = (float(distance), int(geom))
         return found
 
-    def _tool(self) -> Pose:
-        data, turned = self._data, np.zeros(4)
-        mujoco.mju_mat2Quat(turned, data.site_xmat[self._cell.tool])
-        return pose(data.site_xpos[self._cell.tool], turned)
-
 
 def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
-    """Return the sliding friction of a contact of two geoms, as MuJoCo mixes it; 0: they do not touch, or slip."""
+    """Return the sliding friction of a contact of two geoms, as MuJoCo mixes it; 0: frictionless."""
     if model.geom_priority[one] == model.geom_priority[other]:
         mixed = [one, other]
     else:

@@ -17,35 +17,27 @@ from rack.levels.messages import (
     SegmentKind,
 )
 from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Operation, Orders
-from rack.levels.primitive.fault import Fault
-from rack.levels.primitive.gripper_work import GripperWork
-from rack.levels.primitive.guard import Guard
-from rack.levels.primitive.memory import Memory, recall
-from rack.levels.primitive.params import PrimitiveParams
-from rack.levels.primitive.path_motion import SetPoint
-from rack.levels.primitive.path_work import PathWork, WorkRules
-from rack.levels.primitive.plans import Plans
-from rack.levels.primitive.segment import Segment, read_segment, window
-from rack.levels.primitive.sight import Sight
-from rack.levels.primitive.tracking import Straying, Tracking, awaited
+from rack.levels.primitive.guard import Guard, Sight
+from rack.levels.primitive.path_motion import JointSetPoint
+from rack.levels.primitive.planner import Plans
+from rack.levels.primitive.segment import Memory, MotionSegment, SegmentFault, read_segment, recall, window
+from rack.levels.primitive.tracking import LEAD_CYCLES, MAX_UNEXPLAINED_CYCLES, SEEN_CYCLES, Straying, Tracking
+from rack.levels.primitive.work import GripperWork, PathWork, PrimitiveParams, WorkCycle, WorkRules
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
 
 Work = PathWork | GripperWork
 
-SEEN_CYCLES = 2
-"""Cycles by which the world model lags behind the servo: what rests now is seen at rest since then."""
-DELAY_CYCLES = 3
-"""Cycles from the sensing of the world model to the set point commanded last: what moves has gone on meanwhile."""
+DELAY_CYCLES = SEEN_CYCLES + LEAD_CYCLES - 1
+"""Cycles from the sensing of the world model to the set point commanded last: bodies move on in that time."""
 
 
 class PrimitiveExecutor(Executor):
-    """Does the segments of the window, oldest first; each from rest to rest, the next one planned meanwhile.
+    """Does the segments of the window, oldest first; each from rest to rest, while the next one is planned.
 
-    Released at tick T it writes the set point due two cycles later: the first brings it to the servo, over the second
-    the servo interpolates to it. What it must not forget when its board dies it finds in its own last messages. While
-    the board above is lost it rests on its path, as with `hold` from above or of an operator; while the servo does not
-    follow it waits.
+    The set point written at tick T is due `LEAD_CYCLES` later. After a restart the level's own last messages hold
+    everything that it must remember. It rests on its path while the board above is lost, and on `hold` from above or
+    from an operator; while the servo does not follow, it waits.
     """
 
     inputs = {
@@ -63,54 +55,53 @@ class PrimitiveExecutor(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._params = read_params(PrimitiveParams, context.params)
+        params = read_params(PrimitiveParams, context.params)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self._rules = WorkRules(context.robot.joints, cell.limits, self._params, context.period_s)
-        self._guard = Guard(cell, context.scene, self._params.lookahead, DELAY_CYCLES * context.period_s)
+        self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
+        self._guard = Guard(cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s)
         self._gripper = context.robot.gripper
-        self._sight = Sight(self._guard, round(self._params.blind / context.tick_s), bool(context.scene.bodies))
+        self._sight = Sight(self._guard, round(params.blind / context.tick_s), bool(context.scene.bodies))
         self._tracking = Tracking()
-        straying = self._rules.cycles(self._params.straying)
-        self._straying = Straying(context.robot.joints, self._params.following, straying)
+        self._straying = Straying(context.robot.joints, params.following, self._rules.cycles(params.straying))
+        self._silent_cycles = self._rules.cycles(params.silent)
         self._plans = Plans()
         self._orders = Orders(self.commands)
-        self._memory: Memory | None = None
+        self._memory: Memory | None = None  # None until this level, in this life or before, first came into step
         self._work: Work | None = None
-        self._fault: Fault | None = None
-        self._faulty = 0
-        self._position = cell.home.copy()
-        self._rest = SetPoint(self._position, *np.zeros((2, len(cell.home))))
-        self._tick: int | None = None
-        # True when the servo has been away since the last path: the arm may not be where that ended.
-        self._displaced = False
+        self._fault: SegmentFault | None = None
+        self._begun = 0  # serial of the segment begun last
+        self._position = cell.home.copy()  # commanded last, (joints,), rad
+        self._rest = JointSetPoint(self._position, *np.zeros((2, len(cell.home))))
+        self._tick: int | None = None  # of the cycle before
+        self._displaced = False  # the servo has been away since the last path: the arm may not be where that ended
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Sample command, status, plan and world model; write the next set point and this level's status."""
+        """Read command, status, plan and world model; write the next set point and this level's status."""
         if self._tick is None:
             self._tick, self._memory = tick - self.context.every, recall(read)
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
+        servo = read.status.value
         self._orders.take(read.operator)
         serials = window(read.command.value)
         self._plans.accept(read.plan, serials)
         if self._tracking.update(read.status):
-            self._take_up(read, tick)
-        self._sight.update(read.world, read.status.value.position, tick)
+            self._resume(servo, tick)
+        self._sight.update(read.world, servo.position, tick)
         if self._tracking.in_step:
-            self._go_on(read, serials, tick, passed_s)
-        elif read.status.value.state == State.ERROR:
-            self._fault = Fault(Error(read.status.value.error), read.status.value.reason)
-        elif self._tracking.silent_cycles > self._rules.cycles(self._params.silent):
-            self._fault = Fault(Error.BELOW, f"no status from below for {self._tracking.silent_cycles} cycles")
-        if read.status.is_there and read.status.value.state == State.ERROR:
-            self._fault = Fault(Error(read.status.value.error), read.status.value.reason)
+            self._do_segments(read, serials, tick, passed_s)
+        elif self._tracking.silent_cycles > self._silent_cycles:
+            reason = f"no status from below for {self._tracking.silent_cycles} cycles"
+            self._fault = SegmentFault(Error.BELOW, reason)
+        if servo.state == State.ERROR:
+            self._fault = SegmentFault(Error(servo.error), servo.reason)
         self._write_set_point(write.command, tick)
         self._write_status(read, write.status, serials, tick)
         self._answer(write, read.command.value.operator)
 
-    def _take_up(self, read: Ports, tick: int) -> None:
-        """Go on from where the servo holds the arm."""
-        servo, work = read.status.value, self._work
+    def _resume(self, servo: Message, tick: int) -> None:
+        """Continue from where the servo holds the arm."""
+        work = self._work
         self._displaced = self._memory is not None
         if self._memory is None:
             force = self._gripper.force if self._gripper is not None else 0.0
@@ -118,14 +109,17 @@ class PrimitiveExecutor(Executor):
         self._fault = None
         self._straying.forget()
         self._position[:] = servo.target
-        self._sight.carry(self._memory.held, tick - SEEN_CYCLES * self.context.every)
+        self._carry(self._memory.held, tick)
         if isinstance(work, PathWork):
             work.begin_near(self._position, work.progress)
             self._displaced = False
         elif work is not None:
             work.begin()
 
-    def _go_on(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
+    def _carry(self, row: int | None, tick: int) -> None:
+        self._sight.carry(row, tick - SEEN_CYCLES * self.context.every)
+
+    def _do_segments(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish it, drop it, begin it, step it."""
         hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.standing is Operation.HOLD
         if read.status.is_new:
@@ -142,8 +136,8 @@ class PrimitiveExecutor(Executor):
         if isinstance(work, PathWork):
             hold = hold or withdrawn or self._fault is not None or self._straying.strays or bool(self._sight.lacks)
             plan = self._plans.trajectory(work.segment.id, work.motion.s)
-            due_s = (tick + self.context.every) * self.context.tick_s
-            work.step(hold, plan, read.world.value, due_s, passed_s)
+            due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
+            work.step(WorkCycle(hold, plan, read.world.value, due_s, passed_s))
             self._position[:] = work.motion.set_point.position
 
     def _finish(self, servo: Message, tick: int) -> None:
@@ -152,18 +146,18 @@ class PrimitiveExecutor(Executor):
             return
         if isinstance(work, GripperWork):
             memory.held = work.held_after
-            self._sight.carry(memory.held, tick - SEEN_CYCLES * self.context.every)
+            self._carry(memory.held, tick)
         memory.done, self._work = work.segment.id, None
 
     def _withdraw(self, serials: list[int]) -> bool:
-        """Drop work and fault that are no longer in the window; say whether the work must come to rest first."""
-        serial = self._work.segment.id if self._work is not None else self._faulty
+        """Drop work and fault that have left the window; return whether the work must come to rest first."""
+        serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
             return False
         if isinstance(self._work, PathWork) and not self._work.motion.resting:
             return True
         if isinstance(self._work, PathWork) and self._memory is not None:
-            # Messages may come out of order: what is withdrawn may be wanted again, and goes on then.
+            # Messages may arrive out of order: a withdrawn segment may come back, and then continues.
             self._memory.interrupted, self._memory.progress = serial, self._work.progress
         self._work, self._fault = None, None
         return False
@@ -174,24 +168,26 @@ class PrimitiveExecutor(Executor):
         serial = next((s for s in serials if memory is not None and s > memory.done), 0)
         if not serial or memory is None:
             return
-        self._faulty = serial
+        self._begun = serial
         try:
             segment = read_segment(read.command.value, serial)
             if hold and segment.kind is SegmentKind.GRIPPER:
                 return
-            begin = self._begin_path if segment.kind is SegmentKind.PATH else self._begin_gripper
-            self._work = begin(segment, memory, read)
+            if segment.kind is SegmentKind.PATH:
+                self._work = self._begin_path(segment, memory, read)
+            else:
+                self._work = self._begin_gripper(segment, memory)
         except ValueError as error:
-            self._fault = Fault(Error.LIMIT, str(error))
+            self._fault = SegmentFault(Error.LIMIT, str(error))
         memory.interrupted = 0
 
-    def _begin_gripper(self, segment: Segment, memory: Memory, read: Ports) -> GripperWork:
+    def _begin_gripper(self, segment: MotionSegment, memory: Memory) -> GripperWork:
         if self._gripper is None:
-            raise ValueError(f"segment {segment.id}: the arm has no gripper; only paths are valid")
+            raise ValueError(f"segment {segment.id}: the arm has no gripper; valid: paths")
         memory.opening, memory.force = segment.opening, segment.force
         return GripperWork(segment, self._gripper, self._rules)
 
-    def _begin_path(self, segment: Segment, memory: Memory, read: Ports) -> PathWork:
+    def _begin_path(self, segment: MotionSegment, memory: Memory, read: Ports) -> PathWork:
         path = segment.path()
         self._guard.watch(segment, path, read.status.value.opening, read.world.value)
         work = PathWork(segment, path, self._guard, self._rules)
@@ -205,7 +201,7 @@ class PrimitiveExecutor(Executor):
         return work
 
     def _wanted(self, read: Ports, serials: list[int]) -> tuple[int, float]:
-        """Return the segment that a trajectory is wanted for, and where on its path it is to begin; 0: none."""
+        """Return the segment for which a trajectory is wanted, and the path parameter of its start; 0: none."""
         work, done = self._work, self._memory.done if self._memory is not None else 0
         kinds = read.command.value.segments["kind"].tolist()
         for serial, kind in zip(serials, kinds, strict=False):
@@ -216,47 +212,48 @@ class PrimitiveExecutor(Executor):
                 return serial, begin
         return 0, 0.0
 
+    def _due(self, tick: int) -> int:
+        """Return the tick at which the set point of the cycle released at `tick` is due."""
+        return tick + LEAD_CYCLES * self.context.every
+
     def _write_set_point(self, command: Message, tick: int) -> None:
-        every, work, memory = self.context.every, self._work, self._memory
-        command.id = tick // every + 1 if memory is not None else 0
+        work, memory, in_step = self._work, self._memory, self._tracking.in_step
+        command.id = tick // self.context.every + 1 if memory is not None else 0
         # Out of step, no set point is better than one from where the arm may not be.
-        command.due = tick + 2 * every if self._tracking.in_step else 0
+        command.due = self._due(tick) if in_step else 0
+        set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
-        moving = work if self._tracking.in_step and isinstance(work, PathWork) else None
-        _, velocity, acceleration = moving.motion.set_point if moving is not None else self._rest
-        command.velocity[:], command.acceleration[:] = velocity, acceleration
+        command.velocity[:], command.acceleration[:] = set_point.velocity, set_point.acceleration
         if memory is not None:
-            command.opening, command.force = memory.opening, memory.force
-            command.held = memory.held if memory.held is not None else -1
+            command.opening, command.force, command.held = memory.opening, memory.force, memory.held_row
 
     def _write_status(self, read: Ports, status: Message, serials: list[int], tick: int) -> None:
-        work, memory, fault = self._work, self._memory or Memory(), self._fault
+        memory, path_work = self._memory or Memory(), self._work if isinstance(self._work, PathWork) else None
         status.echo = read.command.value.id
         status.state = self._state(serials, memory)
-        kept_from = self._kept_from(read) if status.state == State.EXECUTING else ""
-        if kept_from:
+        reason = self._reason_to_wait(read) if status.state == State.EXECUTING else ""
+        if reason:
             status.state = State.HOLDING
-        status.error, status.reason, status.earliest = fault or (0, kept_from, 0.0)
-        status.done, status.held = memory.done, memory.held if memory.held is not None else -1
+        status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
+        status.done, status.held = memory.done, memory.held_row
         interrupted = memory.interrupted if memory.interrupted in serials else 0
-        status.current = work.segment.id if work is not None else interrupted
+        status.current = self._work.segment.id if self._work is not None else interrupted
         if read.status.is_there:
             status.opening = read.status.value.opening
         status.position[:] = self._position
-        path_work = work if isinstance(work, PathWork) else None
         status.progress = path_work.progress if path_work is not None else memory.progress * bool(interrupted)
         status.operated = self._orders.standing is not Operation.NONE or read.status.value.standing > 0
-        # Out of step it is not for the world that motion holds.
+        # Out of step, the world is not the reason why motion holds.
         status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
         status.resting = path_work is None or path_work.motion.resting
-        status.ends = path_work.ends_s((tick + 2 * self.context.every) * self.context.tick_s) if path_work else 0.0
+        status.ends = path_work.ends_s(self._due(tick) * self.context.tick_s) if path_work is not None else 0.0
         status.wants, status.begin = self._wanted(read, serials)
 
-    def _kept_from(self, read: Ports) -> str:
-        """Return who or what keeps the level from its work, and what ends that; empty: nothing does."""
+    def _reason_to_wait(self, read: Ports) -> str:
+        """Return what keeps the level from its work, and what ends that; empty: nothing does."""
         work, command = self._work, read.command
         if not self._tracking.in_step:
-            return awaited(read.status.value, self._tracking.silent_cycles)
+            return self._tracking.awaited(read.status.value)
         if isinstance(work, GripperWork):
             return ""
         if self._orders.standing is not Operation.NONE:
@@ -267,10 +264,13 @@ class PrimitiveExecutor(Executor):
                 return reason
         if command.is_lost:
             return ABOVE_LOST
-        return HELD_FROM_ABOVE if command.value.hold else ""
+        if command.value.hold:
+            return HELD_FROM_ABOVE
+        unplanned = work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES
+        return f"segment {work.segment.id} waits for its trajectory from the planner" if work and unplanned else ""
 
     def _answer(self, write: Ports, above: int) -> None:
-        """Answer the operator, and hand down what this cycle rests on."""
+        """Answer the operator, and hand down the newest command that this cycle is based on."""
         if write.status.resting:
             self._orders.done()
         write.command.operator = self._orders.rests_on(above)

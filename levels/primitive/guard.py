@@ -1,32 +1,31 @@
-"""The guard: looks along the remaining path, every cycle, for what stands or comes in the way."""
+"""The guard checks the remaining path in every cycle; sight is whether the world model is fresh enough to move by."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.level import Reading
+from rack.levels.motion.path import BlendedPath
+from rack.levels.motion.trajectory import Trajectory
 from rack.levels.planning.collision import CollisionChecker
-from rack.levels.primitive.grasp import GraspFrame
-from rack.levels.primitive.path import BlendedPath
-from rack.levels.primitive.segment import Segment
-from rack.levels.primitive.trajectory import Trajectory
+from rack.levels.planning.pose import Pose
+from rack.levels.primitive.segment import MotionSegment
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
-Array = NDArray[np.float64]
-
 NEAR_CHECKS = 9
-"""Configurations checked in a cycle on the way that lies within the look-ahead."""
+"""Configurations checked per cycle within the look-ahead."""
 FAR_CHECKS = 3
-"""Configurations checked in a cycle on the rest of the path."""
+"""Configurations checked per cycle on the rest of the path."""
 PHASES = 4
 """Cycles over which the near checks step through the gaps between them."""
 FAR_STEP_RAD = 0.04
 """Spacing of the configurations on the rest of the path."""
 CLEARANCE_PART = 0.5
 """Part of the planned clearance that must be left: sensed poses are not exact."""
-MOVING_M_S = 0.01
+MAX_REST_M_S = 0.01
 """An obstacle slower than this, along every axis, is at rest."""
 
 
@@ -34,14 +33,14 @@ class Guard:
     """Watches one path at a time against the world model.
 
     In every cycle it checks the near way, as far as `lookahead_s` reaches, with every obstacle put where its velocity
-    takes it until the arm is there; and a few configurations of the whole remaining path against all bodies as they
-    are. These count only while no obstacle moves: what moves may be gone by then. At most 13 checks a cycle.
+    will have taken it when the arm arrives; and a few configurations of the whole remaining path against all bodies as
+    they are. The latter count only while no obstacle moves: a moving one may be gone by then. At most 13 checks per
+    cycle.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
-        """Look `lookahead_s` ahead; `delay_s` is the time from the sensing of the world to the set point commanded."""
+        """Look `lookahead_s` ahead; `delay_s` is the time from sensing the world to the set point commanded last."""
         self._checker = CollisionChecker(cell, scene)
-        self._grasps = GraspFrame(cell)
         self._clearance = CLEARANCE_PART * scene.clearance
         self._rows, self._objects = len(scene.bodies), len(scene.objects)
         self._by_themselves = (np.arange(self._rows) >= self._objects)[:, None].astype(float)
@@ -55,19 +54,20 @@ class Guard:
         self.obstacle = ""  # the pair of geoms found too close last, with distance and bound
 
     def carry(self, row: int, q: Array, world: Message) -> None:
-        """Take object `row` along with the tool, from where it is while the arm is at `q` (joints,), rad."""
-        self._checker.hold(row, *self._grasps.pose_of(world.position[row], world.quaternion[row], q))
+        """Carry object `row` with the tool, from its pose in `world` while the arm is at `q` (joints,), rad."""
+        seen = Pose(world.position[row], world.quaternion[row])
+        self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ seen))
 
     def carry_nothing(self) -> None:
-        """Take nothing along."""
+        """Carry no object."""
         self._checker.hold(None)
 
-    def watch(self, segment: Segment, path: BlendedPath, opening: float, world: Message) -> None:
-        """Begin to watch a new path, to be gone with the gripper at `opening`, in m."""
+    def watch(self, segment: MotionSegment, path: BlendedPath, opening: float, world: Message) -> None:
+        """Begin to watch the path of a segment, with the gripper at `opening`, in m."""
         self._checker.open_gripper(opening)
         self._checker.permit(segment.object, segment.touch and segment.object is not None)
         self._place(world)
-        # What is too close at the start, the motion may leave; it must not come closer.
+        # Motion may leave a place that is too close, but must not come closer.
         room = self._checker.room(path.evaluate(0.0).q)
         self._least = min(self._clearance, max(room, 0.0) * CLEARANCE_PART)
         self._obstructed = None
@@ -75,26 +75,25 @@ class Guard:
         self.obstacle = ""
 
     def is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message) -> bool:
-        """Say, within a cycle's share of the checks, whether nothing is in the way of an arm `time_s` along."""
+        """Return, within a cycle's share of the checks, whether the way is clear for an arm at `time_s`."""
         begin = trajectory.at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
-        still = bool((np.abs(obstacles) < MOVING_M_S).all())
+        still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
         self._place(world)
         far_clear = self._far_is_clear(path, begin)
-        near_clear = self._near_is_clear(path, trajectory, time_s, world, still)
+        near_clear = self._near_is_clear(path, trajectory, time_s, None if still else world)
         return near_clear and (far_clear or not still)
 
-    def _near_is_clear(
-        self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message, still: bool
-    ) -> bool:
+    def _near_is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: Message | None) -> bool:
+        """Check the way within the look-ahead; `moving` is the world model while an obstacle moves."""
         self._phase = (self._phase + 1) % PHASES
         for k in range(NEAR_CHECKS):
             ahead_s = (k + (self._phase + 1) / PHASES) * self._spacing_s
-            if not still:
+            if moving is not None:
                 np.multiply(self._by_themselves, ahead_s + self._delay_s, out=self._ahead)
-                self._ahead *= world.velocity[: self._rows]
-                self._ahead += world.position[: self._rows]
-                self._checker.place(self._ahead, world.quaternion)
+                self._ahead *= moving.velocity[: self._rows]
+                self._ahead += moving.position[: self._rows]
+                self._checker.place(self._ahead, moving.quaternion)
             if not self._free(path, trajectory.at(time_s + ahead_s).s):
                 return False
             if time_s + ahead_s > trajectory.duration:
@@ -102,7 +101,7 @@ class Guard:
         return True
 
     def _far_is_clear(self, path: BlendedPath, begin: float) -> bool:
-        """Check the next few configurations, first the one that was found obstructed."""
+        """Check the next few configurations; before them, the one found obstructed last."""
         if self._obstructed is not None and self._obstructed >= begin:
             if not self._free(path, self._obstructed):
                 return False
@@ -124,3 +123,41 @@ class Guard:
 
     def _place(self, world: Message) -> None:
         self._checker.place(world.position, world.quaternion)
+
+
+class Sight:
+    """Holds motion while the world model is stale, and shows the guard how an object sits in the gripper.
+
+    The model may be stale because its board is lost, or because it receives no scene: only the time at which the scene
+    was sensed counts.
+    """
+
+    def __init__(self, guard: Guard, blind_ticks: int, has_bodies: bool) -> None:
+        """Treat a scene older than `blind_ticks` as unseen; without bodies there is nothing to see."""
+        self._guard = guard
+        self._blind_ticks = blind_ticks
+        self._has_bodies = has_bodies
+        self._blind = has_bodies
+        self._waiting: tuple[int, int] | None = None
+
+    def carry(self, row: int | None, since: int) -> None:
+        """Carry object `row` from its pose in a scene sensed at tick `since` or later; None: carry nothing."""
+        self._waiting = (row, since) if row is not None else None
+        if row is None:
+            self._guard.carry_nothing()
+
+    def update(self, world: Reading, q: Array, tick: int) -> None:
+        """Process the newest world model; `q` (joints,), rad, is where the arm rests."""
+        model = world.value
+        seen = world.is_there and model.revision > 0
+        self._blind = self._has_bodies and (not seen or tick - model.sensed > self._blind_ticks)
+        if self._waiting is not None and seen and model.sensed >= self._waiting[1]:
+            self._guard.carry(self._waiting[0], q, model)
+            self._waiting = None
+
+    @property
+    def lacks(self) -> str:
+        """The reason why motion must wait for a new scene; empty: it need not."""
+        if self._blind:
+            return "world model is stale: waiting for a new scene"
+        return "waiting for a scene that shows the held object" if self._waiting is not None else ""

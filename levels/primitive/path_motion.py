@@ -1,48 +1,46 @@
-"""Motion of the arm's set point along one path: begun, held, resumed, ended, always at rest or on a trajectory."""
+"""Motion of the set point along one path: begun, held, resumed, ended; always at rest or on a trajectory."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.primitive.path import COINCIDENT_RAD, BlendedPath
-from rack.levels.primitive.speed import BrakingLimits
-from rack.levels.primitive.stop import make_stop
-from rack.levels.primitive.trajectory import Trajectory
-
-Array = NDArray[np.float64]
+from rack.levels.algebra import Array
+from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath
+from rack.levels.motion.speed import BrakingLimits
+from rack.levels.motion.trajectory import Trajectory, make_stop
 
 NEAREST_STEP_RAD = 0.01
-"""Spacing of the points among which the one nearest to the arm is looked for."""
+"""Spacing of the points among which the one nearest to the arm is searched."""
 
 
-class SetPoint(NamedTuple):
-    """What the set point is at one time: rad, rad/s, rad/s2, (joints,) each."""
+class JointSetPoint(NamedTuple):
+    """The set point of all joints at one time."""
 
-    position: Array
-    velocity: Array
-    acceleration: Array
+    position: Array  # (joints,), rad
+    velocity: Array  # (joints,), rad/s
+    acceleration: Array  # (joints,), rad/s2
 
 
 class PathMotion:
-    """One path under way. `set_point` is where the arm is to be after the last `advance`.
+    """One path under way.
 
-    The arm may begin a little beside the path: the distance is taken back over `bridging_s` while it moves.
+    The arm may begin slightly off the path: the motion removes the distance over its first `bridging_s`.
     """
 
     def __init__(self, path: BlendedPath, braking: BrakingLimits, bridging_s: float) -> None:
         self.path = path
-        self.s = 0.0
-        self.trajectory: Trajectory | None = None
-        self.time_s = 0.0
-        self.stopping = False
+        self.s = 0.0  # path parameter of the set point, rad
+        self.trajectory: Trajectory | None = None  # None: at rest
+        self.time_s = 0.0  # since the trajectory began
+        self.stopping = False  # the trajectory is a ramp to rest
         self._braking = braking
         self._bridging_s = bridging_s
         self._offset = np.zeros(path.joints)
         self._bridged_s = bridging_s
-        self.set_point = SetPoint(path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints))
+        # Where the arm is to be after the last `advance`.
+        self.set_point = JointSetPoint(path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints))
         self._scratch = np.zeros(path.joints)
 
     @property
@@ -61,39 +59,39 @@ class PathMotion:
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
     def rest_at(self, position: Array) -> float:
-        """Rest at the begin of the path, at `position` (joints,); return a joint's largest distance between them."""
+        """Rest at the start of the path, at `position` (joints,); return the largest joint distance between them."""
         return self._rest(0.0, position)
 
     def rest_near(self, position: Array, progress: float) -> float:
-        """Rest where the path is nearest, at `position` (joints,); return a joint's largest distance between them.
+        """Rest at `position` (joints,), near the closest point of the path; return their largest joint distance.
 
-        Of places equally near, as where a path comes back to itself, it is the one nearest to `progress`, 0 to 1.
+        Of points equally close, as on a path that returns to itself, the one nearest to `progress`, 0 to 1, counts.
         """
         points = self.path.sample(NEAREST_STEP_RAD)
         away = np.linalg.norm(points - position, axis=1)
-        before, behind = np.append(np.inf, away[:-1]), np.append(away[1:], np.inf)
-        near = np.flatnonzero((away <= before) & (away <= behind) & (away <= away.min() + NEAREST_STEP_RAD))
-        # Linear spacing has an exact end: rounding must not put it beyond that, where no trajectory begins.
+        before, after = np.append(np.inf, away[:-1]), np.append(away[1:], np.inf)
+        near = np.flatnonzero((away <= before) & (away <= after) & (away <= away.min() + NEAREST_STEP_RAD))
+        # `linspace` has an exact end: rounding must not go beyond it, where no trajectory begins.
         places = np.linspace(0.0, self.path.length, len(points))[near]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
         return self._rest(float(places[nearest]), position)
 
     def follow(self, trajectory: Trajectory) -> None:
-        """Set out along `trajectory`, which begins at rest where the motion rests."""
+        """Start along `trajectory`, which begins at rest where the motion rests."""
         self.trajectory = trajectory
         self.time_s = 0.0
         self.stopping = False
 
     def hold(self) -> None:
-        """Begin to ramp to rest on the path, as soon as the braking limits let it; call in every cycle."""
+        """Begin to ramp to rest on the path as soon as the braking limits permit; call in every cycle."""
         if self.trajectory is None or self.stopping:
             return
         stop = make_stop(self.path, self._braking, self.trajectory.at(self.time_s))
         if stop is not None:
             self.trajectory, self.time_s, self.stopping = stop, 0.0, True
 
-    def advance(self, duration_s: float) -> SetPoint:
-        """Go on by `duration_s`; return the set point then. Its arrays are overwritten by the next call."""
+    def advance(self, duration_s: float) -> JointSetPoint:
+        """Advance by `duration_s`; return the new set point. The next call overwrites its arrays."""
         position, velocity, acceleration = self.set_point
         if self.trajectory is None:
             velocity.fill(0.0)
@@ -125,7 +123,7 @@ class PathMotion:
     def _come_to_rest(self) -> None:
         if self._bridged_s < self._bridging_s:
             return
-        # Trajectories end where they should up to rounding; the end of the path is met exactly.
+        # Trajectories end with rounding errors; the end of the path is met exactly.
         if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
             self.s = self.path.length
             self.set_point.position[:] = self.path.evaluate(self.s).q
@@ -134,7 +132,7 @@ class PathMotion:
         self.set_point.acceleration.fill(0.0)
 
     def _bridge(self, duration_s: float) -> None:
-        """Add what is left of the distance to the path: a quintic from one to zero, at rest at both ends."""
+        """Add the remaining distance to the path: a quintic from one to zero, at rest at both ends."""
         self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
         u, per_s = self._bridged_s / self._bridging_s, 1.0 / self._bridging_s
         left = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.levels.level import Input, LevelContext, Planner, Ports
+from rack.levels.level import Input, LevelContext, Planner, Ports, Reading
 from rack.levels.messages import MOVE_COMMAND, PRIMITIVE_STATUS, TRAJECTORY, Error
-from rack.levels.primitive.fault import Fault
-from rack.levels.primitive.params import PrimitiveParams
-from rack.levels.primitive.path import BlendedPath
-from rack.levels.primitive.path_work import WorkRules, too_late
-from rack.levels.primitive.segment import Segment, read_segment, window
-from rack.levels.primitive.trajectory import Trajectory, make_trajectory
+from rack.levels.motion.path import BlendedPath
+from rack.levels.motion.trajectory import Trajectory, make_trajectory
+from rack.levels.primitive.segment import MotionSegment, SegmentFault, read_segment, window
+from rack.levels.primitive.work import PrimitiveParams, WorkRules
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
 
@@ -37,46 +37,84 @@ class PrimitivePlanner(Planner):
         self._answered_at = 0
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Say whether the executor wants a trajectory that it has not been given."""
+        """Return whether the executor wants a trajectory that it has not received."""
         status = read.status.value
         if status.wants not in window(read.command.value):
             return False
-        # A plan needs a cycle to show in the status; wanted still later, it was lost with the board, and is made anew.
+        # A plan takes a cycle to show in the status. If it is still wanted later, it was lost with the board.
         return (status.wants, status.begin) != self._made or tick > self._answered_at
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Time the wanted segment from where it is to begin, or say why not."""
+        """Time the wanted segment from where it is to begin, or give the reason why not."""
         status, context = read.status.value, self.context
         serial, begin = status.wants, status.begin
         published = tick + context.within_cycles * context.every
         self._made, self._answered_at = (serial, begin), published + context.every
         write.segment, write.begin = serial, begin
         write.duration, write.earliest, write.count = 0.0, 0.0, 0
-        fault: Fault | None = None
+        fault: SegmentFault | None = None
         try:
             segment = read_segment(read.command.value, serial)
             trajectory = make_trajectory(self._path(segment), self._rules.limits, begin)
             start_s = max((published + context.every) * context.tick_s, status.ends)
             fault = self._write(write, segment, trajectory, start_s)
         except (ValueError, ArithmeticError) as error:
-            fault = Fault(Error.LIMIT, f"segment {serial}: {error}")
+            fault = SegmentFault(Error.LIMIT, f"segment {serial}: {error}")
         write.error, write.reason, write.earliest = fault or (0, "", write.earliest)
 
-    def _path(self, segment: Segment) -> BlendedPath:
-        """Return the segment's path. Raises `ValueError` for one that cannot be, or leaves a joint's range."""
+    def _path(self, segment: MotionSegment) -> BlendedPath:
+        """Return the segment's path. Raises `ValueError` for one that is invalid or leaves a joint's range."""
         path = segment.path()
         low, high = self._positions.T
         outside = np.argwhere((path.waypoints < low) | (path.waypoints > high))
         if len(outside):
             k, j = outside[0]
             place = f"waypoint {k}, joint '{self.context.robot.joints[j]}' at {path.waypoints[k, j]:.4f} rad"
-            raise ValueError(f"{place}; {low[j]:.4f} to {high[j]:.4f} is valid")
+            raise ValueError(f"{place}; valid: {low[j]:.4f} to {high[j]:.4f}")
         return path
 
-    def _write(self, write: Message, segment: Segment, trajectory: Trajectory, start_s: float) -> Fault | None:
+    def _write(
+        self, write: Message, segment: MotionSegment, trajectory: Trajectory, start_s: float
+    ) -> SegmentFault | None:
         sections = trajectory.sections
         write.duration, write.count = trajectory.duration, len(sections)
         write.sections[: len(sections)] = sections
         write.earliest = start_s + trajectory.duration + self._rules.latency_s
         fresh = trajectory.begin == 0.0
-        return too_late(segment, write.earliest) if fresh and 0.0 < segment.by < write.earliest else None
+        return segment.too_late(write.earliest) if fresh and 0.0 < segment.by < write.earliest else None
+
+
+class Plans:
+    """The executor's copies of plans: the newest trajectory, or refusal, of every segment in the window."""
+
+    def __init__(self) -> None:
+        self._trajectories: dict[int, Trajectory] = {}
+        self._refusals: dict[int, SegmentFault] = {}
+
+    def accept(self, plan: Reading, window: Collection[int]) -> None:
+        """Copy a new plan; drop those of segments that have left the window."""
+        for kept in (self._trajectories, self._refusals):
+            for serial in [s for s in kept if s not in window]:
+                del kept[serial]
+        message = plan.value
+        serial = message.segment
+        if not plan.is_new or serial not in window:
+            return
+        if message.error:
+            self._refusals[serial] = SegmentFault(Error(message.error), message.reason, message.earliest)
+        else:
+            self._trajectories[serial] = Trajectory(message.sections[: message.count].copy(), message.duration)
+            self._refusals.pop(serial, None)
+
+    def trajectory(self, serial: int, begin: float) -> Trajectory | None:
+        """Return the trajectory of a segment from path parameter `begin`; None: not there yet."""
+        trajectory = self._trajectories.get(serial)
+        return trajectory if trajectory is not None and trajectory.begin == begin else None
+
+    def lacks(self, serial: int, begin: float) -> bool:
+        """Return whether there is neither a trajectory from `begin` nor a refusal of the segment."""
+        return self.trajectory(serial, begin) is None and serial not in self._refusals
+
+    def refusal(self, serial: int) -> SegmentFault | None:
+        """Return why the planner refuses a segment; None: it does not."""
+        return self._refusals.get(serial)

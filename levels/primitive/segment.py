@@ -1,45 +1,63 @@
-"""A segment of work, taken out of the window that the level above hands down."""
+"""Segments of work from the window of the level above, and the executor's memory of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.messages import SegmentKind
-from rack.levels.primitive.path import BlendedPath
+from rack.levels.algebra import Array
+from rack.levels.level import Ports
+from rack.levels.messages import Error, SegmentKind
+from rack.levels.motion.path import BlendedPath
+
+
+class SegmentFault(NamedTuple):
+    """The reason why a segment cannot be done."""
+
+    code: Error
+    reason: str
+    earliest: float = 0.0  # with TOO_LATE: the simulated time that could be met, s
 
 
 @dataclass(frozen=True)
-class Segment:
-    """A copy of one SEGMENT; see there for units. `object` is None for none."""
+class MotionSegment:
+    """A copy of one SEGMENT; see there for units."""
 
     id: int
     kind: SegmentKind
     object: int | None
     touch: bool
-    waypoints: NDArray[np.float64]
-    blend: NDArray[np.float64]
+    waypoints: Array  # (count, joints)
+    blend: Array  # (count,)
     by: float
     opening: float
     force: float
 
     def path(self) -> BlendedPath:
-        """Return the segment's path. Raises `ValueError` for one that cannot be."""
+        """Return the segment's path. Raises `ValueError` for an invalid one."""
         return BlendedPath(self.waypoints, self.blend)
+
+    def too_late(self, earliest_s: float) -> SegmentFault:
+        """Return the fault of a segment that cannot be done before `earliest_s`."""
+        earliest_s = ceil(earliest_s * 1e3) / 1e3  # a user who asks for the time printed here must get it
+        reason = f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s"
+        return SegmentFault(Error.TOO_LATE, reason, earliest_s)
 
 
 def window(command: Message) -> list[int]:
-    """Return the serials of the segments that a MOVE_COMMAND holds, oldest first."""
+    """Return the serials of the segments in a MOVE_COMMAND, oldest first."""
     serials: list[int] = command.segments["id"][: command.count].tolist()
     return serials
 
 
-def read_segment(command: Message, serial: int) -> Segment:
-    """Return the segment of that serial, which must be in the window. Raises `ValueError` for an unknown kind
-    and for numbers that are not finite.
+def read_segment(command: Message, serial: int) -> MotionSegment:
+    """Return the segment with that serial, which must be in the window.
+
+    Raises `ValueError` for an unknown kind and for numbers that are not finite.
     """
     record = command.segments[window(command).index(serial)]
     count, kind, held = int(record["count"]), int(record["kind"]), int(record["object"])
@@ -47,7 +65,7 @@ def read_segment(command: Message, serial: int) -> Segment:
         raise ValueError(f"segment {serial}: kind {kind}; valid: 1 (path), 2 (gripper)")
     if not np.isfinite([record["by"], record["opening"], record["force"]]).all():
         raise ValueError(f"segment {serial}: by, opening or force is not finite")
-    return Segment(
+    return MotionSegment(
         id=serial,
         kind=SegmentKind(kind),
         object=held if held >= 0 else None,
@@ -57,4 +75,36 @@ def read_segment(command: Message, serial: int) -> Segment:
         by=float(record["by"]),
         opening=float(record["opening"]),
         force=float(record["force"]),
+    )
+
+
+@dataclass
+class Memory:
+    """The state with which the executor continues after a restart of its board; its own last messages hold it."""
+
+    done: int = 0  # newest segment done
+    interrupted: int = 0  # segment that was interrupted; 0: none
+    progress: float = 0.0  # part of its path done, 0 to 1
+    held: int | None = None  # row of the object in the gripper
+    opening: float = 0.0  # commanded to the gripper, m
+    force: float = 0.0  # commanded to the gripper, N
+
+    @property
+    def held_row(self) -> int:
+        """`held` as in messages: -1 for none."""
+        return self.held if self.held is not None else -1
+
+
+def recall(read: Ports) -> Memory | None:
+    """Return what the level's own last messages hold; None when it has never had anything to remember."""
+    status, command = read.last_status, read.last_command
+    if not (status.is_there and command.is_there and command.value.id):
+        return None
+    return Memory(
+        done=status.value.done,
+        interrupted=status.value.current,
+        progress=status.value.progress,
+        held=status.value.held if status.value.held >= 0 else None,
+        opening=command.value.opening,
+        force=command.value.force,
     )

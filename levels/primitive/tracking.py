@@ -1,4 +1,4 @@
-"""Whether the servo follows the set points: only then is there motion to go on with."""
+"""How set points reach the servo, and whether it follows them: motion continues only while it does."""
 
 from __future__ import annotations
 
@@ -9,59 +9,72 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.levels.level import Reading
 from rack.levels.messages import Error
-from rack.levels.primitive.fault import Fault
+from rack.levels.primitive.segment import SegmentFault
 
-MISSED_STATUSES = 3
-"""Cycles in a row without a new status after which the servo is silent."""
+LEAD_CYCLES = 2
+"""Cycles from the release that makes a set point to the tick at which it is due.
+
+One cycle of logical execution time brings it to the servo, which then interpolates to it over a second one."""
+SEEN_CYCLES = 2
+"""Cycles by which the world model lags behind the servo: a body that rests now has been seen at rest since then."""
 HANDOVER_CYCLES = 4
 """Cycles from the first set point until a status must show that the servo follows it."""
-REST_RAD_S = 1e-3
+MAX_MISSED_STATUSES = 3
+"""Consecutive cycles without a new status after which the servo is silent."""
+MAX_REST_RAD_S = 1e-3
 """A joint whose interpolated set point is slower than this rests."""
+MAX_UNEXPLAINED_CYCLES = 50
+"""A wait longer than this gets a reason of its own; shorter ones are normal after a restart."""
 
 
 class Tracking:
-    """Tells from the servo's status whether it is in step with this level.
+    """Decides from the servo's status whether it is in step with this level.
 
-    The two fall out of step when one of them starts anew or misses so many cycles that the servo holds by itself.
-    They come in step where the servo holds the arm at rest and is not stopped, and motion goes on from there.
+    The two fall out of step when one of them restarts or misses so many cycles that the servo holds by itself. They
+    come into step where the servo holds the arm at rest and is not stopped, and motion continues from there.
     """
 
     def __init__(self) -> None:
         self.in_step = False
-        self.silent_cycles = 0
+        self.silent_cycles = 0  # consecutive cycles without a new status
         self._cycles_in_step = 0
+        self._unexplained_cycles = 0
 
     def update(self, status: Reading) -> bool:
-        """Take in one status; True in the cycle in which servo and level come in step."""
+        """Process one status; True in the cycle in which servo and level come into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
         servo = status.value
         left_alone = bool(servo.holding) and self._cycles_in_step > HANDOVER_CYCLES
-        if self.silent_cycles > MISSED_STATUSES or left_alone or servo.stopped:
+        if self.silent_cycles > MAX_MISSED_STATUSES or left_alone or servo.stopped:
             self.in_step = False
+        self._unexplained_cycles = 0 if self.in_step or servo.stopped else self._unexplained_cycles + 1
         if self.in_step or not heard or not servo.holding or servo.stopped:
             return False
-        # Written so that what is no number does not rest.
-        if not np.abs(servo.target_velocity).max() <= REST_RAD_S or not np.isfinite(servo.target).all():
+        # Written so that NaN does not count as rest.
+        if not np.abs(servo.target_velocity).max() <= MAX_REST_RAD_S or not np.isfinite(servo.target).all():
             return False
         self.in_step, self._cycles_in_step = True, 0
         return True
 
-
-def awaited(servo: Message, silent_cycles: int) -> str:
-    """Say what is awaited of a servo level that is out of step."""
-    if silent_cycles > MISSED_STATUSES:
-        return f"waiting for servo: no status for {silent_cycles} cycles"
-    if servo.state == State.HOLDING and servo.reason:
-        return f"waiting for servo: {servo.reason}"
-    if servo.standing:
-        return "waiting for servo: held by the operator until `resume`"
-    return f"waiting for servo: {'brakes engaged' if servo.braked else 'it does not follow set points'}"
+    def awaited(self, servo: Message) -> str:
+        """Return what a level out of step waits for."""
+        if self.silent_cycles > MAX_MISSED_STATUSES:
+            return f"waiting for servo: no status for {self.silent_cycles} cycles"
+        if servo.state == State.HOLDING and servo.reason:
+            return f"waiting for servo: {servo.reason}"
+        if servo.standing:
+            return "waiting for servo: held by the operator until `resume`"
+        if servo.braked:
+            return "waiting for servo: brakes engaged"
+        if self._unexplained_cycles > MAX_UNEXPLAINED_CYCLES:
+            return "waiting for servo: it does not report `holding` with a target at rest"
+        return "waiting for servo: it does not follow set points"
 
 
 class Straying:
-    """Counts cycles in which the arm is not where the servo wants it: a few may be, and motion holds meanwhile."""
+    """Counts cycles in which the arm is away from its set point: a few are permitted, and motion holds meanwhile."""
 
     def __init__(self, joints: Sequence[str], permitted_rad: float, permitted_cycles: int) -> None:
         self._joints = joints
@@ -69,7 +82,7 @@ class Straying:
         self._permitted_cycles = permitted_cycles
         self._cycles = 0
         self.place = ""  # which joint is how far away; empty: none is
-        self.fault: Fault | None = None
+        self.fault: SegmentFault | None = None
 
     @property
     def strays(self) -> bool:
@@ -77,11 +90,11 @@ class Straying:
         return self._cycles > 0
 
     def forget(self) -> None:
-        """Begin to count anew."""
+        """Start counting anew."""
         self._cycles, self.place, self.fault = 0, "", None
 
     def update(self, servo: Message) -> None:
-        """Take in one status; `fault` is set when a joint has been too far away for too long."""
+        """Process one status; set `fault` when a joint has been too far away for too long."""
         away = np.abs(servo.position - servo.target)
         if away.max() <= self._permitted_rad:
             self.forget()
@@ -90,25 +103,4 @@ class Straying:
         joint = int(away.argmax())
         self.place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
         if self._cycles > self._permitted_cycles:
-            self.fault = Fault(Error.FOLLOWING, f"{self.place}; at most {self._permitted_rad} is valid")
-
-
-class Quiet:
-    """Counts cycles: enough quiet ones in a row mean settled, too many altogether mean that it never will."""
-
-    def __init__(self, wanted_cycles: int, most_cycles: int) -> None:
-        self._wanted_cycles = wanted_cycles
-        self._most_cycles = most_cycles
-        self._quiet = 0
-        self._cycles = 0
-
-    def settled(self, quiet: bool) -> bool:
-        """Take in one cycle; say whether it has settled."""
-        self._cycles += 1
-        self._quiet = self._quiet + 1 if quiet else 0
-        return self._quiet >= self._wanted_cycles
-
-    @property
-    def overdue(self) -> bool:
-        """True when it should have settled long ago."""
-        return self._cycles > self._most_cycles
+            self.fault = SegmentFault(Error.FOLLOWING, f"{self.place}; valid: at most {self._permitted_rad} rad")

@@ -1,4 +1,4 @@
-"""Actions as elemental moves: of the ways to do an action, the quickest that can be gone to its end."""
+"""Actions as elemental moves: of the ways to do an action, the quickest that succeeds to its end."""
 
 from __future__ import annotations
 
@@ -7,34 +7,33 @@ from contextlib import contextmanager
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
-from rack.levels.planning.motion import MotionPlanner, at
+from rack.levels.planning.motion_planner import MotionPlanner, in_metres
+from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose
-from rack.levels.planning.situation import Situation
 from rack.levels.tables import SceneConfig
 from rack.levels.task.grasps import DOWN, goals, grasps, standing
 from rack.levels.task.program import Goto, Home, TaskConfig, Transfer
 from rack.levels.task.rehearsal import Rehearsal
 
-Array = NDArray[np.float64]
 Option = TypeVar("Option")
 
 TURNS = 8
 """Turns about the tool's z axis that are tried where only its direction is given."""
-WAYS = 16
+MAX_WAYS = 16
 """Ways to do an action that are tried to their end."""
 HALVINGS = 7
-"""Halvings in the search for what is reachable on the way to a place that is not."""
+"""Halvings in the search for a reachable place on the way to one that is not."""
 
 
 class Spot(NamedTuple):
-    """A pose of the tool at an object, and a configuration (joints,), rad, straight above it."""
+    """A pose of the tool at an object."""
 
     tool: Pose
-    above: Array
+    above: Array  # a configuration straight above it, (joints,), rad
 
 
 class Way(NamedTuple):
@@ -60,16 +59,16 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 
 @contextmanager
-def _naming(what: str) -> Iterator[None]:
-    """Say in a refusal what was refused."""
+def _naming(step: str) -> Iterator[None]:
+    """Begin the reason of a refusal with the step that was refused."""
     try:
         yield
     except Refused as refused:
-        raise Refused(refused.code, f"{what}: {refused}") from refused
+        raise Refused(refused.code, f"{step}: {refused}") from refused
 
 
 def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
-    """Return the rehearsal behind a goto. Raises `Refused`."""
+    """Return the rehearsal after a goto. Raises `Refused`."""
     if action.joints is not None:
         return rehearsal.then(k, Verb.MOVE_JOINTS, joints=np.array(action.joints))
     assert action.position is not None, "a goto has joints or a position"
@@ -84,102 +83,112 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
     if not ends:
         raise _nothing_at(motion, tools, rehearsal.q)
     ends.sort(key=lambda end: motion.ik.time_between(rehearsal.q, end[1]))
-    return _first(ends[:WAYS], lambda end: rehearsal.then(k, Verb.MOVE, end[0], joints=end[1]))
+    return _first(ends[:MAX_WAYS], lambda end: rehearsal.then(k, Verb.MOVE, tool=end[0], joints=end[1]))
 
 
 def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:
-    """Return the rehearsal behind a transfer. Raises `Refused` that says whether it is to pick or to place."""
-    row = scene.objects.index(action.object)
+    """Return the rehearsal after a transfer. Raises `Refused` that names the step, pick or place."""
+    handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"action {k}, pick {action.object}"
     place = f"action {k}, place {action.object} at {list(action.to)}"
     with _naming(place):
+        situation, row = rehearsal.situation, handling.row
         standing_goals = [
-            standing(rehearsal.motion.cell, rehearsal.situation, action.object, row, goal)
-            for goal in goals(action, rehearsal.situation.object_pose(row))
+            standing(rehearsal.motion.cell, situation, row, goal) for goal in goals(action, situation.object_pose(row))
         ]
     with _naming(pick):
-        takes = _takes(rehearsal, row, action.lift)
+        takes = handling.takes()
     with _naming(place):
-        ways = _ways(rehearsal, row, takes, standing_goals, action.lift)
+        ways = handling.ways(takes, standing_goals)
 
     def transferred(way: Way) -> Rehearsal:
         with _naming(pick):
-            taken = _moved(rehearsal, k, row, way.take, action.lift, Verb.GRASP)
+            taken = handling.moved(rehearsal, k, way.take, Verb.GRASP)
         with _naming(place):
-            return _moved(taken, k, row, way.put, action.lift, Verb.RELEASE)
+            return handling.moved(taken, k, way.put, Verb.RELEASE)
 
-    return _first(ways[:WAYS], transferred)
-
-
-def _moved(rehearsal: Rehearsal, k: int, row: int, spot: Spot, lift: float, verb: Verb) -> Rehearsal:
-    """Return the rehearsal behind the four moves of a grasp or a release. Raises `Refused`."""
-    above = spot.tool.raised(lift)
-    rehearsal = rehearsal.then(k, Verb.MOVE, above, None if verb is Verb.GRASP else row, spot.above)
-    rehearsal = rehearsal.then(k, Verb.APPROACH, spot.tool, row)
-    rehearsal = rehearsal.then(k, verb, spot.tool, row)
-    return rehearsal.then(k, Verb.DEPART, above, row)
+    return _first(ways[:MAX_WAYS], transferred)
 
 
-def _ways(rehearsal: Rehearsal, row: int, takes: list[Spot], standing_goals: list[Pose], lift: float) -> list[Way]:
-    """Return ways to do a transfer, the quickest to move first. Raises `Refused` when there is none."""
-    motion, situation, here = rehearsal.motion, rehearsal.situation, rehearsal.q
-    seen = situation.object_pose(row)
-    ways: list[Way] = []
-    puts: list[tuple[Pose, list[Spot]]] = []
-    for take in takes:
-        grip = take.tool.inverse() @ seen
-        for goal in standing_goals:
-            tool = goal @ grip.inverse()
-            same = next((spots for known, spots in puts if known.is_near(tool)), None)
-            if same is None:
-                same = _spots(motion, situation.holding(row, grip), row, tool, here, lift)
-                puts.append((tool, same))
-            ways += [Way(take, put) for put in same]
-    if not ways:
-        raise _nothing_at(motion, [place for tool, _ in puts for place in (tool, tool.raised(lift))], here)
-    pace = motion.ik.time_between
-    return sorted(ways, key=lambda way: pace(here, way.take.above) + pace(way.take.above, way.put.above))
+class Handling(NamedTuple):
+    """A transfer as planning sees it: the tool goes straight down to the object and straight up again."""
 
+    start: Rehearsal
+    row: int  # of the object
+    lift: float  # height of the straight motions, m
 
-def _takes(rehearsal: Rehearsal, row: int, lift: float) -> list[Spot]:
-    """Return where object `row` can be taken and held, at the lowest height at which it can. Raises `Refused`."""
-    motion, situation, here = rehearsal.motion, rehearsal.situation, rehearsal.q
-    refusal: Refused | None = None
-    for tools in grasps(motion.cell, situation, row):
-        takes = [spot for tool in tools for spot in _spots(motion, situation, row, tool, here, lift)]
-        if takes:
-            return _held(motion, situation, row, takes)
-        refusal = refusal or _nothing_at(motion, [place for t in tools for place in (t, t.raised(lift))], here)
-        if refusal.code == Error.UNREACHABLE:
-            break
-    assert refusal is not None, "there is at least one height"
-    raise refusal
+    def takes(self) -> list[Spot]:
+        """Return where the object can be taken and held, at the lowest height at which it can. Raises `Refused`."""
+        start = self.start
+        refusal: Refused | None = None
+        for tools in grasps(start.motion.cell, start.situation, self.row):
+            takes = [spot for tool in tools for spot in self._spots(tool, start.situation)]
+            if takes:
+                return self._held(takes)
+            refusal = refusal or self._nothing_at(tools)
+            if refusal.code == Error.UNREACHABLE:
+                break
+        assert refusal is not None, "there is at least one height"
+        raise refusal
 
+    def ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
+        """Return ways to do the transfer, the quickest to move first. Raises `Refused` when there is none."""
+        situation, here = self.start.situation, self.start.q
+        ways: list[Way] = []
+        puts: list[tuple[Pose, list[Spot]]] = []
+        for take in takes:
+            grip = take.tool.inverse() @ situation.object_pose(self.row)
+            for goal in standing_goals:
+                tool = goal @ grip.inverse()
+                same = next((spots for known, spots in puts if known.is_near(tool)), None)
+                if same is None:
+                    same = self._spots(tool, situation.holding(self.row, grip))
+                    puts.append((tool, same))
+                ways += [Way(take, put) for put in same]
+        if not ways:
+            raise self._nothing_at([tool for tool, _ in puts])
+        pace = self.start.motion.ik.time_between
+        return sorted(ways, key=lambda way: pace(here, way.take.above) + pace(way.take.above, way.put.above))
 
-def _held(motion: MotionPlanner, situation: Situation, row: int, takes: list[Spot]) -> list[Spot]:
-    """Return where gripper and motors can hold object `row`. Raises the `Refused` of the first spot when none is."""
-    held: list[Spot] = []
-    refusals: list[Refused] = []
-    for take in takes:
-        grip = take.tool.inverse() @ situation.object_pose(row)
-        try:
-            motion.payloads.check_grip(row, grip)
-            motion.payloads.check_motors(row, grip, take.above[None, :])
-            held.append(take)
-        except Refused as refused:
-            refusals.append(refused)
-    if not held:
-        raise refusals[0]
-    return held
+    def moved(self, rehearsal: Rehearsal, k: int, spot: Spot, verb: Verb) -> Rehearsal:
+        """Return the rehearsal after the four moves of a grasp or a release for action `k`. Raises `Refused`."""
+        above, row = spot.tool.raised(self.lift), self.row
+        over = None if verb is Verb.GRASP else row
+        rehearsal = rehearsal.then(k, Verb.MOVE, tool=above, row=over, joints=spot.above)
+        rehearsal = rehearsal.then(k, Verb.APPROACH, tool=spot.tool, row=row)
+        rehearsal = rehearsal.then(k, verb, tool=spot.tool, row=row)
+        return rehearsal.then(k, Verb.DEPART, tool=above, row=row)
 
+    def _spots(self, tool: Pose, situation: Situation) -> list[Spot]:
+        """Return the free configurations above `tool` from which the arm can come down to it."""
+        motion = self.start.motion
+        situation.lay_out(motion.checker, None)
+        above = motion.ik.solutions(tool.raised(self.lift), self.start.q, motion.checker.free)
+        situation.lay_out(motion.checker, self.row)
+        ends = [(q, motion.ik.reach(tool, q)) for q in above]
+        return [Spot(tool, q) for q, end in ends if end is not None and motion.checker.free(end)]
 
-def _spots(motion: MotionPlanner, situation: Situation, row: int, tool: Pose, here: Array, lift: float) -> list[Spot]:
-    """Return the free configurations above `tool` from which the arm can come down to it."""
-    situation.lay_out(motion.checker, None)
-    above = motion.ik.solutions(tool.raised(lift), here, motion.checker.free)
-    situation.lay_out(motion.checker, row)
-    ends = [(q, motion.ik.reach(tool, q)) for q in above]
-    return [Spot(tool, q) for q, end in ends if end is not None and motion.checker.free(end)]
+    def _held(self, takes: list[Spot]) -> list[Spot]:
+        """Return the spots where gripper and motors can hold the object. Raises the first `Refused` when none can."""
+        payloads, seen = self.start.motion.payloads, self.start.situation.object_pose(self.row)
+        held: list[Spot] = []
+        refusals: list[Refused] = []
+        for take in takes:
+            grip = take.tool.inverse() @ seen
+            try:
+                payloads.check_grip(self.row, grip)
+                payloads.check_motors(self.row, grip, take.above[None, :])
+                held.append(take)
+            except Refused as refused:
+                refusals.append(refused)
+        if not held:
+            raise refusals[0]
+        return held
+
+    def _nothing_at(self, tools: list[Pose]) -> Refused:
+        """Return the refusal for poses of which the arm reaches none, from above, or none freely."""
+        places = [place for tool in tools for place in (tool, tool.raised(self.lift))]
+        return _nothing_at(self.start.motion, places, self.start.q)
 
 
 def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
@@ -207,4 +216,5 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
         middle = 0.5 * (low + high)
         reached = bool(motion.ik.reachable(Pose(begin.towards(end, middle).position, end.quaternion), here))
         low, high = (middle, high) if reached else (low, middle)
-    return Refused(Error.UNREACHABLE, f"out of reach: {at(end)}; in reach: {at(begin.towards(end, low))}")
+    in_reach = begin.towards(end, low)
+    return Refused(Error.UNREACHABLE, f"out of reach: {in_metres(end)}; in reach: {in_metres(in_reach)}")

@@ -1,4 +1,4 @@
-"""Where the gripper may take an object, and where an object comes to stand."""
+"""Where the gripper may take an object, and where an object can stand."""
 
 from __future__ import annotations
 
@@ -6,34 +6,34 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
+from rack.levels.planning.collision import place_bodies
+from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
-from rack.levels.planning.situation import Situation
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geom_name, geoms_of
 from rack.levels.task.program import Transfer
 
-Array = NDArray[np.float64]
-
 DOWN = (0.0, 0.0, -1.0)
 QUARTERS = (0, 1, -1, 2)
-"""Quarter turns between object and gripper, in the order in which they are tried."""
+"""Quarter turns between object and gripper, in the order of trying."""
 HEIGHT_STEP_M = 0.01
-"""Grasps above the object's origin are this far apart: a tall object is taken higher, so that the palm stays clear."""
+"""Spacing of grasps above the object's origin: a tall object is taken higher, so that the palm stays clear."""
 SET_DOWN_M = 0.0005
 """Gap between an object and its support when the gripper opens."""
-FARTHEST_M = 10.0
+MAX_DISTANCE_M = 10.0
+"""Range in which distances between geoms are measured."""
 SKIN_M = 1e-6
-"""A ray that has met the arm goes on this far behind the surface."""
-STANDING_M = 0.02
-"""A goal whose height is farther than this from standing on a support is a mistake of the program."""
+"""A ray that has met the arm continues this far inside the surface."""
+MAX_STANDING_GAP_M = 0.02
+"""A goal farther than this above or below a standing height is a mistake in the program."""
 
 
 def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
-    """Yield, from the lowest height up, the poses of the tool that take object `row` from above.
+    """Yield, from the lowest height up, the tool poses that take object `row` from above.
 
     The fingers close along the tool's y axis, across the object's x or y axis.
     """
@@ -46,7 +46,7 @@ def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
 
 
 def goals(action: Transfer, at: Pose) -> Iterator[Pose]:
-    """Yield poses in which the object may be put down: as it stands now, turned about the vertical."""
+    """Yield poses in which the object may be put down: upright as it is now, turned about the vertical."""
     yaw = yaw_of(at.quaternion)
     turns = [action.yaw - yaw] if action.yaw is not None else [quarter * np.pi / 2.0 for quarter in QUARTERS]
     for turn in turns:
@@ -55,12 +55,13 @@ def goals(action: Transfer, at: Pose) -> Iterator[Pose]:
         yield pose(action.to, quaternion)
 
 
-def standing(cell: Cell, situation: Situation, name: str, row: int, goal: Pose) -> Pose:
-    """Return `goal` at the height at which object `row`, called `name`, stands on the support below it.
+def standing(cell: Cell, situation: Situation, row: int, goal: Pose) -> Pose:
+    """Return `goal` at the height at which object `row` stands on the support below it.
 
     Raises `Refused` for a goal over no support, or far above or below one.
     """
     model, data = cell.model, _laid_out(cell, situation.with_body(row, goal))
+    name = model.body(cell.bodies[row]).name
     x, y, z = goal.position
     support = _geom_below(cell, data, row, goal.position)
     if support not in cell.supports:
@@ -68,8 +69,8 @@ def standing(cell: Cell, situation: Situation, name: str, row: int, goal: Pose) 
         place = f"over '{geom_name(model, support)}'" if support >= 0 else "over nothing"
         raise Refused(Error.UNREACHABLE, f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}")
     parts = geoms_of(model, below(model, cell.bodies[[row]]))
-    gap = min(mujoco.mj_geomDistance(model, data, int(part), support, FARTHEST_M, None) for part in parts)
-    if abs(gap) > STANDING_M:
+    gap = min(mujoco.mj_geomDistance(model, data, int(part), support, MAX_DISTANCE_M, None) for part in parts)
+    if abs(gap) > MAX_STANDING_GAP_M:
         side = "above" if gap > 0 else "deep in"
         place = f"{abs(gap) * 1e3:.0f} mm {side} '{geom_name(model, support)}'"
         raise Refused(Error.UNREACHABLE, f"at z = {z:.3f} '{name}' would be {place}; valid z: {z - gap:.3f}")
@@ -77,7 +78,7 @@ def standing(cell: Cell, situation: Situation, name: str, row: int, goal: Pose) 
 
 
 def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
-    """Return the geom straight below `point` that is neither object `row` nor the arm; -1: there is none."""
+    """Return the first geom below `point` that is neither object `row` nor the arm; -1: there is none."""
     found, body = np.full(1, -1, dtype=np.int32), int(cell.bodies[row])
     begin = point.copy()
     while True:
@@ -90,10 +91,7 @@ def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
 def _laid_out(cell: Cell, situation: Situation) -> mujoco.MjData:
     """Return data of the cell with the bodies as in `situation`."""
     data = cell.start()
-    for row, address in enumerate(cell.object_qpos):
-        data.qpos[address : address + 7] = np.concatenate(situation.object_pose(row))
-    for row, mocap in enumerate(cell.mocap, start=len(cell.object_qpos)):
-        data.mocap_pos[mocap], data.mocap_quat[mocap] = situation.object_pose(row)
+    place_bodies(cell, data, situation.positions, situation.quaternions)
     mujoco.mj_kinematics(cell.model, data)
     return data
 
@@ -102,7 +100,7 @@ def _top(cell: Cell, situation: Situation, row: int) -> float:
     """Return the height of the highest point of object `row`, from its bounding boxes, in m."""
     model, data = cell.model, _laid_out(cell, situation)
     parts = geoms_of(model, below(model, cell.bodies[[row]]))
-    # A box's extent along z: its half sizes, seen along the third row of its rotation.
+    # A box's extent along z: its half sizes times the third row of its rotation.
     vertical = data.geom_xmat[parts].reshape(-1, 3, 3)[:, 2, :]
     centre, half = model.geom_aabb[parts, :3], model.geom_aabb[parts, 3:]
     heights = data.geom_xpos[parts, 2] + np.sum(vertical * centre, axis=1) + np.sum(np.abs(vertical) * half, axis=1)

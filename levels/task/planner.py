@@ -1,59 +1,57 @@
-"""The planner of the task level: the whole program as elemental moves, or the reason why it cannot be done."""
+"""The planner of the task level: the whole program as elemental moves, or why it cannot be done."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 
-from rack.backplane.message import Message, MessageType
+from rack.backplane.message import Message
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
-from rack.levels.planning.situation import Situation
+from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
-from rack.levels.task.finish import Rehearsed, cycles_of, finish_times
-from rack.levels.task.params import TaskParams
-from rack.levels.task.program import TaskConfig, read_program
+from rack.levels.task.program import TaskConfig, TaskParams, read_program
+from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times, pipeline_periods
 
-AT_REST_M_S = 0.01
-"""An object slower than this lies still: its place can be planned with."""
+MAX_REST_M_S = 0.01
+"""An object slower than this is at rest: its position can be planned with."""
 
 
 class TaskPlanner(Planner):
-    """Plans the program once, as soon as the arm is known to be somewhere and the objects lie still.
+    """Plans the program once, as soon as the position of the arm is known and the objects are at rest.
 
-    Everything that cannot be done is refused before anything moves, with what could be done instead.
+    Whatever cannot be done is refused before anything moves, with what could be done instead.
     """
 
-    inputs: ClassVar[Mapping[str, Input]] = {
+    inputs = {
         "status": Input(TASK_STATUS, "own.status"),
         "made": Input(TASK_PLAN, "own.plan"),
         "servo": Input(SERVO_STATUS, "servo.status"),
         "world": Input(WORLD_MODEL, "world.model"),
     }
-    output: ClassVar[MessageType] = TASK_PLAN
+    output = TASK_PLAN
     params = TaskParams
     program = TaskConfig
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        # OMPL takes time and memory to import: the process of a planner pays, no other.
-        from rack.levels.planning.motion import MotionPlanner
+        # OMPL takes time and memory to import: only a planner's process pays for it.
+        from rack.levels.planning.motion_planner import MotionPlanner
 
         self._program = read_program(context.task, context.robot, context.scene)
         self._needs = read_params(TaskParams, context.params)
-        self._cycles = cycles_of(context)
+        self._periods = pipeline_periods(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
-        self._plan: Message | None = None
-        self._visible_at = 0
-        self._since: int | None = None
+        self._plan: Message | None = None  # made by this process
+        self._visible_at = 0  # tick from which it is visible
+        self._since: int | None = None  # tick of the first cycle
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Say whether the program is still to be planned and the world can be planned with."""
+        """Return whether the program is still to be planned and the world is known and at rest."""
         self._since = tick if self._since is None else self._since
         followed = read.status.is_there and read.status.value.echo
         if not self._program.action or followed or self._is_on_its_way(read, tick, self._since):
@@ -64,10 +62,10 @@ class TaskPlanner(Planner):
             return False
         objects = len(self.context.scene.objects)
         speeds = np.linalg.norm(read.world.value.velocity[:objects], axis=1)
-        return bool(np.all(speeds < AT_REST_M_S))
+        return bool(np.all(speeds < MAX_REST_M_S))
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Decompose the whole program into `write`, or refuse it there; a plan that was lost is published again."""
+        """Decompose the whole program into `write`, or refuse it; a plan that was lost is published again."""
         self._visible_at = tick + self._slice
         if self._plan is not None:
             write.copy_from(self._plan)
@@ -86,16 +84,15 @@ class TaskPlanner(Planner):
         return self.context.within_cycles * self.context.every
 
     def _is_on_its_way(self, read: Ports, tick: int, since: int) -> bool:
-        """Say whether the executor may still come to show a plan: of this process, or of one before it."""
+        """Return whether the executor may still report a plan: of this process, or of one before it."""
         if self._plan is not None:
-            # Visible there, it takes a cycle to be read and to be seen in the status.
+            # Once visible, it takes a cycle to be read and to be seen in the status.
             return tick <= self._visible_at + self.context.every
-        # One that died just after it had published is not seen at once.
+        # A planner that died just after publishing: its plan is not seen at once.
         return read.made.is_there or 0 < since <= tick < since + self._slice
 
     def _decompose(self, read: Ports, write: Message, tick: int) -> None:
         from rack.levels.task.actions import rehearse
-        from rack.levels.task.rehearsal import Rehearsal
 
         world = read.world.value
         situation = Situation(np.array(world.position), np.array(world.quaternion))
@@ -103,16 +100,16 @@ class TaskPlanner(Planner):
         moves = self._with_times(rehearse(self._program, self.context.scene, start).moves)
         if len(moves) > MOVES:
             raise Refused(Error.LIMIT, f"the program has {len(moves)} elemental moves; at most {MOVES} are valid")
-        # Planned within its cycles, the plan is read at once and handed down, to be visible a cycle later.
+        # The plan is ready within its cycles, is read and handed down at once, and is visible below a cycle later.
         visible_s = (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
-        finish_s = finish_times(moves, visible_s, self._cycles, self._needs)
+        finish_s = finish_times(moves, visible_s, self._periods, self._needs)
         self._promise(moves, finish_s, write)
         for k, (move, _) in enumerate(moves):
             move.write_to(write.moves[k])
         write.count = len(moves)
 
     def _with_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
-        """Give the last move of each action the time by which it must be done below, to be known here in time."""
+        """Set the time by which the last move of each action must be done below, for this level to report in time."""
         timed = list(moves)
         for k, (move, duration_s) in enumerate(moves):
             by_s = self._program.action[move.action].by
@@ -121,7 +118,7 @@ class TaskPlanner(Planner):
         return timed
 
     def _promise(self, moves: Sequence[Rehearsed], finish_s: Sequence[float], write: Message) -> None:
-        """Raise `Refused` with the earliest time that can be promised, when an action cannot be done by its time."""
+        """Raise `Refused` with the earliest possible time if an action cannot be done by its time."""
         for (move, _), earliest_s in zip(moves, finish_s, strict=True):
             action = self._program.action[move.action]
             if move.by_s and action.by is not None and earliest_s > action.by:

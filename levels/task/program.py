@@ -1,4 +1,4 @@
-"""The `[task]` table: a program of actions."""
+"""The task in a config: the `[task]` table, a program of actions, and the parameters of the level."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Vector = tuple[Finite, Finite, Finite]
 
 
 class Action(Table):
-    """What every action has."""
+    """Base of all actions."""
 
     by: Positive | None = Field(None, description="simulated time by which the action must be done, s")
 
 
 class Transfer(Action):
-    """Take an object to another place."""
+    """Move an object to another place."""
 
     do: Literal["transfer"] = Field("transfer", description="the kind of action")
     object: str = Field(description="object of the scene")
@@ -34,7 +34,7 @@ class Transfer(Action):
 
 
 class Goto(Action):
-    """Bring the tool to a pose, or the joints to positions."""
+    """Move the tool to a pose, or the joints to positions."""
 
     do: Literal["goto"] = Field("goto", description="the kind of action")
     position: Vector | None = Field(None, description="of the tool, m")
@@ -60,7 +60,7 @@ class Goto(Action):
 
 
 class Home(Action):
-    """Bring the arm back to where it starts."""
+    """Move the arm back to its start."""
 
     do: Literal["home"] = Field("home", description="the kind of action")
 
@@ -69,7 +69,7 @@ class Home(Action):
 
 
 class TaskConfig(Program):
-    """A program: actions, done in their order."""
+    """A program: actions in their order."""
 
     action: tuple[Annotated[Transfer | Goto | Home, Field(discriminator="do")], ...] = Field(
         (), description="actions, done in their order"
@@ -80,6 +80,22 @@ class TaskConfig(Program):
         for k, action in enumerate(self.action if robot is not None else ()):
             for key, value, why in _misfits(action, cast(RobotConfig, robot), scene):
                 yield f"action[{k}].{key}", value, why
+
+
+class TaskParams(Table):
+    """Times that the levels below need at most, for the promise of a time, and how long they may make no progress.
+
+    In `[board.<name>.params]`; s of simulated time.
+    """
+
+    beginning: Positive = Field(0.1, description="from a segment's arrival in the primitive level to motion, s")
+    settling: Positive = Field(0.2, description="from the end of a motion to the report that it is done, s")
+    gripping: Positive = Field(0.6, description="time that the gripper takes to open or close and to settle, s")
+    stalled_s: Positive = Field(
+        90.0,
+        description="time without any progress after which the task ends, unless an operator holds it; longer than "
+        "the patience of the level below, s",
+    )
 
 
 def read_program(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> TaskConfig:

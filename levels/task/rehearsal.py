@@ -1,38 +1,43 @@
-"""A program played through in the mind: every move planned as the level below will plan it, with its duration."""
+"""A program played through before anything moves: every move planned as the level below will plan it, and timed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rack.levels.messages import Verb
-from rack.levels.planning.motion import MotionPlanner
-from rack.levels.planning.move import Move
+from rack.levels.algebra import Array
+from rack.levels.errors import LevelError
+from rack.levels.level import LevelContext
+from rack.levels.messages import SEGMENTS, WINDOW, Verb
+from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.pose import Pose
-from rack.levels.planning.situation import Situation
-from rack.levels.task.finish import Rehearsed
+from rack.levels.task.program import TaskParams
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:  # it brings OMPL, which only a planner's process needs
+    from rack.levels.planning.motion_planner import MotionPlanner
+
+
+class Rehearsed(NamedTuple):
+    """A move and the longest time that its motion takes."""
+
+    move: Move
+    duration_s: float  # 0 for the gripper
 
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Where a sequence of moves has led: configuration `q` (joints,), rad, situation, and the moves so far.
-
-    It does not change: `then` returns the next one, so that another way can be tried from the same point.
-    """
+    """The result of a sequence of moves. Immutable: `then` returns a new one, so other ways can be tried from here."""
 
     motion: MotionPlanner
-    q: Array
+    q: Array  # configuration at the end, (joints,), rad
     situation: Situation
     moves: tuple[Rehearsed, ...] = ()
 
     def then(
-        self, action: int, verb: Verb, tool: Pose | None = None, row: int | None = None, joints: Array | None = None
+        self, action: int, verb: Verb, *, tool: Pose | None = None, row: int | None = None, joints: Array | None = None
     ) -> Rehearsal:
-        """Return the rehearsal behind one more move; `joints` is its goal, or the posture at `tool`.
+        """Return the rehearsal after one more move; `joints` is its goal, or the posture at `tool`.
 
         Without `tool` the move ends at `joints`, or where the tool is. Raises `Refused` when the move cannot be done.
         """
@@ -53,3 +58,48 @@ class Rehearsal:
         path = self.motion.plan(move, self.q, self.situation, searches=1)
         rehearsed = Rehearsed(move, self.motion.paths.duration(path))
         return replace(self, q=path.end, moves=(*self.moves, rehearsed))
+
+
+class PipelinePeriods(NamedTuple):
+    """The periods on which the promise of a time depends, in s."""
+
+    own_s: float  # cycle of the task level
+    below_s: float  # cycle of the level below
+    planning_s: float  # time slice of a plan there
+
+
+def pipeline_periods(context: LevelContext) -> PipelinePeriods:
+    """Return the periods of a task level. Raises `LevelError` if it has no level below."""
+    if context.below is None:
+        raise LevelError(f"level '{context.board}' has no level below; it needs one to carry out its moves")
+    below_s = context.below.every * context.tick_s
+    return PipelinePeriods(context.period_s, below_s, below_s * context.below.within_cycles)
+
+
+def finish_times(
+    moves: Sequence[Rehearsed], visible_s: float, periods: PipelinePeriods, needs: TaskParams
+) -> list[float]:
+    """Return for every move the latest simulated time, in s, at which the task level knows that it is done.
+
+    `visible_s` is when the first window of moves becomes visible below. A move begins when the one before it is done,
+    its path is planned, and the window of segments has room for it; each message waits at most one cycle to be read
+    and one to be seen. The result assumes that nothing is in the way.
+    """
+    below = periods.below_s
+    done: list[float] = []
+    planned = visible_s
+    for k, (move, duration_s) in enumerate(moves):
+        shown = visible_s
+        if k >= WINDOW:
+            shown = max(visible_s, done[k - WINDOW] + 2.0 * below + 2.0 * periods.own_s)
+        if move.is_motion:
+            # The planner makes one plan after the other; only a move that it has waited for costs a cycle more.
+            planned = max(planned, shown + below) + periods.planning_s
+        at_hand = max(planned, shown) if move.is_motion else shown
+        room = done[k - SEGMENTS] + below if k >= SEGMENTS else 0.0
+        arrives = max(at_hand, room) + 2.0 * below
+        begun = max(arrives + needs.beginning, done[k - 1] if k else 0.0)
+        end = begun + (duration_s + needs.settling if move.is_motion else needs.gripping)
+        # A move with a time is stretched to end just before it: the next one begins no sooner.
+        done.append(max(end, move.by_s - 2.0 * below))
+    return [time_s + 2.0 * below + periods.own_s for time_s in done]

@@ -1,29 +1,38 @@
-"""What the task level shows of its plan: a window of moves, under ids that rise whatever an operator puts between."""
+"""The moves that the task level shows to the level below: a window on the plan, or an operator's goto in its place.
+
+A goto leaves the program during a free motion or right after one; that motion is done again afterwards, from wherever
+the arm then is. Work on an object is completed first: approach, grasp, depart.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message
+from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
 from rack.levels.messages import WINDOW, Verb
-from rack.levels.planning.move import Move
+from rack.levels.operator import Answer, Goal, Operation, Orders, described, joints_of
+from rack.levels.planning.moves import Move
+from rack.levels.planning.pose import pointing, pose
+from rack.levels.tables import RobotConfig
 
 JUMP = 2
-"""From the newest id shown to the next, where the level below must start anew: behind its own by more than one."""
-FIRST = 1
-"""Id of the plan's first move, as long as no operator has come between."""
+"""From the newest id shown to the next, so that the level below starts anew: a gap of more than one."""
+FIRST_ID = 1
+"""Id of the plan's first move, until an operator has intervened."""
 FREE = (Verb.MOVE, Verb.MOVE_JOINTS)
-"""Moves that may be left under way and done again later, wherever the arm has been meanwhile."""
+"""Moves that may be interrupted and done again later, from wherever the arm then is."""
+MAX_JOINT_RAD = 1e3
+"""No joint is sent farther; the level below knows what it can reach."""
 
 
 class ShownWindow:
-    """Numbers the moves of the plan on the bus: the plan's `k`-th is `first` + k; `newest` is the newest id shown.
+    """Numbers the moves on the bus: ids always rise, whatever an operator inserts."""
 
-    The level below has begun anew once it has done `before`.
-    """
-
-    def __init__(self, first: int = FIRST, newest: int = 0, before: int = 0) -> None:
-        self.first, self.newest, self.before = first, newest, before
+    def __init__(self, first: int = FIRST_ID, newest: int = 0, before: int = 0) -> None:
+        self.first = first  # id of the plan's first move: its k-th is `first` + k
+        self.newest = newest  # newest id shown
+        self.before = before  # the level below has started anew once it has done this id
 
     def jump(self) -> int:
         """Return an id with which the level below starts anew."""
@@ -32,20 +41,20 @@ class ShownWindow:
         return self.newest
 
     def renumber(self, done: int) -> None:
-        """Show the plan from its move `done` on, anew."""
+        """Show the plan anew from its move `done` on."""
         self.first = self.newest + JUMP - done
         self.before = self.first + done - 1
 
     def done(self, below: Message) -> int:
-        """Return how many of the plan's moves the level below says are done."""
+        """Return how many of the plan's moves the level below reports done."""
         return int(below.done) - self.first + 1
 
     def show(self, plan: Message, done: int, command: Message, until: int) -> None:
-        """Show the moves from the first one that is not done to `until`; behind the last, the window stays.
+        """Show the moves from the first one that is not done up to `until`; after the last, the window stays.
 
-        Moves that were done under other ids are not shown again: the level below would do them again.
+        Moves that were done under other ids are not shown again: the level below would repeat them.
         """
-        first = min(done, max(plan.count - WINDOW, 0)) if self.first == FIRST else done
+        first = min(done, max(plan.count - WINDOW, 0)) if self.first == FIRST_ID else done
         count = max(0, min(WINDOW, until - first))
         command.moves[:count] = plan.moves[first : first + count]
         command.moves["id"][:count] = np.arange(count) + (self.first + first)
@@ -70,10 +79,106 @@ class ShownWindow:
 
 
 def is_free(plan: Message, k: int) -> bool:
-    """Say whether move `k` of the plan is a free motion; so is what lies before the first and behind the last."""
+    """Return whether move `k` of the plan is a free motion; before the first and after the last move, True."""
     return not 0 <= k < plan.count or int(plan.moves["verb"][k]) in FREE
 
 
 def next_free(plan: Message, done: int) -> int:
-    """Return the first move of the plan, from `done` on, that is a free motion; the end of the plan, if none is."""
+    """Return the first free motion of the plan from move `done` on; without one, the end of the plan."""
     return next(k for k in range(done, plan.count + 1) if is_free(plan, k))
+
+
+class Detour:
+    """An operator's goto: one move in place of the program's, and then the rest of the program."""
+
+    def __init__(self, robot: RobotConfig, orders: Orders, window: ShownWindow, move: int = 0) -> None:
+        self._robot, self._orders, self._window = robot, orders, window
+        self._goal: Message | None = None
+        self._is_new = False
+        self.move = move  # id of the goto on the bus; 0: the program has not been left
+        self.holds = False  # the arm must rest before the program can be left
+        self.until: int | None = None  # the first move of the program that must not begin
+
+    @property
+    def is_known(self) -> bool:
+        """True unless this board has died and a hold came after the goto: then the goal is lost."""
+        return self._goal is not None
+
+    def reason(self) -> str:
+        """Return the state of the goto, and what ends it."""
+        goal = described(Operation.GOTO, self._goal.goal) if self._goal is not None else "goto"
+        stage = "done" if self._orders.answer is Answer.DONE else "under way"
+        return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
+
+    def begin(self, message: Message, is_new: bool) -> None:
+        """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under its id."""
+        goal = Message(message.record.dtype)
+        goal.copy_from(message)
+        try:
+            if goal.goal == Goal.JOINTS:
+                self._joints(goal)
+            elif goal.goal != Goal.HOME:
+                _check_pose(goal)
+        except ValueError as error:
+            self._orders.refuse(str(error))
+            return
+        self._goal, self._is_new = goal, is_new
+
+    def step(self, plan: Message, done: int, below: Message) -> int:
+        """Advance by one cycle; return how many of the plan's moves are done: `done`, or one less."""
+        self.holds, self.until = False, None
+        standing = self._orders.standing
+        if standing is Operation.NONE and self.move:
+            self._window.renumber(done)
+            self.move = 0
+        elif standing is Operation.GOTO and self.move:
+            if self._is_new:
+                self.move = self._window.jump()
+            self._follow(below)
+        elif standing is Operation.GOTO:
+            done = self._leave(plan, done, below)
+        self._is_new = False
+        return done
+
+    def _leave(self, plan: Message, done: int, below: Message) -> int:
+        """Leave the program where possible; until then show only the moves that must be done first."""
+        after_free = is_free(plan, done - 1)
+        is_begun = below.current == self._window.first + done
+        if not is_free(plan, done) and (is_begun or not after_free):
+            self.until = next_free(plan, done)
+            return done
+        self.until, self.holds = done, True
+        # At rest, the program can be left once the level below has received that nothing more is to begin.
+        if below.resting and below.operator >= self._orders.basis:
+            self.move, self.holds = self._window.jump(), False
+            return done if is_free(plan, done) else done - 1
+        return done
+
+    def as_move(self, action: int) -> Move:
+        """Return the goto as a move; `action` is the program's next, though the move serves none."""
+        goal = self._goal
+        assert goal is not None, "there is a move only for a goal"
+        joints, verb, tool = np.array(self._robot.home), Verb.MOVE_JOINTS, pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
+        if goal.goal == Goal.JOINTS:
+            joints = self._joints(goal)
+        elif goal.goal != Goal.HOME:
+            turned = goal.quaternion if goal.goal == Goal.POSE else pointing(goal.direction)
+            verb, tool = Verb.MOVE, pose(goal.position, turned)
+        return Move(self.move, action, verb, None, tool, joints, False, 0.0)
+
+    def _follow(self, below: Message) -> None:
+        if below.done >= self.move:
+            self._orders.done()
+        elif below.state == State.ERROR and below.done >= self._window.before:
+            self._orders.fail(below.reason)
+
+    def _joints(self, goal: Message) -> Array:
+        names = self._robot.joints
+        return joints_of(goal, names, np.tile((-MAX_JOINT_RAD, MAX_JOINT_RAD), (len(names), 1)))
+
+
+def _check_pose(goal: Message) -> None:
+    """Raise `ValueError` for an invalid position or orientation."""
+    turned = goal.quaternion if goal.goal == Goal.POSE else goal.direction
+    if not (np.isfinite(goal.position).all() and np.isfinite(turned).all() and turned.any()):
+        raise ValueError("position, quaternion or direction is not finite, or all zero")

@@ -196,7 +196,7 @@ def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> N
     assert np.abs(scene.tool_position - ASIDE).max() < 5e-3
     assert rack.task.detour > 0
     assert rack.task.state == State.HOLDING
-    assert rack.task.reason == "diverted by the operator: goto direction done; `resume` goes on"
+    assert rack.task.reason == "diverted by the operator: goto direction done; `resume` continues the program"
     rack.run(2.0)
     assert np.abs(rack.read("servo.scene").tool_position - ASIDE).max() < 5e-3
     operator.say("task", Operation.RESUME)

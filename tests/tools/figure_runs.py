@@ -9,21 +9,20 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.charting.measured import Run
-from rack.tools.charting.panel import Panel
+from rack.tools.charts.measured import TracedRun
+from rack.tools.charts.panel import Panel
 from rack.tools.display import SilentDisplay
-from rack.tools.recording import Recording
 from rack.tools.running import run_rack
+from rack.tools.runs.recording import Recording
 
 SLOWER = 4
-"""Times of these runs as multiples of the figures': what boards take for themselves, on a slow machine too, is little
-beside them."""
+"""Times of these runs as multiples of the figures': long compared with the boards' own work, on a slow machine too."""
 COMPUTED = 0.95
-"""Part of its budget that a figure computes then; some of the rest is the board's own work."""
+"""Part of its budget that a figure computes; some of the rest is the board's own work."""
 SECONDS = 0.6
 ATTEMPTS = 10
 QUIET, DISTURBED = 0.1, 0.25
-"""Parts of a run's time lost to others on its cores: below, it is a good one; above, it tells nothing of the rack."""
+"""Parts of a run's time lost to other programs: below the first a run is good, above the second useless."""
 
 
 def slowed(name: str) -> list[str]:
@@ -36,16 +35,16 @@ def slowed(name: str) -> list[str]:
     return [f"clock.speed={1 / SLOWER}", *settings, *(f"board.level.budget.{key}={ms}" for key, ms in times.items())]
 
 
-def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Run:
+def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> TracedRun:
     """Run a rack of the figures under a name of its own, into `folder`, and return the run."""
     config = load(name, [f"name=test-{os.getpid()}-{name}", *settings])
     result = run_rack(config, seconds, folder, SilentDisplay())
     assert result.worked, result.failure()
-    return Run(Recording(folder))
+    return TracedRun(Recording(folder))
 
 
-def undisturbed(name: str, folder: Path, *settings: str) -> Run:
-    """Return a run in which nobody outside the rack had its cores for long: of several attempts the best one."""
+def undisturbed(name: str, folder: Path, *settings: str) -> TracedRun:
+    """Return a run in which other programs had its cores only briefly: the best of several attempts."""
     best, least = None, DISTURBED
     for attempt in range(ATTEMPTS):
         found = run(name, folder / str(attempt), *slowed(name), *settings)
@@ -58,8 +57,8 @@ def undisturbed(name: str, folder: Path, *settings: str) -> Run:
     return best
 
 
-def lost(found: Run) -> float:
-    """Return the part of a run in which its tasks waited for a core, or were on one, and did not compute.
+def lost(found: TracedRun) -> float:
+    """Return the part of a run in which its tasks waited for a core, or were on one without computing.
 
     An executor is ready at its release, a planner when its executor has let go of the core.
     """
@@ -70,11 +69,11 @@ def lost(found: Run) -> float:
     return (waited + max(0, charted - computed)) / found.end_ns
 
 
-def whole(found: Run) -> Panel:
+def whole(found: TracedRun) -> Panel:
     """Return the panel of a whole run."""
     return found.panel(0, found.end_ns, lambda part: None)
 
 
 def usual(counts: Counter[str]) -> str:
-    """Return the pattern that came most often: a machine that wakes processes late makes many others, each seldom."""
+    """Return the most frequent pattern: a machine that wakes processes late makes many others, each rare."""
     return counts.most_common(1)[0][0]

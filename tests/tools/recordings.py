@@ -1,4 +1,4 @@
-"""Recordings whose trace is made up, in the files that a recorder writes."""
+"""Recordings with made-up traces, in the files that a recorder writes."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rack.backplane.trace import RECORD
+from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
 from rack.tools.recorder.cycles import CyclesFile
 from rack.tools.recorder.signals import SignalsFile
-from rack.tools.recording import Recording
+from rack.tools.runs.recording import Recording
 
-MS = 1_000_000
+MS, US = 1_000_000, 1_000
+EPOCH_NS = 5_000_000_123
+"""Time of tick 0 in the rows of `cycle`."""
+Row = tuple[int, ...]
 
 
 class Cycle(NamedTuple):
-    """One trace record, ms: `parts` are the stamped lengths of C, R, X, W; `processor` is counted beside them."""
+    """One trace record, ms: `parts` are the stamped lengths of C, R, X, W; `processor` is None for their sum."""
 
     tick: int
     parts: tuple[float, float, float, float]
@@ -28,29 +31,38 @@ class Cycle(NamedTuple):
     processor: float | None = None
     flags: int = 0
 
+    def row(self, period_ns: int) -> Row:
+        """Return the record; a tick takes `period_ns`."""
+        release = self.tick * period_ns
+        stamps = np.cumsum([round(ms * MS) for ms in (self.late, *self.parts)]) + release
+        processor = sum(self.parts) if self.processor is None else self.processor
+        return (self.tick, release, *stamps.tolist(), self.flags, 0, round(processor * MS))
+
+
+def cycle(
+    tick: int, tick_us: int, *moments_us: int, processor_us: int | None = None, skipped: int = 0, planned: bool = False
+) -> Row:
+    """Return a trace record released at `tick`; its moments, start to end, are us since tick 0."""
+    moments = [EPOCH_NS + moment * US for moment in moments_us]
+    flags = skipped << SKIPPED_SHIFT | (skipped > 0) * Flag.SKIPPED | planned * Flag.PLANNED
+    used = moments_us[-1] - moments_us[0] if processor_us is None else processor_us
+    return (tick, EPOCH_NS + tick * tick_us * US, *moments, flags, 0, used * US)
+
 
 def recorded(
     folder: Path,
     config: RackConfig,
-    traces: Mapping[str, Sequence[Cycle]],
+    traces: Mapping[str, Sequence[Cycle | Row]],
     events: Sequence[Mapping[str, Any]] = (),
 ) -> Recording:
-    """Write a recording of a rack whose tasks left these traces; return it."""
-    folder.mkdir()
+    """Write the recording of a rack whose tasks left these traces into `folder`; return it."""
+    folder.mkdir(exist_ok=True)
     (folder / "config.toml").write_text(config.text())
     (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
-    layout = wire(config)
-    signals = SignalsFile(folder / "signals.parquet", layout)
-    signals.close({})
-    cycles = CyclesFile(folder / "cycles.parquet")
+    cycles, signals = CyclesFile(folder / "cycles.parquet"), SignalsFile(folder / "signals.parquet", wire(config))
     for task, trace in traces.items():
-        cycles.add(task, np.array([_row(cycle, tick_ns(config)) for cycle in trace], RECORD))
+        rows = [cycle.row(tick_ns(config)) if isinstance(cycle, Cycle) else cycle for cycle in trace]
+        cycles.add(task, np.array(rows, RECORD))
     cycles.close({})
+    signals.close({})
     return Recording(folder)
-
-
-def _row(cycle: Cycle, period_ns: int) -> tuple[int, ...]:
-    release = cycle.tick * period_ns
-    stamps = np.cumsum([round(ms * MS) for ms in (cycle.late, *cycle.parts)]) + release
-    processor = sum(cycle.parts) if cycle.processor is None else cycle.processor
-    return (cycle.tick, release, *stamps.tolist(), cycle.flags, 0, round(processor * MS))

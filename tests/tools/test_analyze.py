@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +11,17 @@ import pytest
 from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
-from rack.tools.analysis.text import text
+from rack.tools.analysis.tables import text
 from rack.tools.display import SilentDisplay
 from rack.tools.running import run_rack
-from tests.processes import RACK
+from tests.tools.in_process import rack
 from tests.tools.recordings import MS, Cycle, recorded
 
-ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 30
 SETTLED = 40
 PLAIN = (0.0, 0.1, 1.0, 0.1)
 BUDGET = ["board.lower.budget.process_ms=1.0", "board.lower.budget.read_ms=0.2", "board.lower.budget.write_ms=0.2"]
 USUAL = ["--percentile", "50"]
 """What a machine whose host stalls it cannot change."""
-
-
-def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [*RACK, *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 
 def run_of(figure: str, name: str, folder: Path) -> Path:
@@ -38,28 +30,30 @@ def run_of(figure: str, name: str, folder: Path) -> Path:
     return folder
 
 
-def verdicts(told: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
+def verdicts(found: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
     """Return which equations hold on which subjects, on one side of the document."""
-    return {(row["equation"], row["subject"]): row[side]["holds"] for row in told["equations"] if row[side] is not None}
+    return {
+        (row["equation"], row["subject"]): row[side]["holds"] for row in found["equations"] if row[side] is not None
+    }
 
 
 @pytest.mark.alone
 def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_path: Path) -> None:
     done = rack("analyze", run_of("fig4", rack_name, tmp_path / "run"), *USUAL, "--json")
-    told = json.loads(done.stdout)
-    assert (done.returncode, told["holds"]) == (0, True), done.stderr
-    predicted, measured = verdicts(told, "predicted"), verdicts(told, "measured")
+    found = json.loads(done.stdout)
+    assert (done.returncode, found["holds"]) == (0, True), done.stderr
+    predicted, measured = verdicts(found, "predicted"), verdicts(found, "measured")
     assert all(predicted.values())
     assert {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load", "core 1")} <= set(measured)
     assert all(measured.values())
-    assert not any(row["disagrees"] for row in told["equations"])
-    level = told["levels"]["level"]
+    assert not any(row["disagrees"] for row in found["equations"])
+    level = found["levels"]["level"]
     assert level["measured"]["execution_ns"] == pytest.approx(level["predicted"]["execution_ns"], rel=0.1)
     assert level["measured"]["plan_ns"] == pytest.approx(level["predicted"]["plan_ns"], rel=0.1)
     assert "fits into 2 of its 2 cycles" in level["summary"]
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"analysis.json", "residuals.png", "residuals.svg"} <= written
-    assert json.loads((tmp_path / "run" / "analysis.json").read_text()) == told
+    assert json.loads((tmp_path / "run" / "analysis.json").read_text()) == found
 
 
 @pytest.mark.alone
@@ -70,13 +64,13 @@ def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_pa
     assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == [
         *("analysis.json", "residuals.png", "residuals.svg"),
     ]
-    told = json.loads((tmp_path / "analysis" / "analysis.json").read_text())
+    found = json.loads((tmp_path / "analysis" / "analysis.json").read_text())
     for side in ("predicted", "measured"):
-        failed = {key for key, holds in verdicts(told, side).items() if not holds}
+        failed = {key for key, holds in verdicts(found, side).items() if not holds}
         assert {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load", "core 1")} <= failed
-    broken = [breach for breach in told["breaches"] if breach["task"] == "level"]
+    broken = [breach for breach in found["breaches"] if breach["task"] == "level"]
     # Every cycle takes 7 of 6 ms.
-    assert len(broken) >= told["tasks"]["level"]["cycles"]
+    assert len(broken) >= found["tasks"]["level"]["cycles"]
     assert "failed: level 3.1" in done.stdout
     assert "more: --json has them all" in done.stdout
 
@@ -94,12 +88,12 @@ def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Pa
     differing = {pair.equation for pair in analysis.pairs if pair.disagrees}
     assert differing >= {"3.1", "3.6", "response time"}
     assert not analysis.holds
-    told = text(analysis)
-    assert "not as predicted: lower 3.1" in told
-    assert "lower: 2.8 of 2.5 ms used in the worst cycle, 1.2 usually" in told
-    assert "over its budget: X 2.6 of 1 ms" in told
-    assert "lower: 1 of 40 (2.5 %)" in told
-    assert "upper: never ran" in told
+    found = text(analysis)
+    assert "not as predicted: lower 3.1" in found
+    assert "lower: 2.8 of 2.5 ms used in the worst cycle, 1.2 usually" in found
+    assert "over its budget: X 2.6 of 1 ms" in found
+    assert "lower: 1 of 40 (2.5 %)" in found
+    assert "upper: never ran" in found
 
 
 def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(small: Path, tmp_path: Path) -> None:
@@ -110,29 +104,29 @@ def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(small: Path, tm
     assert not analysis.holds
     assert "failed in more than 1 of 100 cycles: none" in text(analysis)
     assert Analysis.of(recording, 99.0).holds
-    # Which cycle it was is told all the same.
+    # The cycle is listed all the same.
     assert [breach.tick for breach in Analysis.of(recording, 99.0).breaches] == [SETTLED + 7]
 
 
 def test_alpha_and_deviation_are_those_of_equation_3_6(small: Path, tmp_path: Path) -> None:
     trace = [Cycle(SETTLED, (0.0, 0.1, 2.0, 0.1)), Cycle(SETTLED + 1, (0.0, 0.4, 1.0, 0.1))]
     recording = recorded(tmp_path / "run", load(small, ["clock.mode=realtime"]), {"lower": trace})
-    told = document(Analysis.of(recording))
+    found = document(Analysis.of(recording))
     # 2.5 less the longest execution and the longest communication, each part at its longest.
-    assert told["levels"]["lower"]["measured"]["residual_ns"] == pytest.approx(0, abs=1)
+    assert found["levels"]["lower"]["measured"]["residual_ns"] == pytest.approx(0, abs=1)
     # Residuals of 0.3 and 1.0 ms.
-    assert told["tasks"]["lower"]["deviation_ms"] == pytest.approx(0.35)
-    assert told["levels"]["lower"]["predicted"] is None
+    assert found["tasks"]["lower"]["deviation_ms"] == pytest.approx(0.35)
+    assert found["levels"]["lower"]["predicted"] is None
 
 
 def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Path) -> None:
     trace = [Cycle(SETTLED + k, PLAIN, late=0.3 if k == 5 else 0.1) for k in (*range(8), 11)]
     traces = {"lower": trace}
-    told = document(Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces)))
-    task = told["tasks"]["lower"]
+    found = document(Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces)))
+    task = found["tasks"]["lower"]
     assert (task["lateness_ms"]["max"], task["lateness_ms"]["p50"]) == (0.3, 0.1)
     assert task["largest_gap_ms"] == 4 * 2.5
-    assert told["core_loads"] == {"core 0": pytest.approx(1.2 / 2.5)}
+    assert found["core_loads"] == {"core 0": pytest.approx(1.2 / 2.5)}
     lockstep = Analysis.of(recorded(tmp_path / "b", load(small), traces))
     task = document(lockstep)["tasks"]["lower"]
     assert (task["lateness_ms"], task["largest_gap_ms"], task["response_ms"]) == (None, None, None)
@@ -154,8 +148,8 @@ def test_the_tables_of_an_analysis_fit_the_terminal(small: Path, tmp_path: Path,
 def test_a_run_in_lockstep_is_analyzed_with_its_system_response(small: Path, rack_name: str, tmp_path: Path) -> None:
     settings = [f"name={rack_name}", "board.upper.rate_hz=10", "board.lower.rate_hz=80"]
     run_rack(load(small, settings), 4.0, tmp_path / "run", SilentDisplay())
-    told = json.loads(rack("analyze", tmp_path / "run", "--json").stdout)
-    measured = [(row["equation"], row["measured"]) for row in told["equations"] if row["measured"] is not None]
+    found = json.loads(rack("analyze", tmp_path / "run", "--json").stdout)
+    measured = [(row["equation"], row["measured"]) for row in found["equations"] if row["measured"] is not None]
     # 40 and 5 ticks: a command takes both cycles, a status waits for up to 35 ticks more.
     responses = [(found["left"], found["right"]) for equation, found in measured if equation == "3.3"]
     assert responses == [(45 * 2.5 * MS, 45 * 2.5 * MS), (80 * 2.5 * MS, 80 * 2.5 * MS)]

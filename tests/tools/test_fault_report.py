@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load
+from rack.tools.analysis.report import write_report
+from rack.tools.analysis.report_markdown import markdown
 from rack.tools.display import SilentDisplay
-from rack.tools.reporting.markdown import markdown
-from rack.tools.reporting.report import write_report
 from rack.tools.running import run_rack
 from rack.tools.viewer.reading import read
 

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 
 from rack.boards.config import load
-from tests.processes import RACK
-from tests.tools.traces import cycle, recorded
-
-ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 50
-
-
-def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [*RACK, "gantt", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+from tests.tools.in_process import rack
+from tests.tools.recordings import cycle, recorded
 
 
 @pytest.fixture
@@ -44,8 +35,8 @@ def run(tmp_path: Path) -> Path:
         ("fig4-overload", ["PPPPPPU-----PPPPPPU-----", "CRXXXXWCRXXXXWCRXXXXWCRX"]),
     ],
 )
-def test_a_figure_is_printed_as_the_paper_has_it_and_drawn(name: str, rows: list[str], tmp_path: Path) -> None:
-    shown = rack(name, "--out", tmp_path / "out")
+def test_a_figure_is_printed_as_in_the_paper_and_drawn(name: str, rows: list[str], tmp_path: Path) -> None:
+    shown = rack("gantt", name, "--out", tmp_path / "out")
     assert (shown.returncode, shown.stderr) == (0, "")
     assert [line.split()[-1] for line in shown.stdout.splitlines() if line.startswith("core ")] == rows
     assert ("late: level" in shown.stdout) == (name in ("fig3", "fig4-overload"))
@@ -55,13 +46,13 @@ def test_a_figure_is_printed_as_the_paper_has_it_and_drawn(name: str, rows: list
 
 
 def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_ms(tmp_path: Path) -> None:
-    shown = rack("fig2", "--process", "level=3,2", "--to-ms", 16, "--out", tmp_path)
+    shown = rack("gantt", "fig2", "--process", "level=3,2", "--to-ms", 16, "--out", tmp_path)
     assert "RXXXWPPPRXXWPPPU\n" in shown.stdout
     assert "R X W P | R X W P U: 10 of 10 plans" in shown.stdout
 
 
 def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> None:
-    shown = rack("fig3", "--cycles", "0-3", "--out", tmp_path, "--json")
+    shown = rack("gantt", "fig3", "--cycles", "0-3", "--out", tmp_path, "--json")
     assert shown.stderr == ""
     found = json.loads(shown.stdout)
     (panel,) = found["panels"]
@@ -75,7 +66,7 @@ def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> No
 
 
 def test_a_run_is_shown_above_the_schedule_of_its_config(run: Path) -> None:
-    shown = rack(run)
+    shown = rack("gantt", run)
     assert (shown.returncode, shown.stderr) == (0, "")
     # From the plan in the middle of the run, two slices.
     assert "measured, 80 to 112 ms" in shown.stdout
@@ -94,7 +85,7 @@ def test_a_run_without_budgets_is_shown_alone(tmp_path: Path) -> None:
     level = config.board["level"].model_copy(update={"budget": None})
     rows = [cycle(4 * n, 2000, *[8000 * n] * 4, 8000 * n + 1000) for n in range(9)]
     recorded(tmp_path / "run", config.model_copy(update={"board": {"level": level}}), {"level": rows})
-    shown = rack(tmp_path / "run", "--json")
+    shown = rack("gantt", tmp_path / "run", "--json")
     found = json.loads(shown.stdout)
     assert [panel["kind"] for panel in found["panels"]] == ["measured"]
     assert "no board has a budget" in found["notes"][0]
@@ -102,9 +93,9 @@ def test_a_run_without_budgets_is_shown_alone(tmp_path: Path) -> None:
 
 def test_a_run_in_lockstep_has_its_schedule_alone_and_says_why(tmp_path: Path) -> None:
     recorded(tmp_path / "run", load("fig2", ["clock.mode=lockstep"]), {"level": [cycle(0, 2000, 0, 0, 0, 0, 1000)]})
-    shown = rack(tmp_path / "run")
+    shown = rack("gantt", tmp_path / "run")
     assert "fig2: schedule, 0 to 32 ms" in shown.stdout
-    assert "ran in lockstep, and time stood still" in shown.stdout
+    assert "ran in lockstep: time stood still" in shown.stdout
     assert "measured" not in shown.stdout
 
 
@@ -115,21 +106,21 @@ def test_any_rack_has_a_schedule_where_it_has_budgets(tmp_path: Path) -> None:
         "board.world.budget.read_ms=1",
     )
     words = [word for setting in settings for word in ("--set", setting)]
-    shown = json.loads(rack("nasrem", *words, "--out", tmp_path, "--json").stdout)
+    shown = json.loads(rack("gantt", "nasrem", *words, "--out", tmp_path, "--json").stdout)
     lanes = {lane["board"]: lane["core"] for lane in shown["panels"][0]["lanes"]}
     assert {"servo": 1, "primitive": 0, "world": 0}.items() <= lanes.items()
 
 
 def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
-    shown = rack("nasrem", "--figure", 5, "--out", tmp_path)
+    shown = rack("gantt", "nasrem", "--figure", 5, "--out", tmp_path)
     assert (shown.returncode, shown.stderr) == (0, "")
-    assert "task, 1 s: multitasking: coupled tightly, as the figure has it" in shown.stdout
+    assert "task, 1 s: multitasking: coupled tightly, as in the figure" in shown.stdout
     assert (tmp_path / "figure5.png").read_bytes().startswith(b"\x89PNG")
     assert ElementTree.parse(tmp_path / "figure5.svg").getroot().tag.endswith("svg")
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["nosuch"], "no such file; by name: crossing, fig2"),
         (["runs/nosuch"], "runs/nosuch: no such run's folder, and no such config"),
@@ -138,13 +129,13 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
         (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),
         (["fig2", "--process", "arm=3"], "--process arm: no board of that name has a budget; boards: level"),
         (["fig2", "--from-ms", "5", "--to-ms", "5"], "5 to 5 ms: --to-ms must be later than --from-ms"),
-        (["fig2", "--out", "README.md"], "README.md: no place for pictures: File exists"),
+        (["fig2", "--out", "README.md"], "--out README.md: no folder for pictures: File exists"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(words: list[str], told: str) -> None:
-    shown = rack(*words)
+def test_bad_arguments_are_refused_in_one_line(words: list[str], message: str) -> None:
+    shown = rack("gantt", *words)
     assert (shown.returncode, shown.stdout) == (2, "")
-    assert told in shown.stderr
+    assert message in shown.stderr
     assert len(shown.stderr.splitlines()) == 1
 
 
@@ -153,19 +144,19 @@ def test_a_rack_without_budgets_has_no_schedule(tmp_path: Path) -> None:
     level = config.board["level"].model_copy(update={"budget": None})
     path = tmp_path / "bare.toml"
     path.write_text(config.model_copy(update={"board": {"level": level}}).text())
-    shown = rack(path)
+    shown = rack("gantt", path)
     assert (shown.returncode, shown.stdout) == (2, "")
     assert "no board has a budget: give [board.<name>.budget]" in shown.stderr
 
 
 def test_a_run_cannot_be_asked_for_what_it_does_not_have(run: Path) -> None:
-    assert "outside the run, which lasts from 0 to 160 ms" in rack(run, "--from-ms", 500).stderr
-    assert "is a run, and its config is what it was" in rack(run, "--set", "clock.speed=2").stderr
+    assert "outside the run, which lasts from 0 to 160 ms" in rack("gantt", run, "--from-ms", 500).stderr
+    assert "the config of a run cannot be changed" in rack("gantt", run, "--set", "clock.speed=2").stderr
 
 
 def test_a_schedule_without_end_is_refused_in_one_line() -> None:
     settings = ("clock.period_ms=0.01", "timing.clock_ms=0.001", "board.level.every=1000000")
-    done = rack("fig2", *(word for setting in settings for word in ("--set", setting)))
+    done = rack("gantt", "fig2", *(word for setting in settings for word in ("--set", setting)))
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("no schedule: 10 slices of the slowest task, 20000 ms each, hold ")
     assert len(done.stderr.splitlines()) == 1

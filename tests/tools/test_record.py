@@ -12,8 +12,8 @@ import pytest
 from rack.boards.config import load
 from rack.boards.rack import Rack
 from rack.tools.answer import Failure
-from rack.tools.recording import Recording
 from rack.tools.replay import replay
+from rack.tools.runs.recording import Recording
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import Window
 from tests.processes import RACK

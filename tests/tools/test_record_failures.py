@@ -16,6 +16,7 @@ from rerun.chunk import RrdReader
 from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
 from rack.boards.rack import Rack
+from rack.tools.analysis.report import write_report
 from rack.tools.answer import Failure
 from rack.tools.display import SilentDisplay
 from rack.tools.recorder import process
@@ -23,9 +24,8 @@ from rack.tools.recorder.files import mend
 from rack.tools.recorder.recorder import Recorder
 from rack.tools.recorder.side_sink import SideSink
 from rack.tools.recorder.spool import NAME
-from rack.tools.recording import Recording
-from rack.tools.reporting.report import write_report
 from rack.tools.running import LATE, run_rack
+from rack.tools.runs.recording import Recording
 from rack.tools.snapshot import Snapshot
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import executable

@@ -14,8 +14,8 @@ from rack.boards.config.layout import field_specs
 from rack.tools.answer import Failure
 from rack.tools.display import SilentDisplay
 from rack.tools.recorder.columns import columns_of
-from rack.tools.recording import Recording
 from rack.tools.running import RunResult, run_rack
+from rack.tools.runs.recording import Recording
 
 SECONDS = 4.0
 TICKS = 1600

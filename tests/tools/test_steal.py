@@ -8,10 +8,10 @@ import pytest
 
 from rack.backplane.trace import Flag
 from rack.boards.config import load
+from rack.tools.analysis.report import report_of
+from rack.tools.analysis.report_markdown import markdown
 from rack.tools.recorder import steal as meter
 from rack.tools.recorder.steal import Stolen
-from rack.tools.reporting.markdown import markdown
-from rack.tools.reporting.report import report_of
 from tests.tools.recordings import MS, Cycle, recorded
 
 HEAD = "cpu  9 9 9 9 9 9 9 99 0 0\n"

@@ -12,8 +12,8 @@ from rerun.chunk import RrdReader
 from rack.boards.config import load, loads
 from rack.levels.robot.cell import STATE, Cell, build_cell
 from rack.tools.display import SilentDisplay
-from rack.tools.recording import Recording
 from rack.tools.running import run_rack
+from rack.tools.runs.recording import Recording
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import executable

@@ -11,10 +11,10 @@ import rerun.blueprint as rrb
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import RECORD, Flag
 from rack.tools.viewer.blocks import Block
-from rack.tools.viewer.misses import Misses
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import Stream
 from rack.tools.viewer.timelines import Timelines
+from rack.tools.viewer.timing import Misses
 
 TICK_NS = 2_500_000
 SPAN = 100

@@ -1,1 +1,1 @@
-"""A run against the timing model: what its cycles took, which equation each of them broke, and what ran beside it."""
+"""A run judged: its report, and its comparison with the timing model."""

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.backplane.layout import TaskSpec
+from rack.levels.timing import trace_times
 from rack.levels.timing.equations import (
     Relation,
     coupling_may_be_tight,
@@ -19,16 +20,16 @@ from rack.levels.timing.equations import (
     plan_fits_tight,
     residual_is_left,
 )
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import LOOSE_PLAN, RESPONSE_TIME
-from rack.tools.analysis.cycles import Cycles
-from rack.tools.analysis.model import Model
+from rack.tools.runs.cycles import Cycles
 
 
 @dataclass(frozen=True)
 class Rule:
-    """An equation put to all cycles of a task: a side of `relation` is of shape (cycles,), or one for all of them.
+    """An equation put to all cycles of a task: each side of `relation` has shape (cycles,), or is one number for all.
 
-    It is in ns, or in parts of a cycle where `unit` is "1".
+    Sides are ns, or parts of a cycle where `unit` is "1".
     """
 
     equation: str
@@ -36,64 +37,74 @@ class Rule:
     unit: str = "ns"
 
 
-def rules_for(name: str, found: Mapping[str, Cycles], model: Model) -> list[Rule]:
-    """Return the equations put to the cycles of a task, of all that `cycles_of` found."""
+def rules_for(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> list[Rule]:
+    """Return the equations put to the cycles of a task; `found` are the cycles of the run, by task."""
     is_executor = found[name].task.role == "executor"
-    return list(_executor_rules(name, found, model) if is_executor else _planner_rules(name, found, model))
+    return list(_executor_rules(name, found, rack) if is_executor else _planner_rules(name, found, rack))
 
 
-def _executor_rules(name: str, found: Mapping[str, Cycles], model: Model) -> Iterator[Rule]:
+def _executor_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Rule]:
     cycles = found[name]
-    board, cycle_ns = cycles.task.board, model.cycle_ns(cycles.task)
+    board, period_ns = cycles.task.board, cycle_ns(rack, cycles.task)
     execution, communication = cycles.process_ns, cycles.communication_ns
-    yield Rule("3.1", _put(fits_cycle, execution, communication, cycle_ns))
-    yield Rule("3.4", _put(executes_in_time, execution, model.longest_cycle_ns(cycles.task)))
-    yield Rule("3.6", _put(residual_is_left, cycle_ns - execution - communication))
-    yield Rule("3.7", _put(Relation, steps_ns(cycles, model), "=", cycle_ns))
-    if board in model.tight:
+    yield Rule("3.1", _put(fits_cycle, execution, communication, period_ns))
+    yield Rule("3.4", _put(executes_in_time, execution, round(rack.longest_cycles[board] * rack.tick_ns)))
+    yield Rule("3.6", _put(residual_is_left, period_ns - execution - communication))
+    yield Rule("3.7", _put(Relation, steps_ns(cycles, rack), "=", period_ns))
+    if rack.boards[board].coupling == "tight":
         update = _updates_ns(cycles, found.get(f"{name}.planner"))
-        yield Rule("3.9", _put(leaves_time_to_plan, execution, communication + update, model.switch_ns, cycle_ns))
-        yield Rule("3.10", _put(coupling_may_be_tight, cycles.exchange_ns + update, cycle_ns, model.small_share), "1")
-    yield from _deadline(cycles, model)
+        yield Rule(
+            "3.9", _put(leaves_time_to_plan, execution, communication + update, rack.context_switch_ns, period_ns)
+        )
+        yield Rule("3.10", _put(coupling_may_be_tight, cycles.exchange_ns + update, period_ns, rack.small_share), "1")
+    yield from _deadline(cycles, rack)
 
 
-def _planner_rules(name: str, found: Mapping[str, Cycles], model: Model) -> Iterator[Rule]:
+def _planner_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Rule]:
     cycles = found[name]
     task, executor = cycles.task, found.get(cycles.task.board)
-    if task.board not in model.tight:
-        yield Rule(LOOSE_PLAN, _put(plan_fits_loose, cycles.used_ns, task.within_cycles, model.cycle_ns(task)))
+    if rack.boards[task.board].coupling != "tight":
+        yield Rule(LOOSE_PLAN, _put(plan_fits_loose, cycles.used_ns, task.within_cycles, cycle_ns(rack, task)))
     elif executor is not None:
-        left = _left_to_plan_ns(cycles, executor, model)
-        yield Rule("3.8", _put(plan_fits_tight, cycles.used_ns, task.within_cycles, left, model.switch_ns))
-    yield from _deadline(cycles, model)
+        left = _left_to_plan_ns(cycles, executor, rack)
+        yield Rule("3.8", _put(plan_fits_tight, cycles.used_ns, task.within_cycles, left, rack.context_switch_ns))
+    yield from _deadline(cycles, rack)
 
 
-def _deadline(cycles: Cycles, model: Model) -> Iterator[Rule]:
-    if not model.is_lockstep:
-        yield Rule(RESPONSE_TIME, _put(Relation, response_ns(cycles, model), "<=", model.slice_ns(cycles.task)))
+def _deadline(cycles: Cycles, rack: RackTiming) -> Iterator[Rule]:
+    if not rack.is_lockstep:
+        yield Rule(RESPONSE_TIME, _put(Relation, response_ns(cycles, rack), "<=", slice_ns(rack, cycles.task)))
 
 
-def response_ns(cycles: Cycles, model: Model) -> np.ndarray:
-    """Return how long after its release each cycle ended, shape (n,).
+def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
+    """Return R_i of a task's level."""
+    return rack.boards[task.board].every * rack.tick_ns
 
-    One whose message came too late, as the trace says, has missed its deadline whenever it ended.
+
+def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
+    """Return the time available to one cycle of a task; d R_i, the time slice, of a planner."""
+    return task.every * task.within_cycles * rack.tick_ns
+
+
+def response_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
+    """Return the time from the release to the end of each cycle, shape (n,).
+
+    A cycle whose message came too late, as its trace says, has missed its deadline whenever it ended.
     """
-    rows = cycles.rows
-    missed = (rows["flags"] & Flag.MISSED) > 0
-    least = np.where(missed, model.slice_ns(cycles.task) + 1, 0)
-    return np.asarray(np.maximum(rows["end_ns"] - rows["release_ns"], least))
+    least = np.where(trace_times.is_missed(cycles.rows), slice_ns(rack, cycles.task) + 1, 0)
+    return np.asarray(np.maximum(trace_times.response_ns(cycles.rows), least))
 
 
-def steps_ns(cycles: Cycles, model: Model) -> np.ndarray:
-    """Return how long behind the release before each cycle was released, t_(k+1) - t_k of eq. 3.7, shape (n,).
+def steps_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
+    """Return the time from the previous release to that of each cycle, t_(k+1) - t_k of eq. 3.7, shape (n,).
 
-    By what the trace says was skipped: a new process begins anew, and a row that the recorder lost is no cycle lost.
+    It follows from the releases skipped as traced: a restart, or a row lost by the recorder, is not a skipped release.
     """
-    return np.asarray((1 + (cycles.rows["flags"] >> SKIPPED_SHIFT)) * model.cycle_ns(cycles.task))
+    return np.asarray((1 + trace_times.skipped(cycles.rows)) * cycle_ns(rack, cycles.task))
 
 
 def _updates_ns(executor: Cycles, plans: Cycles | None) -> np.ndarray:
-    """Return how long the plan was updated in each of an executor's cycles, shape (n,)."""
+    """Return the time spent on updating the plan in each cycle of an executor, shape (n,)."""
     updates = np.zeros(len(executor.rows), np.int64)
     if plans is not None:
         cycle = np.searchsorted(executor.rows["release_ns"], plans.rows["process_ns"], side="right") - 1
@@ -101,24 +112,21 @@ def _updates_ns(executor: Cycles, plans: Cycles | None) -> np.ndarray:
     return updates
 
 
-def _left_to_plan_ns(plans: Cycles, executor: Cycles, model: Model) -> np.ndarray:
-    """Return what the executor left of a cycle, in the middle of those of each plan's slice, shape (plans,).
+def _left_to_plan_ns(plans: Cycles, executor: Cycles, rack: RackTiming) -> np.ndarray:
+    """Return the mean residual of the executor's cycles within each plan's slice, shape (plans,).
 
-    A cycle that the executor skipped left nothing: it was late.
+    A cycle that the executor skipped counts with a residual of 0.
     """
-    residual = model.cycle_ns(executor.task) - executor.used_ns
+    residual = cycle_ns(rack, executor.task) - executor.used_ns
     before = np.concatenate(([0], np.cumsum(residual)))
     first = plans.rows["tick"]
-    begin, end = (np.searchsorted(executor.rows["tick"], ticks) for ticks in (first, first + _slice_ticks(plans)))
-    # A plan at the end of the run has fewer cycles, and is held against those.
+    last = first + plans.task.every * plans.task.within_cycles
+    begin, end = (np.searchsorted(executor.rows["tick"], ticks) for ticks in (first, last))
+    # A plan at the end of the run is compared with the fewer cycles that it had.
     cycles = np.clip((executor.rows["tick"][-1] - first) // executor.task.every + 1, 1, plans.task.within_cycles)
     return np.asarray((before[end] - before[begin]) / cycles)
 
 
-def _slice_ticks(cycles: Cycles) -> int:
-    return cycles.task.every * cycles.task.within_cycles
-
-
 def _put(equation: Callable[..., Relation], *numbers: Any) -> Relation:
-    """Put an equation to all cycles: plain arithmetic takes arrays of them as well as one."""
+    """Put an equation to all cycles at once: its arithmetic works on arrays as well."""
     return equation(*numbers)

@@ -11,17 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.levels.timing.response_time import response_times
+from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
 from rack.tools.answer import Failure
 from rack.tools.display import display_for
 from rack.tools.progress import Progress
-from rack.tools.recording import Recording
-from rack.tools.reporting.statistics import Distribution, distribution
-from rack.tools.reporting.timing import plan_ages_ms
 from rack.tools.running import run_rack
+from rack.tools.runs.recording import Recording
 from rack.tools.text_table import table
 
 LAUNCH_S = 3.0
@@ -148,25 +146,23 @@ def _level(board: str, layout: Layout, responses: Mapping[str, int | None], runs
 
 def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarray:
     made, visible_at = run.signal(plan, "tick"), run.signal(plan, "visible_at")
-    return plan_ages_ms(run.cycles[board]["tick"], made, visible_at, layout.clock_ns * 1e-6)
+    return plan_ages(run.cycles[board]["tick"], made, visible_at) * (layout.clock_ns * 1e-6)
 
 
 def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> TaskFigures:
-    cycles = np.concatenate([run.cycles.get(task.name, run.no_cycles) for run in runs])
-    if task.role == "planner":
-        # Releases without a plan do not count; they are traced only if they were late.
-        skipped, cycles = cycles, cycles[(cycles["flags"] & Flag.PLANNED) > 0]
-    else:
-        skipped = cycles
+    cycles = np.concatenate([run.trace(task.name) for run in runs])
+    # Releases without a plan are traced only if they were late; of them only the skipped releases count.
+    _, skipped = counts(cycles)
+    cycles = plans(cycles) if task.role == "planner" else cycles
+    missed, _ = counts(cycles)
     slice_ns = task.every * task.within_cycles * tick_ns
-    residual_ns = cycles["release_ns"] + slice_ns - cycles["end_ns"]
     predicted_ns = responses.get(task.name)
     return TaskFigures(
         slice_ms=slice_ns * 1e-6,
         cycles=len(cycles),
-        missed=int(np.count_nonzero(cycles["flags"] & Flag.MISSED)),
-        skipped=int(np.sum(skipped["flags"] >> SKIPPED_SHIFT)),
-        residual_ms=distribution(residual_ns * 1e-6),
+        missed=missed,
+        skipped=skipped,
+        residual_ms=distribution(residual_ns(cycles, slice_ns) * 1e-6),
         predicted_ms=None if predicted_ns is None else predicted_ns * 1e-6,
         fits=predicted_ns is not None and predicted_ns <= slice_ns if task.name in responses else None,
     )

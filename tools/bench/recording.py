@@ -18,9 +18,9 @@ from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, trace_ring
 from rack.boards.config import RackConfig, load
 from rack.boards.rack import Rack
+from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
 from rack.tools.answer import Failure
 from rack.tools.recorder.process import RecorderProcess
-from rack.tools.reporting.statistics import Distribution, distribution
 from rack.tools.text_table import table
 from rack.tools.viewer.window import Window, free_port, url
 
@@ -66,7 +66,7 @@ class Meter:
         rows = {task: ring.drain().rows for task, ring in self._rings.items()}
         fastest = rows[self._fastest]
         flags = np.concatenate([taken["flags"] for taken in rows.values()])
-        return flags, (fastest["start_ns"] - fastest["release_ns"]) * 1e-6
+        return flags, lateness_ns(fastest) * 1e-6
 
 
 def measure(name: str) -> list[RecordingCost]:

@@ -25,7 +25,7 @@ from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.answer import Failure
 from rack.tools.progress import Progress
 from rack.tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
-from rack.tools.recording import Recording
+from rack.tools.runs.recording import Recording
 from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of
 
 RUN_S = 24.0

@@ -24,8 +24,8 @@ import posix_ipc
 
 from rack.backplane.process import pin
 from rack.boards.processor import die_with_parent, set_priority
+from rack.levels.timing.trace_times import Distribution, distribution
 from rack.tools.answer import Failure
-from rack.tools.reporting.statistics import Distribution, distribution
 
 PAPER_US = 100.0
 """Task switch on NIST's boards (NISTIR 90-4251, section 4)."""

@@ -19,7 +19,7 @@ from rack.levels.operator import Answer, Operation
 from rack.levels.timing.system_response import CommandPath, command_paths, lowest_level
 from rack.tools.answer import Failure, print_json
 from rack.tools.live_table import print_wrapped, terminal_width
-from rack.tools.recording import Recording
+from rack.tools.runs.recording import Recording
 from rack.tools.text_table import table
 
 if TYPE_CHECKING:

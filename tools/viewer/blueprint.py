@@ -10,13 +10,13 @@ from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.messages import SERVO_STATUS
 from rack.levels.robot.cell import Cell
-from rack.tools.viewer import ages, load
+from rack.tools.viewer import timing as ages
+from rack.tools.viewer import timing as load
 from rack.tools.viewer.activity import LEVELS, LOG
 from rack.tools.viewer.document import CONFIG
 from rack.tools.viewer.events import EVENTS
 from rack.tools.viewer.eye import eye_on
 from rack.tools.viewer.fields import SIGNALS
-from rack.tools.viewer.gantt import BOARDS
 from rack.tools.viewer.geometry import CELL, COLLISION
 from rack.tools.viewer.hierarchy import COLUMN, HIERARCHY, ROW, positions
 from rack.tools.viewer.joints import ERROR, GRIPPER, JOINTS, QUANTITIES
@@ -25,6 +25,7 @@ from rack.tools.viewer.own import RECORDER
 from rack.tools.viewer.poses import FRAMES
 from rack.tools.viewer.stream import path
 from rack.tools.viewer.timelines import SIM_TIME
+from rack.tools.viewer.timing import BOARDS
 
 CYCLES_S = 0.022
 """What the Gantt lanes show before and behind the time that is looked at: some cycles of fast and of slower boards."""

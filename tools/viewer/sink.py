@@ -12,20 +12,17 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
 from rack.boards.config import loads, rack_timing
-from rack.tools.viewer.ages import Age
 from rack.tools.viewer.blocks import Block, Part
 from rack.tools.viewer.blueprint import blueprint
 from rack.tools.viewer.document import write_document
 from rack.tools.viewer.events import Events
-from rack.tools.viewer.gantt import Gantt
 from rack.tools.viewer.geometry import write_geometry
 from rack.tools.viewer.hierarchy import Hierarchy
-from rack.tools.viewer.load import Load
-from rack.tools.viewer.misses import Misses
 from rack.tools.viewer.own import Losses
 from rack.tools.viewer.parts import parts_of
 from rack.tools.viewer.stream import Stream
 from rack.tools.viewer.timelines import Timelines
+from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
 FILE = "run.rrd"
 BLOCK_S = 1.0
@@ -62,7 +59,7 @@ class ViewSink:
         slice_ns = layout.clock_ns if lockstep else period_ns
         self._of_task: dict[str, list[Part]] = {
             task.name: [
-                Gantt(stream, task, speed, lockstep),
+                CycleLanes(stream, task, speed, lockstep),
                 Load(stream, task, slice_ns, lockstep),
                 Misses(stream, task),
             ]

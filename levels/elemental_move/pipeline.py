@@ -1,0 +1,192 @@
+"""The executor's stock: plans that wait until their move is due, and segments handed down. The level's parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from rack.backplane.mailbox import Reading
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.messages import SEGMENTS, WINDOW, Error, SegmentKind, Verb
+from rack.levels.tables import Positive, Table
+
+MAX_GAP_RAD = 0.005
+"""Paths join if no joint is farther than this between the end of one and the start of the next."""
+MAX_PLANS = 2 * WINDOW
+"""Plans kept: the planner is never farther ahead than its window, and moves just done leave with the next plan."""
+
+
+class ElementalMoveParams(Table):
+    """Bounds of patience, of grasping, and of the answers from below, in `[board.<name>.params]`."""
+
+    patience: Positive = Field(60.0, description="time that a move waits for a free path before it is an error, s")
+    retry: Positive = Field(2.0, description="time after which a path is searched again in a world at rest, s")
+    replans: int = Field(
+        10, ge=1, le=1000, description="other paths that one move may take before a blocked way is an error"
+    )
+    grasp_gap: Positive = Field(0.002, description="a gripper closer to closed than this holds nothing, m or rad")
+    answer: Positive = Field(0.3, description="time that settling and the report from below may take, s")
+
+
+class PlansAtHand:
+    """The newest plan of every move from the one under way on, and the answer to the open request for another path."""
+
+    def __init__(self) -> None:
+        self._by_move: dict[int, Message] = {}
+        self._answer: Message | None = None
+
+    def take(self, plan: Reading, done: int, handed_down: int, end: Array) -> None:
+        """Keep a new plan of a move after `handed_down`, if it begins where the path before it ends.
+
+        `end` (joints,), rad, is where the moves end whose plans are no longer at hand. A plan that does not join is
+        based on one that has been lost or replaced; the planner will make it anew. Plans of moves before `done` are
+        dropped. After a refusal, or a path with another end than before, all later plans are dropped.
+        """
+        if not plan.is_new:
+            return
+        message = Message(plan.value.record.dtype)
+        message.copy_from(plan.value)
+        if message.replan:
+            self._answer = message
+            return
+        for move in [m for m in self._by_move if m < done]:
+            del self._by_move[move]
+        before = self.end(message.move - 1)
+        if message.move <= handed_down or not (message.error or joins(message, end if before is None else before)):
+            return
+        known = self._by_move.get(message.move)
+        stays = known is not None and not (known.error or message.error) and is_same(end_of(known), end_of(message))
+        for move in [m for m in self._by_move if m > message.move and not stays]:
+            del self._by_move[move]
+        if len(self._by_move) < MAX_PLANS:
+            self._by_move[message.move] = message
+
+    def of(self, move: int) -> Message | None:
+        """Return the plan of a move, which may be a refusal; None: not there yet."""
+        return self._by_move.get(move)
+
+    def answer(self, request: int) -> Message | None:
+        """Return the answer to a request for another path; None: not there yet."""
+        return self._answer if self._answer is not None and self._answer.replan == request else None
+
+    def reach(self, window: Any, handed_down: int) -> int:
+        """Return the newest move, at least `handed_down`, up to which every motion of `window` has its path."""
+        reached = handed_down
+        for move in window:
+            if move["id"] == reached + 1:
+                plan = self._by_move.get(int(move["id"]))
+                has_path = plan is not None and plan.error == Error.NONE
+                if not has_path and move["verb"] not in (Verb.GRASP, Verb.RELEASE):
+                    break
+                reached += 1
+        return reached
+
+    def end(self, move: int) -> Array | None:
+        """Return where the newest path up to that of `move` ends, (joints,) in rad; None: there is no such path."""
+        paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
+        return end_of(self._by_move[max(paths)]) if paths else None
+
+
+def joins(plan: Message, place: Array) -> bool:
+    """Return whether the path of a `MOVE_PLAN` begins at `place` (joints,), rad."""
+    return is_same(np.asarray(plan.waypoints[0]), place)
+
+
+def end_of(plan: Message) -> Array:
+    """Return where the path of a `MOVE_PLAN` ends, (joints,), rad."""
+    return np.asarray(plan.waypoints[plan.count - 1])
+
+
+def is_same(a: Array, b: Array) -> bool:
+    """Return whether a path may end at one and the next begin at the other of two configurations (joints,), rad."""
+    return float(np.abs(a - b).max()) <= MAX_GAP_RAD
+
+
+class SegmentWindow:
+    """Segments handed down and not known to be done, oldest first, kept in the outgoing `MOVE_COMMAND` itself.
+
+    Serials are never reused: a segment that replaces another has a newer one.
+    """
+
+    def __init__(self, command: Message) -> None:
+        self._command = command
+        self._segments = command.segments
+
+    @property
+    def count(self) -> int:
+        """Segments in the window."""
+        return int(self._command.count)
+
+    @property
+    def is_full(self) -> bool:
+        """True when no segment may be added."""
+        return self.count >= SEGMENTS
+
+    @property
+    def first(self) -> Any:
+        """The oldest segment; valid while `count` is not 0."""
+        return self._segments[0]
+
+    @property
+    def newest_move(self) -> int:
+        """The move of the newest segment; 0 in an empty window."""
+        return int(self._segments["move"][self.count - 1]) if self.count else 0
+
+    def take_done(self, done: int) -> Any:
+        """Remove and return the oldest segment if its serial is at most `done`; else return None."""
+        if not self.count or self._segments["id"][0] > done:
+            return None
+        taken = self._segments[0].copy()
+        self._segments[:-1] = self._segments[1:]
+        self._command.count = self.count - 1
+        self._blank()
+        return taken
+
+    def clear(self) -> None:
+        """Withdraw every segment."""
+        self._command.count = 0
+        self._blank()
+
+    def add_path(self, move: Any, plan: Message, by_s: float) -> None:
+        """Hand down the path of `plan` for `move`, an element of a window of `ELEMENTAL_MOVE`."""
+        segment = self._add(move, SegmentKind.PATH)
+        segment["touch"] = move["verb"] in (Verb.APPROACH, Verb.DEPART)
+        segment["by"] = by_s
+        self._lay(segment, plan)
+
+    def replace_first(self, plan: Message) -> None:
+        """Withdraw all and hand the oldest segment down again along another path, with a new serial."""
+        self._command.count = 1
+        self._blank()
+        self._command.id = self.first["id"] = int(self._command.id) + 1
+        self._lay(self.first, plan)
+
+    def add_gripper(self, move: Any, opening: float, force: float) -> None:
+        """Hand down a motion of the gripper to `opening`, m or rad, with at most `force`, N or N m."""
+        segment = self._add(move, SegmentKind.GRIPPER)
+        segment["opening"], segment["force"] = opening, force
+
+    def end(self) -> Array | None:
+        """Return the last waypoint (joints,) of the newest path in the window; None: there is none."""
+        for segment in self._segments[: self.count][::-1]:
+            if segment["kind"] == SegmentKind.PATH:
+                return np.array(segment["waypoints"][segment["count"] - 1])
+        return None
+
+    def _add(self, move: Any, kind: SegmentKind) -> Any:
+        segment = self._segments[self.count]
+        self._command.count = self.count + 1
+        self._command.id = segment["id"] = int(self._command.id) + 1
+        segment["move"], segment["kind"], segment["object"] = move["id"], kind, move["object"]
+        return segment
+
+    def _lay(self, segment: Any, plan: Message) -> None:
+        segment["count"] = plan.count
+        segment["waypoints"], segment["blend"] = plan.waypoints, plan.blend
+
+    def _blank(self) -> None:
+        """Zero the rest of the array, so that equal windows have equal bytes."""
+        self._segments[self.count :] = np.zeros((), self._segments.dtype)

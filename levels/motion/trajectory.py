@@ -1,0 +1,233 @@
+"""Time along a path: sections of constant jerk of its parameter, within the limits of every joint; ramps to rest."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import ruckig
+
+from rack.levels.algebra import Array
+from rack.levels.messages import SECTIONS_A_LINE
+from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath, PathBounds
+from rack.levels.motion.speed import JointLimits, SpeedLimits, acceleration_room, boundary_speeds, speed_limits
+
+SHARES = (1.0, 0.9, 0.75, 0.6)
+"""Parts of a curve's highest speed that are tried; the fastest trajectory is taken."""
+MIN_SECTION_S = 1e-12
+"""Sections shorter than this are dropped."""
+STOP_EFFORTS = ((1.0, 1.0), (0.6, 1.0), (0.6, 0.5), (0.35, 0.6), (0.35, 0.3), (0.2, 0.3), (0.2, 0.15), (0.1, 0.1))
+"""Parts of a straight line's deceleration and jerk that a stop tries; a curve leaves less of both."""
+STOP_INTERVALS = 24
+"""Intervals of equal time in which the joint limits of a stop are checked."""
+LIMIT_ROUNDING = 1e-6
+"""Part of a limit that a stop may exceed, from rounding."""
+MAX_REST_RAD_S = 1e-7
+"""Motion slower than this counts as rest."""
+
+Section = tuple[float, float, float, float, float]
+"""Duration, s, then s, ds, dds at its begin and its constant jerk."""
+
+
+class PathState(NamedTuple):
+    """State of the path parameter: rad, rad/s, rad/s2."""
+
+    s: float
+    ds: float
+    dds: float
+
+
+class Trajectory:
+    """Motion along a path as sections of constant jerk, from rest or from motion to rest."""
+
+    def __init__(self, sections: Array, duration: float) -> None:
+        self.sections = sections  # (n, 5), n >= 1: start in s; s, ds, dds and jerk of the path parameter there
+        self.duration = duration  # s
+        self._starts: list[float] = sections[:, 0].tolist()
+        self._rows: list[list[float]] = sections[:, 1:].tolist()
+        self.begin = self._rows[0][0]  # path parameter at the start, rad
+        self.end = self.at(duration).s  # path parameter at the end, rad
+
+    def at(self, time_s: float) -> PathState:
+        """Return the state `time_s` after the start."""
+        time_s = min(max(time_s, 0.0), self.duration)
+        k = max(bisect_right(self._starts, time_s) - 1, 0)
+        s, ds, dds, jerk = self._rows[k]
+        t = time_s - self._starts[k]
+        return PathState(
+            s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)), ds + t * (dds + t * jerk / 2.0), dds + t * jerk
+        )
+
+    def states(self, times_s: Array) -> tuple[Array, Array, Array]:
+        """Return s, ds and dds at `times_s` (n,), within the duration; (n,) each."""
+        row = self.sections[np.searchsorted(self.sections[:, 0], times_s, side="right") - 1]
+        t = times_s - row[:, 0]
+        s, ds, dds, jerk = row[:, 1], row[:, 2], row[:, 3], row[:, 4]
+        return s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)), ds + t * (dds + t * jerk / 2.0), dds + t * jerk
+
+    def stretched(self, factor: float) -> Trajectory:
+        """Return the same motion slowed by `factor` >= 1; it keeps every limit that this one keeps."""
+        powers = np.array([factor, 1.0, 1.0 / factor, 1.0 / factor**2, 1.0 / factor**3])
+        return Trajectory(self.sections * powers, self.duration * factor)
+
+
+def make_trajectory(path: BlendedPath, limits: JointLimits, begin: float = 0.0) -> Trajectory:
+    """Make the fastest motion found from rest at `begin`, in rad, to rest at the end of `path`.
+
+    It rests at the path's stops too. The path's analytic bounds, not samples, ensure that joint velocity, acceleration
+    and jerk keep `limits` everywhere. At most `SECTIONS` sections.
+    """
+    stops = [s for s in path.stops if s > begin + COINCIDENT_RAD]
+    marks = [min(begin, path.length), *stops, path.length]
+    rows: list[Section] = []
+    for start, end in pairwise(marks):
+        if end - start > COINCIDENT_RAD:
+            rows += _fastest(_Run(path, start, end), limits)
+    return _joined(rows, marks[0])
+
+
+def duration(path: BlendedPath, limits: JointLimits) -> float:
+    """Return the time of the fastest motion found along `path`, rest to rest, in s."""
+    return make_trajectory(path, limits).duration
+
+
+def make_stop(path: BlendedPath, limits: JointLimits, state: PathState) -> Trajectory | None:
+    """Make the shortest ramp found to rest along `path` from `state` that keeps the joint limits.
+
+    None: every ramp would exceed a limit or overrun the path. Motion may then follow its trajectory, which itself ends
+    at rest, and ask again a cycle later. Bounded time, whatever the path.
+    """
+    if state.ds < MAX_REST_RAD_S:
+        return _joined([], state.s)
+    most, jerk = acceleration_room(path.bounds.first[path.piece_at(state.s)], limits)
+    # After a stop the path continues in another direction: only rest may be there.
+    end = next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
+    for part, part_of_jerk in STOP_EFFORTS:
+        stop = _ramp(state, max(part * most, abs(state.dds)), part_of_jerk * jerk)
+        if stop.end <= end and _keeps(stop, path, limits):
+            return stop
+    return None
+
+
+class _Run:
+    """A stretch of a path between two points of rest, and the bounds of its pieces."""
+
+    def __init__(self, path: BlendedPath, start: float, end: float) -> None:
+        first, last = path.piece_at(start), path.piece_at(end - COINCIDENT_RAD)
+        inner = path.breaks[first + 1 : last + 1]
+        self.marks = [start, *inner.tolist(), end]
+        self.bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
+        corners = int(self.bounds.second.any(axis=1).sum())
+        self.shares = SHARES if corners else SHARES[:1]
+        self.most_sections = SECTIONS_A_LINE * (1 + corners)
+
+    def ways(self) -> list[tuple[list[float], PathBounds]]:
+        """Return marks and bounds: limits for each piece, and one set for all, which suits many small corners."""
+        alone = (self.marks, self.bounds)
+        together = PathBounds(*(bound.max(axis=0, keepdims=True) for bound in self.bounds))
+        return [alone, ([self.marks[0], self.marks[-1]], together)] if len(self.marks) > 2 else [alone]
+
+
+def _fastest(run: _Run, limits: JointLimits) -> list[Section]:
+    """Return the fastest of a few candidates that fit into a message."""
+    best: list[Section] = []
+    least = np.inf
+    for share in run.shares:
+        for marks, bounds in run.ways():
+            stretches = [speed_limits(PathBounds(*piece), limits, share) for piece in zip(*bounds, strict=True)]
+            rows = list(_sections(marks, stretches))
+            time_s = math.fsum(row[0] for row in rows)  # exact: `sum` rounds otherwise from Python 3.12 on
+            if time_s < least and len(rows) <= run.most_sections:
+                best, least = rows, time_s
+    return best
+
+
+def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator[Section]:
+    """Yield the sections from rest at the first to rest at the last mark, each stretch with its limits."""
+    lengths = [end - start for start, end in pairwise(marks)]
+    speeds = boundary_speeds(lengths, limits)
+    for start, length, limit, (before, after) in zip(marks, lengths, limits, pairwise(speeds), strict=False):
+        if limit.acceleration > 0.0:
+            wanted = ruckig.InputParameter(1)
+            wanted.current_position, wanted.current_velocity = [start], [before]
+            wanted.target_position, wanted.target_velocity = [start + length], [after]
+            wanted.max_velocity = [limit.speed]
+            wanted.max_acceleration, wanted.max_jerk = [limit.acceleration], [limit.jerk]
+            yield from _calculated(wanted)
+        else:
+            yield (length / before if before > 0.0 else np.inf, start, before, 0.0, 0.0)
+
+
+def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
+    wanted = ruckig.InputParameter(1)
+    wanted.control_interface = ruckig.ControlInterface.Velocity
+    wanted.current_position, wanted.current_velocity = [state.s], [state.ds]
+    wanted.current_acceleration = [state.dds]
+    wanted.max_acceleration, wanted.max_jerk = [acceleration], [jerk]
+    return _joined(_calculated(wanted), state.s)
+
+
+def _calculated(wanted: ruckig.InputParameter) -> list[Section]:
+    """Return the sections of ruckig's answer in one dimension. Raises `ArithmeticError` when it has none."""
+    found = ruckig.Trajectory(1)
+    result = ruckig.Ruckig(1).calculate(wanted, found)
+    if result != ruckig.Result.Working:
+        raise ArithmeticError(f"trajectory: ruckig returned {result} for {wanted}")
+    profile = found.profiles[0][0]
+    rows = zip(profile.t, profile.p, profile.v, profile.a, profile.j, strict=False)
+    return [row for row in rows if row[0] > MIN_SECTION_S]
+
+
+def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
+    """Return the trajectory of consecutive sections; without sections, rest at `begin`."""
+    if not rows:
+        return Trajectory(np.array([[0.0, begin, 0.0, 0.0, 0.0]]), 0.0)
+    sections = np.array(rows)
+    ends = np.cumsum(sections[:, 0])
+    sections[:, 0] = ends - sections[:, 0]
+    return Trajectory(sections, float(ends[-1]))
+
+
+def _keeps(stop: Trajectory, path: BlendedPath, limits: JointLimits) -> bool:
+    """Return whether every joint keeps its limits, by bounds of motion and path over each interval of time."""
+    switches = stop.sections[:, 0]
+    times = _checked_times(stop)
+    s, ds, dds = stop.states(times)
+    jerk = np.abs(stop.sections[np.searchsorted(switches, times[:-1], side="right") - 1, 4])
+    # Within an interval dds is linear and does not change its sign: the ends bound both dds and ds.
+    most = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))
+    speed = np.maximum(ds[:-1], ds[1:])
+    first, second, third = _bounds_over(path, s)
+    speed, most, jerk = speed[:, None], most[:, None], jerk[:, None]
+    cubed = speed * speed * speed  # of an array, ** 3 is not the same on every processor
+    room = 1.0 + LIMIT_ROUNDING
+    return bool(
+        (ds > -LIMIT_ROUNDING).all()  # a jerk too small to end the present deceleration would reverse the motion
+        and (first * speed <= limits.velocity * room).all()
+        and (second * speed**2 + first * most <= limits.acceleration * room).all()
+        and (third * cubed + 3.0 * second * speed * most + first * jerk <= limits.jerk * room).all()
+    )
+
+
+def _checked_times(stop: Trajectory) -> Array:
+    """Return the ends of the intervals: evenly spread, and wherever jerk or the sign of dds changes."""
+    start, dds, jerk = stop.sections[:, 0], stop.sections[:, 3], stop.sections[:, 4]
+    until_zero = np.divide(-dds, jerk, out=np.zeros(len(jerk)), where=jerk != 0.0)
+    zeros = np.clip(start + until_zero, start, np.append(start[1:], stop.duration))
+    return np.unique(np.concatenate((start, zeros, np.linspace(0.0, stop.duration, STOP_INTERVALS + 1))))
+
+
+def _bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
+    """Return the bounds of the path's derivatives between consecutive `s`; (n - 1, joints) each."""
+    last = len(path.breaks) - 2
+    piece = np.clip(np.searchsorted(path.breaks, s, side="right") - 1, 0, last)
+    low, high = piece[:-1], piece[1:]
+    bounds = [bound[low] for bound in path.bounds]
+    for k in range(1, int((high - low).max()) + 1):
+        for total, bound in zip(bounds, path.bounds, strict=True):
+            np.maximum(total, bound[np.minimum(low + k, high)], out=total)
+    return bounds[0], bounds[1], bounds[2]

@@ -1,0 +1,201 @@
+"""The path of one elemental move: inverse kinematics, then a straight tool line or a search in joint space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rack.levels.algebra import Array, mat_vec, norm
+from rack.levels.errors import Refused
+from rack.levels.messages import Error, Verb
+from rack.levels.motion.path import BlendedPath, Path
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.ik import SAME_RAD, InverseKinematics
+from rack.levels.planning.moves import VERB_NAMES, Move, Situation
+from rack.levels.planning.path_planner import MAX_SEARCHES, PathPlanner
+from rack.levels.planning.payload import Payloads
+from rack.levels.planning.pose import Pose
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import SceneConfig
+
+CLOSE_PART = 0.9
+"""Where the arm rests too close to something, the way out keeps this part of the remaining clearance."""
+LOAD_STEP_RAD = 0.25
+"""Spacing of the configurations at which the motors must carry the load."""
+AHEAD_PART = 0.5
+"""Part of the clearance that an earlier path must still have: sensed and predicted poses differ a little."""
+MAX_STRAY_M = 1e-3
+"""Largest distance of the tool from a straight line that it follows."""
+LINES = (1, 2, 3, 4, 6, 8, 12, 16, 20)
+"""Numbers of joint-space lines that are tried: the fewest that stay on the tool's line make the quickest path."""
+STRAY_SAMPLES = 5
+"""Points of every joint-space line at which the tool's distance from its line is measured."""
+
+
+class MotionPlanner:
+    """Plans elemental moves for one arm. Pure: equal arguments give equal paths, in every process."""
+
+    def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
+        self.cell = cell
+        self.clearance = scene.clearance  # m
+        self.ik = InverseKinematics(cell, seed)
+        self.checker = CollisionChecker(cell, scene)
+        self.paths = PathPlanner(cell, scene.clearance, seed)
+        self.payloads = Payloads(cell, scene.objects)
+
+    def plan(
+        self,
+        move: Move,
+        start: Array,
+        situation: Situation,
+        *,
+        attempt: int = 0,
+        goal: Array | None = None,
+        searches: int = MAX_SEARCHES,
+    ) -> Path:
+        """Return the path of `move` from `start` (joints,), rad.
+
+        `attempt` counts tries in the same situation. With `goal` (joints,) the path ends there, so that paths planned
+        from there remain valid. `searches` as in `PathPlanner.plan`. Raises `Refused`: UNREACHABLE when no
+        configuration serves, NO_PATH when all are blocked, OVERLOAD when the motors cannot carry the load along it.
+        """
+        self.lay_out(move, situation)
+        if move.touches:
+            path = self._line(move, start, goal)
+        else:
+            goal = self.goal(move, start) if goal is None else goal
+            path = self._path_to(move, start, goal, attempt=attempt, searches=searches)
+        if situation.held is not None and situation.grip is not None:
+            along = BlendedPath(*path).sample(LOAD_STEP_RAD)
+            self.payloads.check_motors(situation.held, situation.grip, along)
+        return path
+
+    def lay_out(self, move: Move, situation: Situation) -> None:
+        """Set the collision checker to `situation` with the contacts that `move` intends."""
+        situation.lay_out(self.checker, move.object if move.touches else None)
+
+    def goal(self, move: Move, start: Array) -> Array:
+        """Return the configuration at the end of a free motion, with the checker as it is set. Raises `Refused`."""
+        if move.verb is Verb.MOVE_JOINTS:
+            self._check_limits(move)
+            return move.joints
+        if move.posture:
+            near = self.ik.nearby(move.tool, move.joints)
+            if near is not None and self.checker.free(near):
+                return near
+        reference = move.joints if move.posture else start
+        reachable = self.ik.reachable(move.tool, reference)
+        name, place = VERB_NAMES[move.verb], in_metres(move.tool)
+        if not reachable:
+            raise Refused(Error.UNREACHABLE, f"{name}: the arm cannot bring the tool to {place}")
+        for q in reachable:
+            if self.checker.free(q):
+                return q
+        raise Refused(Error.NO_PATH, f"{name} to {place}: {self.checker.why(reachable[0])}")
+
+    def still_free(self, move: Move, path: Path, situation: Situation) -> bool:
+        """Return whether an earlier path of `move` can still be used in `situation`."""
+        self.lay_out(move, situation)
+        clearance = AHEAD_PART * self.clearance
+        return self.paths.is_free(path, lambda q: self.checker.free(q, clearance))
+
+    def _path_to(self, move: Move, start: Array, goal: Array, *, attempt: int, searches: int) -> Path:
+        clearance = self._clearance_at(start)
+        path = self.paths.plan(
+            start, goal, lambda q: self.checker.free(q, clearance), attempt=attempt, searches=searches
+        )
+        if path is None:
+            why = self._why_no_path(start, goal, clearance)
+            raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {in_metres(self.ik.tool_at(goal))}: {why}")
+        return path
+
+    def _why_no_path(self, start: Array, goal: Array, clearance: float) -> str:
+        """Return why a free motion has no path: start or goal is blocked, or what stands on the straight way."""
+        why = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
+        if why:
+            return why
+        straight = Path(np.array([start, goal]), np.zeros(2))
+        blocked = self.paths.first_blocked(straight, lambda q: self.checker.free(q, clearance))
+        found = self.checker.why(blocked, clearance) if blocked is not None else ""
+        return f"no path found around {found}" if found else "no path found"
+
+    def _line(self, move: Move, start: Array, goal: Array | None) -> Path:
+        name, place = VERB_NAMES[move.verb], in_metres(move.tool)
+        path = straight_line(self.ik, start, move.tool)
+        if path is None:
+            raise Refused(Error.UNREACHABLE, f"{name}: no straight tool line to {place}")
+        if goal is not None and np.max(np.abs(path.end - goal)) < SAME_RAD:
+            path.waypoints[-1] = goal
+        clearance = self._clearance_at(start)
+        blocked = self.paths.first_blocked(path, lambda q: self.checker.free(q, clearance))
+        if blocked is not None:
+            raise Refused(Error.NO_PATH, f"{name} to {place}: {self.checker.why(blocked, clearance)}")
+        return path
+
+    def _clearance_at(self, start: Array) -> float:
+        """Return the scene's clearance, or less where an obstacle has come closer to the resting arm."""
+        room = self.checker.room(start)
+        return self.clearance if room >= self.clearance else max(CLOSE_PART * room, 0.0)
+
+    def _check_limits(self, move: Move) -> None:
+        low, high = self.cell.limits.position.T
+        beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
+        if beyond.size:
+            j = int(beyond[0])
+            name = self.cell.model.joint(self.cell.model.dof_jntid[self.cell.dof[j]]).name
+            raise Refused(
+                Error.UNREACHABLE, f"joint '{name}' to {move.joints[j]:.4g} rad; valid: {low[j]:.4g} to {high[j]:.4g}"
+            )
+
+
+def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:
+    """Return a path along which the tool moves straight from its pose at `start` (joints,) to `target`.
+
+    The tool turns at a constant rate and strays at most `MAX_STRAY_M`. None when the line leaves the reach of the arm,
+    or continues only on another branch of the inverse kinematics. Collisions are not checked.
+    """
+    begin = ik.tool_at(start)
+    for lines in LINES:
+        points = _points_on(ik, [start], (begin, target), lines)
+        if points is not None:
+            path = _smooth(points)
+            if _stray(ik, path, begin, target) < MAX_STRAY_M:
+                return path
+    return None
+
+
+def _points_on(ik: InverseKinematics, points: list[Array], way: tuple[Pose, Pose], lines: int) -> Array | None:
+    """Return `points` continued along `way` on one branch, (lines + 1, joints), rad; None: it leaves the branch."""
+    begin, target = way
+    for k in range(1, lines + 1):
+        q = ik.nearby(begin.towards(target, k / lines), points[-1])
+        if q is None:
+            return None
+        points.append(q)
+    return np.array(points)
+
+
+def _smooth(points: Array) -> Path:
+    """Round every corner by half of the shorter adjacent line: neighbours meet, nothing stops."""
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    blend = np.zeros(len(points))
+    blend[1:-1] = 0.5 * np.minimum(lengths[:-1], lengths[1:])
+    return Path(points, blend)
+
+
+def _stray(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> float:
+    """Return the largest distance of the tool from the straight line, in m."""
+    blended = BlendedPath(*path)
+    if blended.length == 0.0:
+        return 0.0
+    way = target.position - begin.position
+    length = norm(way)
+    samples = blended.sample(blended.length / (STRAY_SAMPLES * (len(path.waypoints) - 1)))
+    off = np.array([ik.tool_at(q).position - begin.position for q in samples])
+    if length > 0.0:
+        off -= np.outer(mat_vec(off, way) / length**2, way)
+    return float(np.max(np.linalg.norm(off, axis=1)))
+
+
+def in_metres(tool: Pose) -> str:
+    """Return a position as a user writes it, in m."""
+    return "[{:.3f}, {:.3f}, {:.3f}]".format(*tool.position)

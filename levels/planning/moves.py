@@ -1,0 +1,114 @@
+"""Elemental moves as planning sees them, and the situations before and after them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rack.levels.algebra import Array
+from rack.levels.messages import Verb
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.pose import Pose, pose
+
+VERB_NAMES = {
+    Verb.NONE: "rest",
+    Verb.MOVE: "move",
+    Verb.MOVE_JOINTS: "move",
+    Verb.APPROACH: "approach",
+    Verb.GRASP: "grasp",
+    Verb.DEPART: "depart",
+    Verb.RELEASE: "release",
+}
+
+
+class Move(NamedTuple):
+    """One `ELEMENTAL_MOVE`."""
+
+    id: int
+    action: int
+    verb: Verb
+    object: int | None  # row in the world model
+    tool: Pose  # of the tool at the end
+    joints: Array  # (joints,), rad
+    posture: bool  # of the configurations at `tool`, the one nearest to `joints` is wanted
+    by_s: float  # simulated time by which it must be done, s; 0: no such time
+
+    @property
+    def is_motion(self) -> bool:
+        """True when the arm moves and a path is needed; False for the gripper."""
+        return self.verb not in (Verb.GRASP, Verb.RELEASE)
+
+    @property
+    def touches(self) -> bool:
+        """True when the object that is held, or is about to be grasped, may touch its support."""
+        return self.verb in (Verb.APPROACH, Verb.DEPART)
+
+    def write_to(self, record: Any) -> None:
+        """Fill one element of an array of `ELEMENTAL_MOVE`."""
+        record["id"], record["action"], record["verb"] = self.id, self.action, self.verb
+        record["object"] = -1 if self.object is None else self.object
+        record["position"], record["quaternion"] = self.tool
+        record["joints"], record["posture"], record["by"] = self.joints, self.posture, self.by_s
+
+
+def read_move(record: Any) -> Move:
+    """Return a copy of the move in one element of an array of `ELEMENTAL_MOVE`."""
+    row = int(record["object"])
+    return Move(
+        id=int(record["id"]),
+        action=int(record["action"]),
+        verb=Verb(int(record["verb"])),
+        object=None if row < 0 else row,
+        tool=pose(record["position"], record["quaternion"]),
+        joints=np.array(record["joints"]),
+        posture=bool(record["posture"]),
+        by_s=float(record["by"]),
+    )
+
+
+def read_window(command: Any) -> list[Move]:
+    """Return the moves of a `TASK_COMMAND` or a `TASK_PLAN`, oldest first."""
+    return [read_move(record) for record in command.moves[: command.count]]
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Where the bodies are and what the gripper holds: now, or once the moves ahead are done."""
+
+    positions: Array  # (bodies, 3), m: the rows of the world model
+    quaternions: Array  # (bodies, 4), as w, x, y, z
+    held: int | None = None  # row of the object in the gripper
+    grip: Pose | None = None  # its pose in the tool's frame
+
+    def object_pose(self, row: int) -> Pose:
+        """Return the pose of object `row` in the world model."""
+        return Pose(self.positions[row], self.quaternions[row])
+
+    def after(self, move: Move) -> Situation:
+        """Return the situation after `move` has succeeded."""
+        if move.verb is Verb.GRASP and move.object is not None:
+            return self.holding(move.object, move.tool.inverse() @ self.object_pose(move.object))
+        if move.verb is Verb.RELEASE and self.held is not None and self.grip is not None:
+            return self.with_body(self.held, move.tool @ self.grip).holding(None, None)
+        return self
+
+    def holding(self, row: int | None, grip: Pose | None) -> Situation:
+        """Return this situation with object `row` in the gripper at `grip` in the tool's frame; None: nothing held."""
+        return replace(self, held=row, grip=grip)
+
+    def with_body(self, row: int, at: Pose) -> Situation:
+        """Return this situation with body `row` at another pose."""
+        positions, quaternions = self.positions.copy(), self.quaternions.copy()
+        positions[row], quaternions[row] = at
+        return replace(self, positions=positions, quaternions=quaternions)
+
+    def lay_out(self, checker: CollisionChecker, touched: int | None) -> None:
+        """Set `checker` to this situation; object `touched` may touch supports and gripper."""
+        checker.place(self.positions, self.quaternions)
+        if self.held is None or self.grip is None:
+            checker.hold(None)
+        else:
+            checker.hold(self.held, *self.grip)
+        checker.permit(touched)

@@ -1,0 +1,252 @@
+"""Segments under way.
+
+A path starts when planned and clear, holds on command or for the guard, and is done when settled. A gripper segment is
+done when the gripper rests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.messages import Error
+from rack.levels.motion.path import BlendedPath
+from rack.levels.motion.speed import BrakingLimits, JointLimits, braking_limits
+from rack.levels.motion.trajectory import Trajectory
+from rack.levels.primitive.guard import Guard
+from rack.levels.primitive.path_motion import PathMotion
+from rack.levels.primitive.segment import MotionSegment, SegmentFault
+from rack.levels.primitive.tracking import HANDOVER_CYCLES
+from rack.levels.tables import GripperConfig, Positive, Table
+
+ANSWER_CYCLES = 3
+"""Cycles from the end of a trajectory until its segment is reported done, besides those in which the arm settles.
+
+They pass until the last set point is due, the servo's status shows it, and this level's status is visible."""
+
+
+class PrimitiveParams(Table):
+    """Bounds of following, settling and guarding, in `[board.<name>.params]`."""
+
+    following: Positive = Field(0.05, description="largest distance of a joint from its set point under way, rad")
+    straying: Positive = Field(0.1, description="time that a joint may be farther than that before it is an error, s")
+    settled: Positive = Field(0.003, description="largest distance of a settled joint from its goal, rad")
+    settled_opening: Positive = Field(0.002, description="largest speed of a settled gripper, m/s")
+    settled_cycles: int = Field(3, ge=1, le=100, description="consecutive cycles that a settled arm stays so")
+    settling: Positive = Field(3.0, description="longest time that arm or gripper may take to settle, s")
+    astray: Positive = Field(0.02, description="largest distance of a joint from the path when motion begins, rad")
+    bridging: Positive = Field(0.5, description="time in which such a distance is removed, s")
+    silent: Positive = Field(10.0, description="time without status from below, restarts included, that is an error, s")
+    blind: Positive = Field(0.2, description="time without a new scene in the world model after which motion holds, s")
+    braking: float = Field(
+        1.5, ge=1.0, le=3.0, description="multiple of the planned acceleration and jerk limits that a hold may use"
+    )
+    lookahead: Positive = Field(2.0, description="time ahead of the arm that the guard watches in every cycle, s")
+    clear: Positive = Field(0.5, description="time that the way must be clear before held motion continues, s")
+
+
+@dataclass(frozen=True)
+class WorkRules:
+    """The bounds by which segments are done."""
+
+    joints: tuple[str, ...]
+    limits: JointLimits
+    params: PrimitiveParams
+    period_s: float  # the level's cycle
+
+    @property
+    def braking(self) -> BrakingLimits:
+        """Limits of a hold."""
+        return braking_limits(self.limits, self.params.braking)
+
+    def cycles(self, time_s: float) -> int:
+        """Return the cycles that fill `time_s`."""
+        return max(1, round(time_s / self.period_s))
+
+    def quiet(self) -> Quiet:
+        """Return a new count of settled cycles."""
+        return Quiet(self.params.settled_cycles, self.cycles(self.params.settling))
+
+    @property
+    def latency_s(self) -> float:
+        """Time from the end of a trajectory until its segment is reported done, in s."""
+        return (self.params.settled_cycles + ANSWER_CYCLES) * self.period_s
+
+
+class Quiet:
+    """Counts cycles: enough consecutive quiet ones mean settled, too many altogether mean it will never settle."""
+
+    def __init__(self, wanted_cycles: int, most_cycles: int) -> None:
+        self._wanted_cycles = wanted_cycles
+        self._most_cycles = most_cycles
+        self._quiet = 0
+        self._cycles = 0
+
+    def settled(self, quiet: bool) -> bool:
+        """Count one cycle; return whether it has settled."""
+        self._cycles += 1
+        self._quiet = self._quiet + 1 if quiet else 0
+        return self._quiet >= self._wanted_cycles
+
+    @property
+    def overdue(self) -> bool:
+        """True when it should have settled long ago."""
+        return self._cycles > self._most_cycles
+
+
+class WorkCycle(NamedTuple):
+    """The inputs of one cycle of a path."""
+
+    hold: bool
+    plan: Trajectory | None  # from where the motion rests
+    world: Message  # WORLD_MODEL
+    due_s: float  # simulated time of the set point commanded last
+    passed_s: float  # since the cycle before
+
+
+class PathWork:
+    """One PATH segment under way."""
+
+    def __init__(self, segment: MotionSegment, path: BlendedPath, guard: Guard, rules: WorkRules) -> None:
+        self.segment = segment
+        self.motion = PathMotion(path, rules.braking, rules.params.bridging)
+        self.fault: SegmentFault | None = None  # why it cannot be done
+        self.blocked = False  # something is in the way
+        self.astray = False  # the arm is off the path
+        self.obstacle = ""  # what was in the way when the motion was blocked last
+        self.unplanned_cycles = 0  # consecutive cycles in which the motion waits for a trajectory
+        self._guard = guard
+        self._rules = rules
+        self._quiet = rules.quiet()
+        self._clear_cycles = 0
+        self._fresh = True
+
+    def begin_at(self, position: Array) -> None:
+        """Prepare to start from `position` (joints,), rad, where the path must begin."""
+        permitted = self._rules.params.astray
+        distance = self.motion.rest_at(position)
+        if distance > permitted:
+            begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
+            self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
+
+    def begin_near(self, position: Array, progress: float) -> None:
+        """Prepare to continue from `position` (joints,), rad; blocked when that is off the path.
+
+        `progress`, 0 to 1, is about the part of the path that is done.
+        """
+        self._fresh = False
+        self._clear_cycles = 0
+        self._quiet = self._rules.quiet()
+        away = self.motion.rest_near(position, progress)
+        self.astray = self.blocked = away > self._rules.params.astray
+        self.obstacle = f"the arm is {away:.3f} rad off its path"
+
+    def step(self, cycle: WorkCycle) -> None:
+        """Advance by one cycle."""
+        motion, waits = self.motion, self.begin_wanted is not None
+        if motion.trajectory is not None and not motion.stopping:
+            self._block(not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world))
+            if cycle.hold or self.blocked:
+                motion.hold()
+        elif waits and cycle.plan is not None:
+            self._start(cycle, cycle.plan)
+        self.unplanned_cycles = self.unplanned_cycles + 1 if waits and cycle.plan is None else 0
+        motion.advance(cycle.passed_s)
+
+    def done(self, status: Message) -> bool:
+        """Return whether set point and arm rest at the end of the path."""
+        if not self.motion.finished:
+            return False
+        away = np.abs(status.position - self.motion.set_point.position)
+        settled = self._quiet.settled(bool((away < self._rules.params.settled).all()))
+        if self._quiet.overdue and not settled:
+            joint, permitted = int(away.argmax()), self._rules.params.settled
+            name = self._rules.joints[joint]
+            reason = f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most {permitted} rad"
+            self.fault = SegmentFault(Error.FOLLOWING, reason)
+        return settled
+
+    @property
+    def begin_wanted(self) -> float | None:
+        """Where on the path a trajectory is to begin, in rad; None when the motion needs none."""
+        motion = self.motion
+        return motion.s if motion.resting and not motion.finished and not self.astray else None
+
+    @property
+    def progress(self) -> float:
+        """Part of the path done, 0 to 1."""
+        length = self.motion.path.length
+        return self.motion.s / length if length > 0.0 else 1.0
+
+    def ends_s(self, due_s: float) -> float:
+        """Return when the segment should be done, in simulated time, if the set point is due at `due_s`; 0: unknown."""
+        if self.motion.stopping or (self.motion.resting and not self.motion.finished):
+            return 0.0
+        return due_s + self.motion.remaining_s + self._rules.latency_s
+
+    def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
+        clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
+        self._clear_cycles = self._clear_cycles + 1 if clear else 0
+        wanted = self._rules.cycles(self._rules.params.clear) if self.blocked else 1
+        self._block(self._clear_cycles < wanted)
+        if cycle.hold or self.blocked:
+            return
+        timed = self._timed(plan, cycle.due_s)
+        if timed is not None:
+            self.motion.follow(timed)
+            self._fresh = False
+            self._clear_cycles = 0
+
+    def _block(self, blocked: bool) -> None:
+        if blocked and not self.blocked:
+            self.obstacle = self._guard.obstacle
+        self.blocked = blocked
+
+    def _timed(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
+        """Stretch the trajectory to end just in time; refuse one that is too late before anything has moved."""
+        if not self.segment.by or not trajectory.duration:
+            return trajectory
+        available = self.segment.by - self._rules.latency_s - due_s
+        if available < trajectory.duration and self._fresh:
+            self.fault = self.segment.too_late(due_s + trajectory.duration + self._rules.latency_s)
+            return None
+        return trajectory.stretched(max(1.0, available / trajectory.duration))
+
+
+class GripperWork:
+    """One GRIPPER segment under way: the gripper moves as far as its force takes it, and is done when it rests."""
+
+    def __init__(self, segment: MotionSegment, gripper: GripperConfig, rules: WorkRules) -> None:
+        self.segment = segment
+        self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
+        self.fault: SegmentFault | None = None  # why it cannot be done
+        self._rules = rules
+        self.begin()
+
+    def begin(self) -> None:
+        """Wait anew until the gripper rests: at the start, and after the servo has been away."""
+        self._cycles = 0
+        self._quiet = self._rules.quiet()
+
+    @property
+    def held_after(self) -> int | None:
+        """The object in the gripper afterwards: the segment's, if the gripper ends nearer to closed than to open."""
+        return self.segment.object if self._closes else None
+
+    def done(self, status: Message) -> bool:
+        """Return whether the gripper rests."""
+        self._cycles += 1
+        # The gripper rests too before the command has reached it.
+        if self._cycles <= HANDOVER_CYCLES:
+            return False
+        speed, permitted = abs(status.opening_velocity), self._rules.params.settled_opening
+        settled = self._quiet.settled(speed < permitted)
+        if self._quiet.overdue and not settled:
+            reason = f"gripper still moves at {speed:.4f} m/s; it must come below {permitted} m/s"
+            self.fault = SegmentFault(Error.FOLLOWING, reason)
+        return settled

@@ -1,0 +1,101 @@
+"""The elemental move level above the real levels below it: paths ahead of their turn, other ways, restarts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import State
+from rack.levels.messages import Error
+from rack.levels.tables import MotionConfig
+from tests.levels.whole_rack import WholeRack
+
+TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
+HOME = {"do": "home"}
+GOAL = np.array(TRANSFER["to"])
+BLOCK1, POST = 0, 3
+
+
+def post_moves(*legs: tuple[float, tuple[float, float, float]], speed: float = 0.25) -> list[MotionConfig]:
+    """Bring the post to the height of the arm, out of its reach, then along `legs`: time and place."""
+    first = MotionConfig(body="post", at=1.0, to=(legs[0][1][0], 0.85, legs[0][1][2]), speed=1.0)
+    return [first, *(MotionConfig(body="post", at=at, to=to, speed=speed) for at, to in legs)]
+
+
+@pytest.fixture(scope="module")
+def transferred() -> tuple[WholeRack, list[tuple[int, bool]]]:
+    """A rack that has transferred a block and moved home, and when segments were under way."""
+    rack = WholeRack(actions=[TRANSFER, HOME])
+    seen: list[tuple[int, bool]] = []
+
+    def watch(_: object) -> bool:
+        seen.append((rack.primitive.done, bool(rack.primitive.current)))
+        return rack.task.state in (State.DONE, State.ERROR)
+
+    rack.run(30.0, watch)
+    return rack, seen
+
+
+def test_block_is_put_where_it_should_be_and_nothing_is_touched(transferred: tuple) -> None:
+    rack, _ = transferred
+    assert rack.task.state == State.DONE
+    assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.002)
+    assert rack.read("servo.status").touches == 0
+    assert rack.move.replans == 0
+
+
+def test_arm_hardly_waits_for_a_path_once_it_has_begun(transferred: tuple) -> None:
+    # Between two segments the primitive level may be without work for some of its cycles, not for one of this level's.
+    _, seen = transferred
+    begun = next(k for k, (_, busy) in enumerate(seen) if busy)
+    last = max(done for done, _ in seen)
+    ended = next(k for k, (done, _) in enumerate(seen) if done == last)
+    idle, longest = 0, 0
+    for _, busy in seen[begun:ended]:
+        idle = 0 if busy else idle + 1
+        longest = max(longest, idle)
+    assert longest * 10 < 100
+
+
+def test_another_path_is_taken_around_an_obstacle_that_comes_into_the_way() -> None:
+    rack = WholeRack(arm="puma560_crossing", actions=[TRANSFER], motion=post_moves((5.5, (0.6, 0.0, 0.9))))
+    assert rack.run_to_end(40.0).state == State.DONE
+    assert rack.move.replans >= 1
+    assert rack.read("servo.status").touches == 0
+    assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.003)
+
+
+def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() -> None:
+    motion = post_moves((2.5, (0.5, 0.30, 0.95)), (8.0, (0.5, 0.85, 0.95)))
+    above_block = {"do": "goto", "position": [0.5, 0.3, 0.6]}
+    rack = WholeRack(arm="puma560_crossing", actions=[above_block], motion=motion)
+    rack.run(8.0)
+    assert rack.primitive.done == 0
+    assert rack.move.state == State.HOLDING
+    assert "'post'" in rack.move.reason
+    assert rack.run_to_end(30.0).state == State.DONE
+    assert rack.move.reason == ""
+    assert rack.read("servo.status").touches == 0
+
+
+def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
+    motion = post_moves((2.5, (0.5, 0.30, 0.95)))
+    rack = WholeRack(
+        arm="puma560_crossing", actions=[TRANSFER], motion=motion, params={"elemental_move": {"patience": 0.5}}
+    )
+    status = rack.run_to_end(20.0)
+    assert (status.state, status.error) == (State.ERROR, Error.NO_PATH)
+    assert "'post'" in status.reason
+
+
+@pytest.mark.parametrize("names", [("elemental_move",), ("elemental_move.planner", "task")])
+def test_task_continues_when_boards_are_restarted_repeatedly(names: tuple[str, ...]) -> None:
+    rack = WholeRack(actions=[TRANSFER])
+    for _ in range(12):
+        if rack.run(2.3, lambda _: rack.task.state in (State.DONE, State.ERROR)):
+            break
+        for name in names:
+            rack.restart(name)
+    assert rack.task.state == State.DONE
+    assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.003)
+    assert rack.read("servo.status").touches == 0

@@ -1,0 +1,376 @@
+"""The executor of the elemental move level alone; the test plays task level, planner and primitive level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rack.backplane.message import Message, State
+from rack.levels.elemental_move import ElementalMoveExecutor
+from rack.levels.messages import MOVE_PLAN, PRIMITIVE_STATUS, TASK_COMMAND, Error, SegmentKind, Verb
+from rack.levels.operator import ABOVE_LOST, BELOW_LOST
+from tests.levels.arms import config
+from tests.levels.lockstep import BoardSpec, Lockstep
+
+EVERY = 100
+BLOCK = 0
+PICK = (Verb.MOVE, Verb.APPROACH, Verb.GRASP, Verb.DEPART, Verb.MOVE)
+
+
+class Bench(Lockstep):
+    """The executor between mailboxes that the test writes."""
+
+    def __init__(self, **params: Any) -> None:
+        places = {"above": "task", "below": "primitive"}
+        board = BoardSpec("elemental_move", EVERY, ElementalMoveExecutor, **places, params=params)
+        robot, scene = config("puma560")
+        outside = {"task.command": TASK_COMMAND, "primitive.status": PRIMITIVE_STATUS, "elemental_move.plan": MOVE_PLAN}
+        super().__init__([board], robot, scene, outside=outside)
+        self.home = np.array(robot.home)
+        self.below = self.message("primitive.status")
+        self.below.resting, self.below.held, self.below.opening = 1, -1, 0.04
+        self.below.position = self.home
+        self.ends = {0: self.home}
+
+    def cycle(self, cycles: int = 1, **below: object) -> None:
+        """Show the primitive level's status with the fields `below` changed, and run some cycles."""
+        for name, value in below.items():
+            setattr(self.below, name, value)
+        self.write("primitive.status", self.below)
+        for _ in range(cycles * EVERY):
+            self.step()
+
+    def order(self, verbs: Sequence[Verb] = PICK, first: int = 1, by: float = 0.0) -> None:
+        """Hand down a window of moves."""
+        command = self.message("task.command")
+        for k, verb in enumerate(verbs):
+            command.moves[k]["id"], command.moves[k]["verb"] = first + k, verb
+            command.moves[k]["object"], command.moves[k]["by"] = BLOCK, by
+        command.count, command.id = len(verbs), first + len(verbs) - 1
+        self.write("task.command", command)
+
+    def plan(
+        self, move: int, start: NDArray[np.float64] | None = None, replan: int = 0, error: Error = Error.NONE
+    ) -> None:
+        """Publish a path for a move, from where the one before it ends or `start`, or a refusal."""
+        plan = self.message("elemental_move.plan")
+        plan.move, plan.replan, plan.kind, plan.error = move, replan, SegmentKind.PATH, error
+        plan.reason = "something is there" if error else ""
+        plan.count = 0 if error else 2
+        begin = self.ends[max(m for m in self.ends if m < move)] if start is None else start
+        plan.waypoints[:2] = begin, begin + 0.1
+        if not (error or replan):
+            self.ends[move] = begin + 0.1
+        self.write("elemental_move.plan", plan)
+        self.cycle()
+
+    @property
+    def command(self) -> Message:
+        """What the level hands down."""
+        return self.read("elemental_move.command")
+
+    @property
+    def status(self) -> Message:
+        """What the level reports."""
+        return self.read("elemental_move.status")
+
+    def segments(self) -> list[tuple[int, int]]:
+        """Return serial and move of the segments handed down."""
+        window = self.command.segments[: self.command.count]
+        return [(int(s["id"]), int(s["move"])) for s in window]
+
+
+def planned_bench(**params: Any) -> Bench:
+    """A bench with paths for the motions of `PICK`."""
+    bench = Bench(**params)
+    bench.order()
+    for move in (1, 2, 4, 5):
+        bench.plan(move)
+    bench.cycle(2)
+    return bench
+
+
+def test_nothing_is_handed_down_before_its_path_is_there() -> None:
+    bench = Bench()
+    bench.order()
+    bench.cycle(3)
+    assert bench.segments() == []
+    assert bench.status.state == State.EXECUTING
+    bench.plan(1)
+    bench.cycle(2)
+    assert bench.segments() == [(1, 1)]
+    assert bench.status.planned == 1
+    assert bench.status.end == pytest.approx(bench.home + 0.1)
+
+
+def test_window_stays_full_and_serials_rise() -> None:
+    bench = planned_bench()
+    assert bench.segments() == [(1, 1), (2, 2)]
+    bench.cycle(2, done=1)
+    assert bench.segments() == [(2, 2), (3, 3)]
+    bench.cycle(2, done=2)
+    assert bench.segments() == [(3, 3), (4, 4)]
+    assert bench.status.done == 2
+    assert bench.status.verb == Verb.GRASP
+
+
+def test_gripper_closes_with_force_on_the_object_of_the_move() -> None:
+    bench = planned_bench()
+    bench.cycle(2, done=1)
+    gripper, segment = config("puma560")[0].gripper, bench.command.segments[1]
+    assert gripper is not None
+    assert (segment["kind"], segment["object"]) == (SegmentKind.GRIPPER, BLOCK)
+    assert (segment["opening"], segment["force"]) == (gripper.closed, gripper.force)
+
+
+def test_contacts_are_permitted_on_approach_and_depart_alone() -> None:
+    bench = planned_bench()
+    assert bench.command.segments["touch"].tolist() == [0, 1]
+
+
+def test_grasp_that_shuts_on_nothing_stops_everything() -> None:
+    bench = planned_bench()
+    bench.cycle(2, done=2)
+    bench.cycle(2, done=3, opening=0.0005)
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.GRASP_MISSED)
+    assert bench.segments() == []
+    assert bench.command.hold == 1
+
+
+def test_move_continues_after_a_grasp_that_holds_something() -> None:
+    bench = planned_bench()
+    bench.cycle(2, done=2)
+    bench.cycle(2, done=3, opening=0.022, held=BLOCK)
+    assert bench.status.state == State.EXECUTING
+    assert bench.segments() == [(4, 4), (5, 5)]
+
+
+def test_object_that_is_lost_on_the_way_is_an_error() -> None:
+    bench = planned_bench()
+    bench.cycle(2, done=3, opening=0.022, held=BLOCK)
+    bench.cycle(2, opening=0.0)
+    assert bench.status.error == Error.OBJECT_LOST
+
+
+def test_error_of_the_level_below_goes_up_with_its_reason() -> None:
+    bench = planned_bench()
+    bench.cycle(2, state=State.ERROR, error=Error.FOLLOWING, reason="joint 2 strays")
+    assert (bench.status.error, bench.status.reason) == (Error.FOLLOWING, "joint 2 strays")
+
+
+def test_program_that_is_done_is_reported_done() -> None:
+    bench = planned_bench()
+    for segment in range(1, 6):
+        bench.cycle(2, done=segment, opening=0.022, held=BLOCK)
+    assert bench.status.state == State.DONE
+    assert bench.status.done == 5
+    assert bench.segments() == []
+
+
+def test_blocked_arm_holds_and_asks_for_another_path_from_where_it_rests() -> None:
+    bench = planned_bench()
+    bench.cycle(2, current=1, blocked=1, resting=1, position=bench.home + 0.05)
+    assert bench.command.hold == 1
+    assert bench.status.replan > 0
+    assert bench.status.start == pytest.approx(bench.home + 0.05)
+
+
+def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> None:
+    bench = planned_bench()
+    bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
+    bench.plan(1, bench.home + 0.05, replan=bench.status.replan)
+    bench.cycle(1)
+    assert bench.segments()[0] == (3, 1)
+    assert bench.command.segments[0]["waypoints"][0] == pytest.approx(bench.home + 0.05)
+    bench.cycle(2, current=3, blocked=0)
+    assert bench.command.hold == 0
+    assert bench.segments() == [(3, 1), (4, 2)]
+    assert bench.status.replans == 1
+
+
+def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_is_there() -> None:
+    # As where the guard sees a collision that the planner does not: every path is free, and none can be followed.
+    bench, why = planned_bench(replans=3), "blocked: 'pad_left' and 'block1' are -7.1 mm apart; valid: 0.0 mm"
+    for _ in range(3):
+        serial = bench.segments()[0][0]
+        bench.cycle(2, current=serial, blocked=1, state=State.HOLDING, reason=why)
+        assert (bench.status.state, bench.status.reason) == (State.HOLDING, why)
+        bench.plan(1, bench.home, replan=bench.status.replan)
+    bench.cycle(2, current=bench.segments()[0][0])
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.BLOCKED)
+    assert bench.status.reason == f"3 other paths tried, still {why}"
+    assert bench.segments() == []
+
+
+def test_next_move_may_take_as_many_other_paths_again() -> None:
+    bench = planned_bench(replans=1)
+    bench.cycle(2, current=1, blocked=1)
+    bench.plan(1, bench.home, replan=bench.status.replan)
+    bench.cycle(2, current=3, blocked=0)
+    bench.cycle(2, done=3, current=4, blocked=1)
+    assert (bench.status.error, bench.status.replan > 0) == (Error.NONE, True)
+
+
+def test_who_keeps_the_level_below_from_its_work_is_passed_on() -> None:
+    bench = planned_bench()
+    bench.cycle(
+        2, current=1, progress=0.25, operated=1, state=State.HOLDING, reason="waiting for servo: brakes engaged"
+    )
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "waiting for servo: brakes engaged")
+    assert (bench.status.progress, bench.status.operated) == (0.25, 1)
+    bench.cycle(2, operated=0, state=State.EXECUTING, reason="")
+    assert (bench.status.state, bench.status.reason, bench.status.operated) == (State.EXECUTING, "", 0)
+
+
+def test_answer_to_an_older_request_is_not_taken() -> None:
+    bench = planned_bench()
+    bench.cycle(2, current=1, blocked=1)
+    bench.plan(1, replan=bench.status.replan - 1)
+    bench.cycle(2)
+    assert bench.segments() == [(1, 1), (2, 2)]
+
+
+def test_request_is_dropped_when_the_way_is_free_again() -> None:
+    bench = planned_bench()
+    bench.cycle(2, current=1, blocked=1)
+    bench.cycle(2, blocked=0)
+    assert bench.command.hold == 0
+    assert bench.status.replan == 0
+    assert bench.segments() == [(1, 1), (2, 2)]
+
+
+def test_time_is_handed_down_less_what_the_answer_takes() -> None:
+    bench = Bench()
+    bench.order([Verb.MOVE_JOINTS], by=20.0)
+    bench.plan(1)
+    bench.cycle(2)
+    # The report of the primitive level waits a cycle to be read and this level's a cycle to be seen.
+    assert 18.0 < bench.command.segments[0]["by"] <= 20.0 - 2 * 0.25
+
+
+def test_refusal_counts_when_its_move_is_due_and_not_before() -> None:
+    bench = Bench()
+    bench.order()
+    bench.plan(1)
+    bench.plan(2, error=Error.UNREACHABLE)
+    bench.cycle(4, current=1)
+    assert bench.status.state == State.EXECUTING
+    bench.cycle(2, done=1, current=0)
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.UNREACHABLE)
+    assert bench.status.reason == "something is there"
+
+
+def test_move_without_a_path_for_now_waits_and_says_why() -> None:
+    bench = Bench()
+    bench.order()
+    bench.plan(1, error=Error.NO_PATH)
+    bench.cycle(3)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "something is there")
+    bench.plan(1)
+    bench.cycle(2)
+    assert bench.segments() == [(1, 1)]
+    assert bench.status.reason == ""
+
+
+def test_another_program_begins_once_the_arm_rests() -> None:
+    bench = planned_bench()
+    bench.order(first=40)
+    bench.cycle(2, resting=0)
+    assert bench.segments() == []
+    assert bench.status.done == 0
+    bench.cycle(2, resting=1)
+    assert bench.status.done == 39
+    bench.plan(40, bench.home)
+    bench.cycle(2)
+    assert bench.segments() == [(3, 40)]
+
+
+def test_restarted_executor_continues_from_its_own_last_messages() -> None:
+    bench = planned_bench()
+    bench.cycle(2, done=1)
+    bench.restart("elemental_move")
+    bench.cycle(2)
+    assert bench.segments() == [(2, 2), (3, 3)]
+    # The path of move 4 is lost with the old executor, and the planner sees that.
+    assert bench.status.planned == 3
+    bench.plan(4)
+    bench.cycle(2, done=2)
+    assert bench.segments() == [(3, 3), (4, 4)]
+
+
+def test_after_a_restart_the_next_path_continues_from_the_one_that_replaced_the_blocked_one() -> None:
+    bench = planned_bench()
+    bench.restart("elemental_move")
+    bench.cycle(2, blocked=1, current=1)
+    bench.plan(1, bench.home, replan=bench.status.replan)
+    bench.cycle(1, blocked=0, current=3, resting=0)
+    assert [move for _, move in bench.segments()] == [1]
+    assert (bench.status.planned, bench.status.end) == (1, pytest.approx(bench.home + 0.1))
+    bench.plan(2, bench.home + 0.2)  # where move 2 was to end before it was withdrawn
+    bench.cycle(2)
+    assert [move for _, move in bench.segments()] == [1]
+
+
+def test_arm_is_held_while_the_board_above_is_lost() -> None:
+    bench = planned_bench()
+    bench.boxes["task.command"].lost = True
+    bench.cycle(2)
+    assert bench.command.hold == 1
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, ABOVE_LOST)
+    assert bench.segments() == [(1, 1), (2, 2)]
+    bench.boxes["task.command"].lost = False
+    bench.cycle(2)
+    assert (bench.command.hold, bench.status.error) == (0, 0)
+
+
+def test_level_says_that_it_waits_for_the_board_below() -> None:
+    bench = planned_bench()
+    bench.boxes["primitive.status"].lost = True
+    bench.cycle(2)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, BELOW_LOST)
+    bench.boxes["primitive.status"].lost = False
+    bench.cycle(2)
+    assert (bench.status.state, bench.status.reason) == (State.EXECUTING, "")
+
+
+def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() -> None:
+    # The path of move 1 was lost on its way, that of move 2 was not; another path for move 1 may end elsewhere.
+    bench = Bench()
+    bench.order()
+    bench.plan(2, bench.home + 0.3)
+    bench.plan(1)
+    bench.cycle(2)
+    assert bench.status.planned == 1
+    bench.plan(2)
+    bench.cycle(2)
+    assert bench.status.planned == 3
+
+
+def test_path_made_again_with_another_end_withdraws_what_was_planned_from_the_old_one() -> None:
+    bench = planned_bench()
+    assert bench.status.planned == 5
+    again = bench.message("elemental_move.plan")
+    again.move, again.kind, again.count = 4, SegmentKind.PATH, 2
+    again.waypoints[:2] = bench.ends[2], bench.ends[2] + 0.3
+    bench.write("elemental_move.plan", again)
+    bench.cycle(2)
+    assert bench.status.planned == 4
+    assert bench.status.end == pytest.approx(bench.ends[2] + 0.3)
+
+
+def test_answer_for_a_place_that_the_arm_has_left_is_requested_again() -> None:
+    bench = planned_bench()
+    bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
+    asked = bench.status.replan
+    bench.cycle(position=bench.home + 0.09)
+    bench.plan(1, bench.home + 0.05, replan=asked)
+    bench.cycle(1)
+    assert bench.segments() == [(1, 1), (2, 2)]
+    assert bench.status.replan > asked
+    bench.plan(1, bench.home + 0.09, replan=bench.status.replan)
+    bench.cycle(1)
+    assert bench.segments()[0] == (3, 1)

@@ -1,0 +1,118 @@
+"""A blended path: geometry, smoothness, bounds, degenerate cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.levels.motion.path import BlendedPath
+
+CORNERED = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, -0.3], [1.2, 1.0, 0.1], [0.4, 1.1, 0.9]])
+BLEND = np.array([0.0, 0.3, 0.25, 0.0])
+
+
+def points(path: BlendedPath, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    q, dq, d2q = zip(*(tuple(a.copy() for a in path.evaluate(x)) for x in s), strict=True)
+    return np.array(q), np.array(dq), np.array(d2q)
+
+
+def test_path_begins_and_ends_on_its_first_and_last_waypoint() -> None:
+    path = BlendedPath(CORNERED, BLEND)
+    assert path.evaluate(0.0).q == pytest.approx(CORNERED[0], abs=1e-15)
+    assert path.evaluate(path.length).q == pytest.approx(CORNERED[-1], abs=1e-12)
+    assert path.length == pytest.approx(np.linalg.norm(np.diff(CORNERED, axis=0), axis=1).sum())
+
+
+def test_derivatives_agree_with_finite_differences() -> None:
+    path, step = BlendedPath(CORNERED, BLEND), 1e-5
+    s = np.linspace(step, path.length - step, 2003)
+    _, dq, d2q = points(path, s)
+    ahead, ahead_dq, _ = points(path, s + step)
+    behind, behind_dq, _ = points(path, s - step)
+    assert np.abs((ahead - behind) / (2 * step) - dq).max() < 1e-8
+    assert np.abs((ahead_dq - behind_dq) / (2 * step) - d2q).max() < 2e-4  # q'' has kinks where a blend ends
+
+
+def test_second_derivative_is_continuous_and_zero_where_a_blend_ends() -> None:
+    path = BlendedPath(CORNERED, BLEND)
+    for s in path.breaks[1:-1]:
+        _, _, d2q = points(path, np.array([s - 1e-9, s, s + 1e-9]))
+        assert np.abs(d2q).max() < 1e-6
+
+
+def test_analytic_bounds_hold_and_are_tight_on_every_piece() -> None:
+    path = BlendedPath(CORNERED, BLEND)
+    for k, (start, end) in enumerate(zip(path.breaks[:-1], path.breaks[1:], strict=True)):
+        s = np.linspace(start, end - 1e-12, 400)
+        _, dq, d2q = points(path, s)
+        third = np.diff(d2q, axis=0) / (s[1] - s[0])
+        assert (np.abs(dq).max(axis=0) <= path.bounds.first[k] + 1e-9).all()
+        assert (np.abs(d2q).max(axis=0) <= path.bounds.second[k] + 1e-9).all()
+        assert (np.abs(third).max(axis=0) <= path.bounds.third[k] + 1e-6).all()
+        assert np.abs(d2q).max(axis=0) == pytest.approx(path.bounds.second[k], rel=1e-3, abs=1e-9)
+
+
+def test_only_a_corner_without_blend_is_a_stop() -> None:
+    path = BlendedPath(CORNERED, [0.0, 0.0, 0.2, 0.0])
+    assert path.stops == pytest.approx([np.linalg.norm(CORNERED[1])])
+    straight = BlendedPath([[0.0, 0.0], [0.5, 0.5], [2.0, 2.0]], [0.0, 0.0, 0.0])
+    assert straight.stops == []
+
+
+def test_rounded_corner_stays_between_the_corner_and_its_chord() -> None:
+    path = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.4, 0.0])
+    q, _, _ = points(path, np.linspace(0.6, 1.4, 101))
+    assert (q[:, 0] <= 1.0).all()
+    assert (q[:, 1] >= 0.0).all()
+    assert (q[:, 0] - q[:, 1] >= 0.6 - 1e-12).all()
+
+
+def test_blends_that_touch_leave_no_line_between_them() -> None:
+    path = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [2.0, 1.0]], [0.0, 0.5, 0.5, 0.0])
+    assert path.breaks == pytest.approx([0.0, 0.5, 1.5, 2.5, 3.0])
+    whole = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 1.0, 0.0])
+    assert whole.breaks == pytest.approx([0.0, 2.0])
+    assert whole.evaluate(0.0).q == pytest.approx([0.0, 0.0])
+    assert whole.evaluate(2.0).q == pytest.approx([1.0, 1.0])
+
+
+def test_single_waypoint_is_a_path_of_length_zero() -> None:
+    path = BlendedPath([[0.3, -0.4]], [0.7])
+    point = path.evaluate(0.5)
+    assert path.length == 0.0
+    assert path.stops == []
+    assert point.q == pytest.approx([0.3, -0.4])
+    assert not point.dq_ds.any()
+    assert not point.d2q_ds2.any()
+    assert path.sample(0.1) == pytest.approx(np.array([[0.3, -0.4]]))
+
+
+def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
+    path = BlendedPath([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.3, 0.2, 0.4, 0.0])
+    assert path.waypoints == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
+    assert path.blend == pytest.approx([0.0, 0.2, 0.0])
+    nowhere = BlendedPath([[1.0, 2.0]] * 3, [0.0, 0.5, 0.0])
+    assert nowhere.length == 0.0
+    assert nowhere.evaluate(0.0).q == pytest.approx([1.0, 2.0])
+
+
+def test_samples_are_no_further_apart_than_asked() -> None:
+    sampled = BlendedPath(CORNERED, BLEND).sample(0.05)
+    assert np.linalg.norm(np.diff(sampled, axis=0), axis=1).max() <= 0.05 + 1e-12
+    assert sampled[[0, -1]] == pytest.approx(CORNERED[[0, -1]])
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "blend", "offender"),
+    [
+        ([[0.0], [1.0], [2.0], [1.0]], [0.0, 0.6, 0.6, 0.0], "overlap"),
+        ([[0.0], [1.0], [0.5]], [0.0, 0.6, 0.0], "overlap"),
+        ([[0.0], [1.0]], [0.0], "shape"),
+        ([], [], "shape"),
+        ([[0.0], [1.0], [2.0]], [0.0, -0.1, 0.0], "-0.1"),
+        ([[0.0], [float("nan")]], [0.0, 0.0], "finite"),
+    ],
+)
+def test_path_that_cannot_be_is_refused(waypoints: list, blend: list, offender: str) -> None:
+    with pytest.raises(ValueError, match=offender):
+        BlendedPath(waypoints, blend)

@@ -1,0 +1,206 @@
+"""Time along a path: limits of every joint, exact ends, good use of the limits, stretching, stopping."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.levels.messages import SECTIONS, WAYPOINTS
+from rack.levels.motion.path import BlendedPath, PathBounds
+from rack.levels.motion.speed import SpeedLimits, boundary_speeds, braking_limits, reachable_speed, speed_limits
+from rack.levels.motion.trajectory import PathState, Trajectory, duration, make_stop, make_trajectory
+from tests.levels.arms import cell
+
+EXACT = 1e-6
+"""Rounding, relative to a limit."""
+
+
+ARM = cell("puma560").limits
+
+
+def random_path(seed: int, corners: int, scale: float = 0.6, stops: bool = False) -> BlendedPath:
+    """A random walk with every corner rounded; with `stops`, some are not."""
+    rng = np.random.default_rng(seed)
+    waypoints = np.cumsum(rng.normal(scale=scale, size=(corners + 2, 6)), axis=0)
+    lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    blend = np.zeros(corners + 2)
+    blend[1:-1] = np.minimum(lengths[:-1], lengths[1:]) * rng.uniform(0.05, 0.5, corners)
+    if stops:
+        blend[1:-1] *= rng.random(corners) > 0.3
+    return BlendedPath(waypoints, blend)
+
+
+def used(path: BlendedPath, trajectory: Trajectory, samples: int = 3000) -> tuple[float, float, float]:
+    """Return the largest parts of velocity, acceleration and jerk limits that densely sampled motion uses.
+
+    Jerk is the difference of the acceleration over a step that touches no change of section.
+    """
+    times = np.linspace(0.0, trajectory.duration, samples)
+    velocity, acceleration = np.zeros((2, samples, path.joints))
+    for k, time_s in enumerate(times):
+        s, ds, dds = trajectory.at(time_s)
+        _, dq, d2q = path.evaluate(s)
+        velocity[k] = dq * ds
+        acceleration[k] = d2q * ds**2 + dq * dds
+    jerk = np.diff(acceleration, axis=0) / (times[1] - times[0])
+    return (
+        float(np.max(np.abs(velocity) / ARM.velocity)),
+        float(np.max(np.abs(acceleration) / ARM.acceleration)),
+        float(np.max(np.abs(jerk) / ARM.jerk)),
+    )
+
+
+@pytest.mark.parametrize("corners", [0, 1, 2, 4, 9])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_every_joint_keeps_velocity_acceleration_and_jerk_limits(seed: int, corners: int) -> None:
+    path = random_path(seed, corners, stops=seed == 3)
+    assert max(used(path, make_trajectory(path, ARM))) <= 1.0 + EXACT
+
+
+@pytest.mark.parametrize("corners", [0, 1, 4, WAYPOINTS - 2])
+def test_trajectory_goes_from_rest_at_the_begin_to_rest_at_the_end(corners: int) -> None:
+    path = random_path(5, corners)
+    trajectory = make_trajectory(path, ARM)
+    assert trajectory.at(0.0) == (0.0, 0.0, 0.0)
+    assert trajectory.at(trajectory.duration) == pytest.approx((path.length, 0.0, 0.0), abs=1e-8)
+    assert len(trajectory.sections) <= SECTIONS
+
+
+def test_sections_join_without_a_jump_in_s_ds_and_dds() -> None:
+    trajectory = make_trajectory(random_path(6, 5, stops=True), ARM)
+    starts = trajectory.sections[1:, 0]
+    before = np.array([trajectory.at(t - 1e-9) for t in starts])
+    assert np.abs(before - trajectory.sections[1:, 1:4]).max() < 1e-5
+
+
+def test_trajectory_never_goes_backwards() -> None:
+    for seed in range(8):
+        trajectory = make_trajectory(random_path(seed, 4), ARM)
+        _, ds, _ = trajectory.states(np.linspace(0.0, trajectory.duration, 4000))
+        assert ds.min() > -1e-9
+
+
+def test_straight_line_uses_velocity_and_acceleration_limits_fully() -> None:
+    path = BlendedPath([np.zeros(6), np.array([2.5, 1.0, 0.5, 0.0, 0.0, 0.0])], [0.0, 0.0])
+    velocity, acceleration, jerk = used(path, make_trajectory(path, ARM))
+    assert velocity == pytest.approx(1.0, abs=1e-6)
+    assert acceleration == pytest.approx(1.0, abs=1e-6)
+    assert jerk == pytest.approx(1.0, abs=1e-6)
+
+
+def test_rounded_corner_is_quicker_than_a_stop_at_it() -> None:
+    waypoints = [np.zeros(6), np.full(6, 0.5), np.array([1.0, 0.2, 0.9, 0.5, 0.0, 0.5])]
+    assert duration(BlendedPath(waypoints, [0, 0.6, 0]), ARM) < 0.95 * duration(BlendedPath(waypoints, [0, 0, 0]), ARM)
+
+
+def test_motion_rests_at_every_stop_of_the_path() -> None:
+    path = BlendedPath([np.zeros(6), np.full(6, 0.4), np.array([0.8, 0, 0, 0, 0, 0.4])], np.zeros(3))
+    trajectory = make_trajectory(path, ARM)
+    s, ds, _ = trajectory.states(np.linspace(0.0, trajectory.duration, 20_001))
+    assert path.stops
+    assert np.abs(ds[np.argmin(np.abs(s - path.stops[0]))]) < 0.02
+    assert ds.max() > 0.5
+
+
+def test_path_of_length_zero_takes_no_time() -> None:
+    trajectory = make_trajectory(BlendedPath([np.ones(6)], [0.0]), ARM)
+    assert trajectory.duration == 0.0
+    assert trajectory.at(0.0) == (0.0, 0.0, 0.0)
+
+
+def test_motion_resumes_from_rest_in_the_middle_of_a_corner() -> None:
+    path = random_path(7, 3)
+    begin = float(path.breaks[1:3].mean())
+    trajectory = make_trajectory(path, ARM, begin)
+    assert trajectory.begin == begin
+    assert trajectory.end == pytest.approx(path.length, abs=1e-8)
+    assert max(used(path, trajectory)) <= 1.0 + EXACT
+
+
+def test_stretched_trajectory_takes_exactly_the_time_asked_for_on_the_same_path() -> None:
+    path = random_path(8, 2)
+    quick = make_trajectory(path, ARM)
+    slow = quick.stretched(7.25 / quick.duration)
+    assert slow.duration == pytest.approx(7.25, rel=1e-12)
+    assert slow.end == pytest.approx(quick.end, rel=1e-12)
+    assert slow.at(0.3 * slow.duration).s == pytest.approx(quick.at(0.3 * quick.duration).s, rel=1e-9)
+    velocity, acceleration, jerk = used(path, slow)
+    factor = slow.duration / quick.duration
+    assert velocity <= 1.0 / factor + EXACT
+    assert acceleration <= 1.0 / factor**2 + EXACT
+    assert jerk <= 1.0 / factor**3 + EXACT
+
+
+def test_equal_paths_give_equal_trajectories_bit_for_bit() -> None:
+    one, other = (make_trajectory(random_path(9, 6, stops=True), ARM) for _ in range(2))
+    assert one.sections.tobytes() == other.sections.tobytes()
+
+
+def test_reachable_speed_needs_just_the_length_given() -> None:
+    for start, length in [(0.0, 0.01), (0.0, 0.5), (0.3, 0.05), (0.7, 0.4)]:
+        limits = SpeedLimits(100.0, 2.0, 20.0)
+        change = reachable_speed(start, length, limits) - start
+        short = change <= limits.acceleration**2 / limits.jerk
+        time_s = 2 * np.sqrt(change / limits.jerk) if short else change / 2.0 + 2.0 / 20.0
+        assert (start + change / 2) * time_s == pytest.approx(length, rel=1e-6)
+
+
+def test_speeds_at_boundaries_can_be_reached_from_both_sides() -> None:
+    limits = [SpeedLimits(1.0, 2.0, 20.0), SpeedLimits(0.4, 0.0, 0.0), SpeedLimits(2.0, 1.0, 10.0)]
+    speeds = boundary_speeds([1.0, 0.2, 0.05], limits)
+    assert speeds[0] == speeds[3] == 0.0
+    assert speeds[1] == speeds[2] == pytest.approx(reachable_speed(0.0, 0.05, limits[2]))
+
+
+def test_curve_that_leaves_no_acceleration_is_followed_at_constant_speed() -> None:
+    bend = PathBounds(np.full(6, 0.4), np.full(6, 1.0), np.full(6, 1.0))
+    whole = speed_limits(bend, ARM, share=1.0)
+    part = speed_limits(bend, ARM, share=0.75)
+    assert whole.acceleration == 0.0
+    assert part.acceleration > 0.0
+    assert part.speed < whole.speed
+
+
+@pytest.mark.parametrize("corners", [0, 1, 3])
+def test_stop_keeps_the_joint_limits_and_stays_on_the_path(corners: int) -> None:
+    path = random_path(10 + corners, corners, stops=corners == 3)
+    trajectory = make_trajectory(path, ARM)
+    braking = braking_limits(ARM, 1.5)
+    stops = 0
+    for time_s in np.linspace(0.0, trajectory.duration, 40):
+        motion = trajectory.at(time_s)
+        stop = make_stop(path, braking, motion)
+        if stop is None or stop.duration == 0.0:
+            continue
+        stops += 1
+        assert stop.at(0.0) == pytest.approx(motion, abs=1e-9)
+        assert stop.at(stop.duration)[1:] == pytest.approx((0.0, 0.0), abs=1e-6)
+        assert motion.s <= stop.end <= path.length + 1e-8
+        velocity, acceleration, jerk = used(path, stop, 200)
+        assert velocity <= 1.0 + EXACT
+        assert max(acceleration, jerk) <= 1.5 + 1e-5
+    assert stops > 20
+
+
+def test_stop_never_overruns_a_corner_that_is_a_stop() -> None:
+    path = BlendedPath([np.zeros(6), np.full(6, 0.4), np.array([0.8, 0, 0, 0, 0, 0.4])], np.zeros(3))
+    trajectory = make_trajectory(path, ARM)
+    corner = path.stops[0]
+    for time_s in np.linspace(0.0, trajectory.duration, 60):
+        motion = trajectory.at(time_s)
+        stop = make_stop(path, ARM, motion)
+        if stop is not None and motion.s < corner - 1e-6:
+            assert stop.end <= corner + 1e-8
+
+
+def test_motion_on_a_straight_line_can_be_stopped_at_any_time() -> None:
+    path = random_path(14, 0)
+    trajectory = make_trajectory(path, ARM)
+    for time_s in np.linspace(0.0, trajectory.duration - 0.05, 50):
+        assert make_stop(path, ARM, trajectory.at(time_s)) is not None
+
+
+def test_stop_from_rest_stays_where_it_is() -> None:
+    stop = make_stop(random_path(15, 1), ARM, PathState(0.25, 0.0, 0.0))
+    assert stop is not None
+    assert (stop.begin, stop.end, stop.duration) == (0.25, 0.25, 0.0)

@@ -1,0 +1,161 @@
+"""The collision checker on the PUMA's cell, against places that geometry tells by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.pose import Pose, pointing, pose
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.tables import RobotConfig, SceneConfig
+from tests.levels.arms import CLOCK_NS, cell, config
+
+DOWN = (0.0, 0.0, -1.0)
+BLOCK1, BLOCK2, PEG = 0, 1, 2
+
+
+@pytest.fixture(scope="module")
+def puma() -> Cell:
+    return cell("puma560")
+
+
+@pytest.fixture(scope="module")
+def ik(puma: Cell) -> InverseKinematics:
+    return InverseKinematics(puma, 1)
+
+
+@pytest.fixture
+def checker(puma: Cell) -> CollisionChecker:
+    return CollisionChecker(puma, config("puma560")[1])
+
+
+def tool_down(x: float, y: float, z: float) -> Pose:
+    return pose((x, y, z), pointing(DOWN))
+
+
+def at(ik: InverseKinematics, puma: Cell, x: float, y: float, z: float) -> np.ndarray:
+    found = ik.reachable(tool_down(x, y, z), puma.home)
+    assert found
+    return found[0]
+
+
+def test_home_is_free_and_has_nothing_to_explain(puma: Cell, checker: CollisionChecker) -> None:
+    assert checker.free(puma.home)
+    assert checker.why(puma.home) == ""
+    assert checker.room(puma.home) == checker.clearance
+
+
+def test_arm_in_the_wall_is_not_free_and_the_wall_is_named(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
+    q = at(ik, puma, 0.5, 0.0, 0.7)
+    assert not checker.free(q)
+    assert "'wall'" in checker.why(q)
+    assert checker.room(q) < 0
+
+
+def test_clearance_decides_near_the_table_and_may_be_lowered(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
+    # The fingers end 20 mm below the tool and the table is 0.45 m high: 10 mm are left.
+    q = at(ik, puma, 0.45, -0.4, 0.48)
+    assert not checker.free(q)
+    assert checker.free(q, clearance=0.009)
+    assert not checker.free(q, clearance=0.011)
+    assert checker.room(q) == pytest.approx(0.010, abs=1e-4)
+
+
+def test_links_of_the_arm_may_be_close_but_must_not_touch() -> None:
+    # Nothing stands around this arm: whatever is not free is the arm itself.
+    arm = cell("k1607")
+    checker = CollisionChecker(arm, config("k1607")[1])
+    rng, (low, high) = np.random.default_rng(1), arm.limits.position.T
+    samples = (rng.uniform(low, high) for _ in range(1000))
+    touching, free = next(q for q in samples if not checker.free(q)), arm.home
+    for _ in range(30):
+        middle = 0.5 * (touching + free)
+        touching, free = (touching, middle) if checker.free(middle) else (middle, free)
+    assert checker.room(free) == checker.clearance
+    data = arm.start()
+    data.qpos[arm.qpos] = touching
+    mujoco.mj_forward(arm.model, data)
+    assert -1e-6 < data.contact.dist.min() < 0.0
+
+
+def test_gripper_may_come_to_the_block_that_is_meant_and_to_no_other(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
+    q = at(ik, puma, 0.5, 0.3, 0.475)
+    assert not checker.free(q)
+    checker.permit(BLOCK1)
+    assert checker.free(q)
+    checker.permit(BLOCK2)
+    assert not checker.free(q)
+    checker.permit(BLOCK1, touch=False)
+    assert not checker.free(q)
+
+
+def test_open_fingers_must_not_go_through_the_block_that_is_meant(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
+    checker.permit(BLOCK1)
+    q = at(ik, puma, 0.5, 0.3 + 0.02, 0.475)
+    assert "'block1'" in checker.why(q)
+
+
+def test_held_block_is_carried_and_keeps_clear_of_the_wall(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
+    # The tool is as far from the wall as the palm needs, a block held 80 mm below it would stand in the wall's top.
+    q = at(ik, puma, 0.5, 0.0, 0.80)
+    assert checker.free(q)
+    checker.hold(BLOCK1, (0.0, 0.0, 0.05))
+    assert not checker.free(q)
+    assert "'block1'" in checker.why(q)
+    checker.hold(None)
+    assert checker.free(q)
+
+
+def test_held_block_may_touch_the_table_only_where_it_is_meant_and_not_sink_into_it(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
+    checker.hold(BLOCK1)
+    on_table = at(ik, puma, 0.5, -0.2, 0.475)
+    assert not checker.free(on_table)
+    checker.permit(BLOCK1)
+    assert checker.free(on_table)
+    assert not checker.free(at(ik, puma, 0.5, -0.2, 0.475 - MAX_HELD_DEPTH_M - 0.002))
+
+
+def test_objects_are_where_they_are_placed(puma: Cell, ik: InverseKinematics, checker: CollisionChecker) -> None:
+    q = at(ik, puma, 0.7, 0.2, 0.55)
+    positions, quaternions = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    positions[:] = [[0.5, 0.3, 0.475], [0.6, 0.3, 0.475], [0.5, -0.3, 0.5]]
+    checker.place(positions, quaternions)
+    assert checker.free(q)
+    positions[PEG] = [0.7, 0.246, 0.5]
+    checker.place(positions, quaternions)
+    assert "'peg'" in checker.why(q)
+
+
+def test_arm_may_be_near_the_fixed_body_that_carries_it(tmp_path: Path) -> None:
+    model = tmp_path / "carried.xml"
+    model.write_text(
+        '<mujoco><worldbody><geom name="floor" type="plane" size="2 2 .1"/><body name="stand" pos="0 0 .5">'
+        '<geom name="stand" type="cylinder" size=".05 .1"/><body name="arm" pos="0 0 .16">'
+        '<joint name="j" axis="0 1 0"/><geom name="arm" type="capsule" fromto="0 0 0 0 0 .3" size=".05"/>'
+        '<site name="tip" pos="0 0 .3"/></body></body></worldbody><actuator><motor joint="j" ctrlrange="-9 9"/>'
+        "</actuator></mujoco>"
+    )
+    robot = RobotConfig(
+        model=model, joints=("j",), tool="tip", home=(0.0,), velocity=(1.0,), acceleration=(1.0,), jerk=(1.0,)
+    )
+    scene = SceneConfig(clearance=0.05)
+    checker = CollisionChecker(build_cell(robot, scene, CLOCK_NS), scene)
+    assert checker.free(np.zeros(1))
+    assert not checker.free(np.array([3.0]))

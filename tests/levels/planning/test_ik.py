@@ -1,0 +1,113 @@
+"""Inverse kinematics: of the PUMA, of an arm with seven joints, and straight lines of the tool."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.levels.motion.path import BlendedPath
+from rack.levels.planning.ik import LIMIT_MARGIN_RAD, InverseKinematics, sampling_range
+from rack.levels.planning.motion_planner import MAX_STRAY_M, straight_line
+from rack.levels.planning.path_planner import lever_arms
+from rack.levels.planning.pose import Pose, pointing, pose
+from tests.levels.arms import cell
+
+SEED = 7
+CELLS = {name: cell(name) for name in ("puma560", "k1607")}
+SOLVERS = {name: InverseKinematics(c, SEED) for name, c in CELLS.items()}
+DOWN = pointing((0.0, 0.0, -1.0))
+
+
+def random_poses(name: str, count: int) -> list[Pose]:
+    rng, (low, high) = np.random.default_rng(SEED), sampling_range(CELLS[name])
+    margin = 2 * LIMIT_MARGIN_RAD
+    return [SOLVERS[name].tool_at(rng.uniform(low + margin, high - margin)) for _ in range(count)]
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_every_pose_that_some_configuration_has_is_reached_within_the_limits(name: str) -> None:
+    ik, limits = SOLVERS[name], CELLS[name].limits.position
+    for target in random_poses(name, 40):
+        found = ik.reachable(target, CELLS[name].home)
+        assert found
+        for q in found:
+            reached = ik.tool_at(q)
+            assert reached.position == pytest.approx(target.position, abs=1e-4)
+            assert reached.angle_to(target) < 1e-4
+            assert np.all(q >= limits[:, 0])
+            assert np.all(q <= limits[:, 1])
+
+
+def test_solutions_are_distinct_and_the_quickest_to_get_to_comes_first() -> None:
+    ik, home = SOLVERS["puma560"], CELLS["puma560"].home
+    found = ik.reachable(pose((0.5, -0.2, 0.7), DOWN), home)
+    assert len(found) >= 2
+    times = [ik.time_between(home, q) for q in found]
+    assert times == sorted(times)
+    for k, q in enumerate(found):
+        assert all(np.max(np.abs(q - other)) > 1e-2 for other in found[:k])
+
+
+def test_solutions_leave_out_what_is_not_free() -> None:
+    ik, home, target = SOLVERS["puma560"], CELLS["puma560"].home, pose((0.5, -0.2, 0.7), DOWN)
+    first = ik.reachable(target, home)[0]
+    kept = ik.solutions(target, home, lambda q: not np.allclose(q, first))
+    assert kept
+    assert not any(np.allclose(q, first) for q in kept)
+
+
+def test_pose_out_of_reach_has_no_solution() -> None:
+    assert SOLVERS["puma560"].reachable(pose((2.0, 0.0, 0.5), DOWN), CELLS["puma560"].home) == []
+
+
+def test_equal_questions_get_equal_answers_in_any_order() -> None:
+    target, home = pose((0.5, -0.2, 0.7), DOWN), CELLS["puma560"].home
+    fresh = InverseKinematics(CELLS["puma560"], SEED)
+    fresh.reachable(pose((0.4, 0.3, 0.8), DOWN), home)
+    for one, other in zip(SOLVERS["puma560"].reachable(target, home), fresh.reachable(target, home), strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_nearby_stays_on_its_branch_or_finds_nothing() -> None:
+    ik, home = SOLVERS["puma560"], CELLS["puma560"].home
+    branches = ik.reachable(pose((0.5, -0.2, 0.7), DOWN), home)
+    for q in branches:
+        near = ik.nearby(pose((0.5, -0.2, 0.72), DOWN), q)
+        assert near is not None
+        assert np.max(np.abs(near - q)) < 0.5
+    assert ik.nearby(pose((-0.5, 0.2, 0.7), DOWN), branches[0]) is None
+
+
+@pytest.mark.parametrize("name", CELLS)
+@pytest.mark.parametrize("way", [(0.0, 0.0, 0.1), (0.1, 0.08, 0.0), (0.0, -0.25, 0.05)])
+def test_tool_follows_a_straight_line(name: str, way: tuple[float, float, float]) -> None:
+    ik, start = SOLVERS[name], CELLS[name].home
+    begin = ik.tool_at(start)
+    end = pose(begin.position + np.array(way), begin.quaternion)
+    path = straight_line(ik, start, end)
+    assert path is not None
+    assert np.array_equal(path.waypoints[0], start)
+    assert ik.tool_at(path.end).position == pytest.approx(end.position, abs=1e-4)
+    length = np.linalg.norm(way)
+    for q in BlendedPath(*path).sample(0.01):
+        tool = ik.tool_at(q)
+        off = tool.position - begin.position
+        along = off @ np.array(way) / length
+        assert np.linalg.norm(off - along * np.array(way) / length) < 1.5 * MAX_STRAY_M
+        assert tool.angle_to(begin) < 0.02
+
+
+def test_line_that_leaves_the_reach_of_the_arm_is_refused() -> None:
+    ik, home = SOLVERS["puma560"], CELLS["puma560"].home
+    assert straight_line(ik, home, pose(ik.tool_at(home).position + np.array([1.0, 0.0, 0.0]), DOWN)) is None
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_lever_arms_bound_how_far_a_step_moves_the_tool(name: str) -> None:
+    c, ik = CELLS[name], SOLVERS[name]
+    levers, rng = lever_arms(c, SEED), np.random.default_rng(SEED)
+    low, high = sampling_range(c)
+    for _ in range(50):
+        q, step = rng.uniform(low, high), rng.normal(size=len(low)) * 0.02
+        moved = np.linalg.norm(ik.tool_at(q + step).position - ik.tool_at(q).position)
+        assert moved <= 1.05 * levers @ np.abs(step)

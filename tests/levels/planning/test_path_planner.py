@@ -1,0 +1,133 @@
+"""Paths around the wall of the PUMA's cell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.levels.messages import WAYPOINTS
+from rack.levels.motion.path import BlendedPath, Path
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.path_planner import PathPlanner
+from rack.levels.planning.pose import pointing, pose
+from rack.levels.robot.cell import Cell
+from tests.levels.arms import cell, config
+
+SEED = 3
+SCENE = config("puma560")[1]
+
+
+@pytest.fixture(scope="module")
+def puma() -> Cell:
+    return cell("puma560")
+
+
+@pytest.fixture(scope="module")
+def checker(puma: Cell) -> CollisionChecker:
+    return CollisionChecker(puma, SCENE)
+
+
+@pytest.fixture(scope="module")
+def planner(puma: Cell) -> PathPlanner:
+    return PathPlanner(puma, SCENE.clearance, SEED)
+
+
+@pytest.fixture(scope="module")
+def sides(puma: Cell, checker: CollisionChecker) -> tuple[np.ndarray, np.ndarray]:
+    """Configurations low on either side of the wall."""
+    ik = InverseKinematics(puma, SEED)
+    left = ik.solutions(pose((0.5, 0.3, 0.6), pointing((0, 0, -1))), puma.home, checker.free)[0]
+    return left, ik.solutions(pose((0.5, -0.2, 0.6), pointing((0, 0, -1))), left, checker.free)[0]
+
+
+@pytest.fixture(scope="module")
+def around(planner: PathPlanner, checker: CollisionChecker, sides: tuple[np.ndarray, np.ndarray]) -> Path:
+    path = planner.plan(*sides, checker.free)
+    assert path is not None
+    return path
+
+
+def test_free_straight_line_is_the_path(planner: PathPlanner, checker: CollisionChecker, puma: Cell) -> None:
+    goal = puma.home + np.array([0.2, 0.0, 0.1, 0.0, 0.1, 0.5])
+    path = planner.plan(puma.home, goal, checker.free)
+    assert path is not None
+    assert np.array_equal(path.waypoints, [puma.home, goal])
+
+
+def test_path_around_the_wall_is_free_between_its_checks_too(
+    planner: PathPlanner, checker: CollisionChecker, around: Path
+) -> None:
+    # Between two checks no point moves farther than half the clearance: half of that may be lost.
+    least = 0.74 * SCENE.clearance
+    assert all(checker.free(q, least) for q in BlendedPath(*around).sample(0.13 * planner.step_rad))
+
+
+def test_path_begins_and_ends_exactly_where_it_should(around: Path, sides: tuple[np.ndarray, np.ndarray]) -> None:
+    assert np.array_equal(around.waypoints[0], sides[0])
+    assert np.array_equal(around.end, sides[1])
+    assert 3 <= len(around.waypoints) <= WAYPOINTS
+
+
+def test_corners_are_rounded_so_that_motion_does_not_stop(around: Path) -> None:
+    assert np.all(around.blend[1:-1] > 0.1)
+    assert BlendedPath(*around).stops == []
+
+
+def test_equal_questions_get_equal_paths_whatever_was_planned_before(
+    puma: Cell, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
+) -> None:
+    fresh = PathPlanner(puma, SCENE.clearance, SEED)
+    fresh.plan(sides[1], sides[0], checker.free)
+    again = fresh.plan(*sides, checker.free)
+    assert again is not None
+    assert np.array_equal(again.waypoints, around.waypoints)
+    assert np.array_equal(again.blend, around.blend)
+
+
+def test_another_attempt_takes_other_random_numbers(
+    planner: PathPlanner, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
+) -> None:
+    other = planner.plan(*sides, checker.free, attempt=1)
+    assert other is not None
+    assert not np.array_equal(other.waypoints[1], around.waypoints[1])
+
+
+def test_one_search_is_never_quicker_than_all(
+    planner: PathPlanner, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
+) -> None:
+    hasty = planner.plan(*sides, checker.free, searches=1)
+    assert hasty is not None
+    assert planner.duration(hasty) >= planner.duration(around)
+
+
+def test_no_path_where_goal_or_start_is_blocked(
+    planner: PathPlanner, checker: CollisionChecker, puma: Cell, sides: tuple[np.ndarray, np.ndarray]
+) -> None:
+    in_the_wall = InverseKinematics(puma, SEED).reachable(pose((0.5, 0.0, 0.65), pointing((0, 0, -1))), puma.home)[0]
+    assert planner.plan(puma.home, in_the_wall, checker.free) is None
+    assert planner.plan(in_the_wall, puma.home, checker.free) is None
+
+
+def test_search_without_a_way_ends_after_a_bounded_number_of_checks(planner: PathPlanner, puma: Cell) -> None:
+    checks = 0
+
+    def walled_in(q: np.ndarray) -> bool:
+        nonlocal checks
+        checks += 1
+        return not 0.3 < q[0] < 0.4
+
+    assert planner.plan(puma.home, puma.home + np.array([1.0, 0, 0, 0, 0, 0]), walled_in) is None
+    assert checks < 30_000
+
+
+def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(planner: PathPlanner) -> None:
+    corner = np.array([[0.0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0]])
+
+    def on_the_polyline(q: np.ndarray) -> bool:
+        return bool(min(q[0], q[1]) < 1e-3)
+
+    path = planner.rounded(corner, on_the_polyline)
+    assert path.blend[1] == 0.0
+    assert planner.is_free(path, on_the_polyline)
+    assert planner.rounded(corner, lambda q: True).blend[1] > 0.5

@@ -1,0 +1,203 @@
+"""The guard: the arm rests before it touches what comes in its way, and goes on when the way is clear."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message, State
+from rack.levels.messages import WORLD_MODEL, SegmentKind
+from rack.levels.motion.path import BlendedPath
+from rack.levels.motion.trajectory import make_trajectory
+from rack.levels.primitive.guard import Guard
+from rack.levels.primitive.segment import MotionSegment
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import MotionConfig
+from tests.levels import arms
+from tests.levels.primitive.rack import PrimitiveRack, path
+
+CROSSING = "puma560_crossing"
+POST = "post"
+NEAR = np.array([-0.9, 1.2, -3.1, 0.0, -1.24, 0.0])
+"""The arm reaches out next to the wall; turning about its base from here it sweeps over the table."""
+SWEEP = np.array([2.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def crossing(at: float, y: float = 0.0, leaves_at: float | None = None) -> list[MotionConfig]:
+    """The post waits next to the sweep, steps into it at `at`, and may leave again."""
+    beside, inside = (0.85, y, 0.8), (0.55, y, 0.8)
+    moves = [(0.0, beside, 5.0), (at, inside, 0.25)] + ([(leaves_at, beside, 0.25)] if leaves_at else [])
+    return [MotionConfig(body=POST, at=start, to=to, speed=speed) for start, to, speed in moves]
+
+
+def sweep(rack: PrimitiveRack) -> None:
+    rack.command(path(1, [rack.home, NEAR]), path(2, [NEAR, NEAR + SWEEP]))
+
+
+@cache
+def crossed(at: float, y: float) -> PrimitiveRack:
+    """Return a rack that has swept until the post crossed its way; its tests only look at it."""
+    rack = PrimitiveRack(CROSSING, motion=crossing(at, y))
+    sweep(rack)
+    rack.run(3.2)
+    return rack
+
+
+@pytest.mark.parametrize(("at", "y"), [(0.5, 0.0), (1.4, 0.0), (1.4, 0.25)])
+def test_arm_rests_before_an_obstacle_that_crosses_touches_it(at: float, y: float) -> None:
+    rack = crossed(at, y)
+    assert rack.status.blocked
+    assert rack.status.resting
+    assert rack.servo.touches == 0
+    assert rack.status.done == 1
+
+
+def test_motion_continues_once_the_obstacle_has_left() -> None:
+    rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
+    sweep(rack)
+    assert rack.run_until_done(2, 12.0)
+    assert rack.servo.touches == 0
+    held = [k for k, s in enumerate(rack.seen) if s["blocked"] and s["resting"]]
+    assert held
+    assert (held[-1] + 1) * 0.02 > 4.5
+    assert rack.seen[held[0]]["progress"] > 0.1
+
+
+def test_arm_that_looks_ahead_too_little_touches_the_obstacle() -> None:
+    rack = PrimitiveRack(CROSSING, motion=crossing(1.0), params={"lookahead": 0.001})
+    sweep(rack)
+    rack.run(4.0)
+    assert rack.servo.touches > 0
+
+
+def test_obstacle_that_enters_the_path_after_the_arm_has_passed_does_not_hold_it() -> None:
+    rack = PrimitiveRack(CROSSING, motion=crossing(2.2))
+    sweep(rack)
+    assert rack.run_until_done(2, 4.0)
+    assert not any(s["blocked"] for s in rack.seen)
+
+
+def test_hold_keeps_the_path_and_brakes_within_its_limits() -> None:
+    made = [p for p in crossed(1.4, 0.0).set_points if p["due"]]
+    accelerations = np.array([p["acceleration"] for p in made])
+    assert (np.abs(accelerations) <= 1.5 * arms.cell(CROSSING).limits.acceleration * (1 + 1e-6)).all()
+    last = np.array([p["position"] for p in made[-50:]])
+    assert np.ptp(last, axis=0).max() == 0.0
+    assert last[0, 1:] == pytest.approx(NEAR[1:], abs=1e-9)
+
+
+def test_held_arm_says_when_the_way_is_free_again() -> None:
+    rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
+    sweep(rack)
+    rack.run(3.0)
+    assert rack.status.blocked
+    assert rack.status.state == State.HOLDING
+    assert "blocked: '" in rack.status.reason
+    assert "'post'" in rack.status.reason
+    rack.command(path(1, [rack.home, NEAR]), path(2, [NEAR, NEAR + SWEEP]), hold=True)
+    rack.run(3.0)
+    assert not rack.status.blocked
+    assert rack.status.resting
+
+
+def test_missing_world_model_holds_the_arm_until_it_is_back() -> None:
+    rack = PrimitiveRack(CROSSING)
+    sweep(rack)
+    rack.run(1.4)
+    world = rack.tasks["world"]
+    world.due = -1
+    rack.run(1.0)
+    assert rack.status.resting
+    assert not rack.status.blocked
+    world.due = -(-rack.tick // 8) * 8
+    assert rack.run_until_done(2, 4.0)
+
+
+class Watched:
+    """A guard over a path of the crossing cell, and the world model that it is shown."""
+
+    def __init__(self, waypoints: np.ndarray, touch: bool = False, held: int | None = None) -> None:
+        _, scene = arms.config(CROSSING)
+        self.cell: Cell = arms.cell(CROSSING)
+        self.guard = Guard(self.cell, scene, lookahead_s=2.0, delay_s=0.0)
+        self.world = Message(WORLD_MODEL.dtype({"bodies": len(self.cell.bodies)}))
+        start = self.cell.start()
+        for row, body in enumerate(self.cell.bodies):
+            self.world.position[row] = start.xpos[body]
+            self.world.quaternion[row] = start.xquat[body]
+        self.path = BlendedPath(waypoints, np.zeros(len(waypoints)))
+        self.trajectory = make_trajectory(self.path, self.cell.limits)
+        self.segment = MotionSegment(1, SegmentKind.PATH, held, touch, waypoints, np.zeros(2), 0.0, 0.0, 0.0)
+
+    def watch(self) -> None:
+        self.guard.watch(self.segment, self.path, 0.04, self.world)
+
+    def clear(self, time_s: float = 0.0, cycles: int = 60) -> bool:
+        """Return whether the way stays clear over `cycles` in which nothing moves."""
+        answers = [self.guard.is_clear(self.path, self.trajectory, time_s, self.world) for _ in range(cycles)]
+        return all(answers)
+
+    def tool_at(self, q: np.ndarray) -> np.ndarray:
+        data = mujoco.MjData(self.cell.model)
+        data.qpos[self.cell.qpos] = q
+        mujoco.mj_kinematics(self.cell.model, data)
+        return data.site_xpos[self.cell.tool].copy()
+
+
+def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
+    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
+    watched.watch()
+    assert watched.clear()
+    for part in (0.3, 0.6, 0.95):
+        watched.world.position[-1, :2] = watched.tool_at(NEAR + part * SWEEP)[:2]
+        assert not watched.clear()
+
+
+def test_obstacle_on_the_part_already_passed_does_not_matter() -> None:
+    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
+    watched.watch()
+    watched.world.position[-1, :2] = watched.tool_at(NEAR + 0.2 * SWEEP)[:2]
+    assert not watched.clear()
+    assert watched.clear(time_s=0.75 * watched.trajectory.duration)
+
+
+def test_obstacle_on_its_way_into_the_path_is_seen_before_it_is_there() -> None:
+    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
+    watched.watch()
+    arrival_s = 0.6 * watched.trajectory.duration
+    meets = watched.tool_at(watched.path.evaluate(watched.trajectory.at(arrival_s).s).q)
+    velocity = np.array([-0.25, 0.0, 0.0])
+    watched.world.position[-1] = meets - velocity * arrival_s
+    assert watched.clear()
+    watched.world.velocity[-1] = velocity
+    assert not watched.clear()
+
+
+def test_what_is_held_moves_with_the_tool() -> None:
+    lower = np.array([-0.9, 0.95, -2.95, 0.0, -1.1416, 0.0])
+    watched = Watched(np.array([lower, lower + SWEEP]), held=0)
+    watched.watch()
+    hand = watched.tool_at(lower)
+    free_of_wall = watched.clear()
+    watched.world.position[0] = hand - np.array([0.0, 0.0, 0.12])
+    watched.guard.carry(0, lower, watched.world)
+    watched.watch()
+    assert free_of_wall
+    assert not watched.clear()
+
+
+def test_work_of_the_guard_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched(np.array([NEAR, NEAR + SWEEP, NEAR, NEAR + SWEEP, NEAR]))
+    watched.watch()
+    checks = []
+    free = watched.guard._checker.free
+    monkeypatch.setattr(watched.guard._checker, "free", lambda *args: checks.append(1) or free(*args))
+    counts = [0]
+    for _ in range(40):
+        watched.guard.is_clear(watched.path, watched.trajectory, 0.0, watched.world)
+        counts.append(len(checks))
+    assert max(b - a for a, b in pairwise(counts)) <= 13

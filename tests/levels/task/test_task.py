@@ -1,0 +1,180 @@
+"""The task level: programs decomposed or refused before anything moves, and times that are kept."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import REASON_BYTES, State
+from rack.levels.errors import Refused
+from rack.levels.messages import (
+    Error,
+    Verb,
+)
+from rack.levels.planning.motion_planner import MotionPlanner
+from rack.levels.planning.moves import Situation
+from rack.levels.planning.pose import Pose
+from rack.levels.task import read_program
+from rack.levels.task.actions import rehearse
+from rack.levels.task.program import TaskParams
+from rack.levels.task.rehearsal import PipelinePeriods, Rehearsal, Rehearsed, finish_times
+from tests.levels.arms import cell, config
+from tests.levels.whole_rack import WholeRack
+
+ROBOT, SCENE = config("puma560")
+BLOCK1, BLOCK2 = 0, 1
+PERIODS = PipelinePeriods(own_s=1.0, below_s=0.25, planning_s=1.0)
+TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
+REACH = {"do": "goto", "position": [0.45, 0.10, 0.95]}
+HOME = {"do": "home"}
+
+
+@pytest.fixture(scope="module")
+def start() -> Rehearsal:
+    puma = cell("puma560")
+    data = puma.start()
+    situation = Situation(data.xpos[puma.bodies].copy(), data.xquat[puma.bodies].copy())
+    return Rehearsal(MotionPlanner(puma, SCENE, 1990), puma.home, situation)
+
+
+def rehearsed(start: Rehearsal, *actions: Mapping[str, Any]) -> Rehearsal:
+    return rehearse(read_program({"action": list(actions)}, ROBOT, SCENE), SCENE, start)
+
+
+def refusal(start: Rehearsal, action: Mapping[str, Any]) -> Refused:
+    with pytest.raises(Refused) as caught:
+        rehearsed(start, action)
+    assert str(caught.value).startswith("action 0, ")
+    assert len(str(caught.value)) <= REASON_BYTES
+    return caught.value
+
+
+def test_transfer_is_eight_moves_and_leaves_the_object_at_its_goal(start: Rehearsal) -> None:
+    end = rehearsed(start, TRANSFER)
+    verbs = [r.move.verb for r in end.moves]
+    assert verbs == [
+        Verb.MOVE,
+        Verb.APPROACH,
+        Verb.GRASP,
+        Verb.DEPART,
+        Verb.MOVE,
+        Verb.APPROACH,
+        Verb.RELEASE,
+        Verb.DEPART,
+    ]
+    assert [r.move.id for r in end.moves] == list(range(1, 9))
+    assert end.situation.held is None
+    put = end.situation.object_pose(BLOCK1).position
+    assert put[:2] == pytest.approx(TRANSFER["to"][:2])
+    # The block's half height over the table: at most 1 mm of air below it when the gripper opens.
+    assert 0.475 <= put[2] <= 0.476
+
+
+def test_later_actions_know_what_earlier_ones_have_moved(start: Rehearsal) -> None:
+    onto_its_place = {"do": "transfer", "object": "block2", "to": [0.50, 0.30, 0.475]}
+    assert refusal(start, onto_its_place).code == Error.NO_PATH
+    end = rehearsed(start, TRANSFER, onto_its_place)
+    assert end.situation.object_pose(BLOCK2).position[:2] == pytest.approx([0.50, 0.30])
+
+
+def test_object_is_turned_as_wanted(start: Rehearsal) -> None:
+    end = rehearsed(start, {**TRANSFER, "yaw": 0.6})
+    w, _, _, z = end.situation.object_pose(BLOCK1).quaternion
+    assert 2.0 * np.arctan2(z, w) == pytest.approx(0.6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("action", "code", "words"),
+    [
+        ({**TRANSFER, "to": [1.2, 0.0, 0.475]}, Error.UNREACHABLE, "would be over 'floor'; supports: 'table'"),
+        ({**TRANSFER, "to": [0.5, -0.2, 0.9]}, Error.UNREACHABLE, "425 mm above 'table'"),
+        ({**TRANSFER, "to": [0.5, -0.2, 0.44]}, Error.UNREACHABLE, "35 mm deep in 'table'; valid z: 0.475"),
+        ({**TRANSFER, "to": [0.9, 0.5, 0.475]}, Error.UNREACHABLE, "out of reach: ["),
+        ({**TRANSFER, "to": [0.65, 0.3, 0.475]}, Error.NO_PATH, "'block1' and 'block2'"),
+        ({"do": "goto", "position": [0.5, 0.0, 0.6]}, Error.NO_PATH, "'wall'"),
+        ({"do": "goto", "position": [1.5, 0.0, 0.6]}, Error.UNREACHABLE, "out of reach: ["),
+        (
+            {"do": "goto", "joints": [9, 0, 0, 0, 0, 0]},
+            Error.UNREACHABLE,
+            "joint 'j1' to 9 rad; valid: -2.788 to 2.788",
+        ),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_what_can(
+    start: Rehearsal, action: Mapping[str, Any], code: Error, words: str
+) -> None:
+    refused = refusal(start, action)
+    assert refused.code == code
+    assert words in str(refused)
+
+
+def test_refused_transfer_says_whether_to_pick_or_to_place_is_blocked(start: Rehearsal) -> None:
+    on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
+    buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))
+    assert "action 0, pick block1: '" in str(refusal(buried, TRANSFER))
+    taken = replace(start, situation=start.situation.with_body(BLOCK2, Pose(np.array(TRANSFER["to"]), on_block1[1])))
+    assert "action 0, place block1 at [0.5, -0.2, 0.475]: '" in str(refusal(taken, TRANSFER))
+
+
+def test_place_named_as_reachable_is_reachable(start: Rehearsal) -> None:
+    text = str(refusal(start, {"do": "goto", "position": [1.5, 0.0, 0.6]}))
+    place = [float(x) for x in text.partition("in reach: [")[2].partition("]")[0].split(",")]
+    assert rehearsed(start, {"do": "goto", "position": place}).moves
+
+
+def test_rehearsal_can_be_gone_back_to(start: Rehearsal) -> None:
+    rehearsed(start, TRANSFER)
+    assert start.moves == ()
+    assert start.situation.object_pose(BLOCK1).position == pytest.approx([0.5, 0.3, 0.475])
+
+
+def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> None:
+    moves = rehearsed(start, TRANSFER, HOME).moves
+    times = finish_times(moves, 4.0, PERIODS, TaskParams())
+    assert times[0] > 4.0 + moves[0].duration_s
+    for (before, after), (_, duration_s) in zip(itertools.pairwise(times), moves[1:], strict=True):
+        assert after >= before + duration_s
+
+
+def test_move_with_a_time_ends_no_sooner_and_holds_up_what_follows(start: Rehearsal) -> None:
+    first, second = rehearsed(start, REACH, HOME).moves
+    late = Rehearsed(first.move._replace(by_s=50.0), first.duration_s)
+    times = finish_times([late, second], 4.0, PERIODS, TaskParams())
+    assert times[0] == pytest.approx(51.0)
+    assert times[1] > 50.0 + second.duration_s
+
+
+@pytest.fixture(scope="module")
+def refused_run() -> WholeRack:
+    rack = WholeRack(actions=[REACH, {**HOME, "by": 2.0}])
+    rack.run_to_end(10.0)
+    return rack
+
+
+def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(refused_run: WholeRack) -> None:
+    status = refused_run.task
+    earliest = refused_run.read("task.plan").earliest
+    assert (status.state, status.error) == (State.ERROR, Error.TOO_LATE)
+    assert f"action 1, home, by 2 s: the earliest is {earliest:.2f} s" in status.reason
+    assert refused_run.primitive.done == 0
+    assert not refused_run.primitive.current
+    assert refused_run.read("servo.status").position == pytest.approx(ROBOT.home, abs=1e-3)
+
+
+def test_earliest_time_that_was_reported_can_be_met(refused_run: WholeRack) -> None:
+    earliest = refused_run.read("task.plan").earliest
+    rack = WholeRack(actions=[REACH, {**HOME, "by": earliest + 1e-6}])
+    assert rack.run_to_end(earliest + 2.0).state == State.DONE
+    assert rack.seconds <= earliest + 1.0
+
+
+def test_arm_takes_the_time_that_it_is_given() -> None:
+    rack = WholeRack(actions=[{**REACH, "by": 10.0}])
+    assert rack.run_to_end(15.0).state == State.DONE
+    # Done at the task level by then, and not a cycle of its own before.
+    assert 9.0 < rack.seconds <= 10.0 + 1.0

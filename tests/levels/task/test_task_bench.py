@@ -1,0 +1,240 @@
+"""The task level alone: the test plays its planner and the level below, or the arm and the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message, State
+from rack.levels.level import Executor, Input, Ports
+from rack.levels.messages import (
+    MOVE_STATUS,
+    SERVO_STATUS,
+    TASK_COMMAND,
+    TASK_PLAN,
+    WINDOW,
+    WORLD_MODEL,
+    Error,
+)
+from rack.levels.task import TaskExecutor, TaskPlanner
+from tests.levels.arms import cell, config
+from tests.levels.box import lose_some
+from tests.levels.lockstep import BoardSpec, Lockstep
+
+ROBOT, SCENE = config("puma560")
+HOME = {"do": "home"}
+
+
+class Bench(Lockstep):
+    """The task executor alone; the test plays its planner and the level below."""
+
+    def __init__(self, *actions: Mapping[str, Any], **params: Any) -> None:
+        board = BoardSpec("task", 400, TaskExecutor, below="elemental_move", params=params)
+        outside = {"task.plan": TASK_PLAN, "elemental_move.status": MOVE_STATUS}
+        super().__init__([board], ROBOT, SCENE, {"action": list(actions)}, outside=outside)
+
+    def plan(self, actions: list[int], error: Error = Error.NONE) -> None:
+        """Publish a plan with one move for each entry of `actions`."""
+        plan = self.message("task.plan")
+        plan.id, plan.error, plan.reason, plan.count = 1, error, "no" if error else "", len(actions)
+        plan.moves["id"][: len(actions)] = np.arange(len(actions)) + 1
+        plan.moves["action"][: len(actions)] = actions
+        self.write("task.plan", plan)
+        self.cycle()
+
+    def cycle(self, **below: object) -> None:
+        """Show a status of the level below with the given fields, and run two cycles."""
+        status = self.message("elemental_move.status")
+        for name, value in below.items():
+            setattr(status, name, value)
+        self.write("elemental_move.status", status)
+        for _ in range(800):
+            self.step()
+
+    @property
+    def status(self) -> Message:
+        """What the level reports."""
+        return self.read("task.status")
+
+    def window(self) -> list[int]:
+        """Return the serials of the moves handed down."""
+        command = self.read("task.command")
+        return [int(serial) for serial in command.moves["id"][: command.count]]
+
+
+def test_window_moves_with_what_is_done_and_ends_with_the_plan() -> None:
+    bench, moves = Bench(HOME, HOME), 2 * WINDOW
+    bench.plan([0] * WINDOW + [1] * WINDOW)
+    assert bench.window() == list(range(1, WINDOW + 1))
+    bench.cycle(done=2)
+    assert bench.window() == list(range(3, WINDOW + 3))
+    assert bench.status.action == 0
+    bench.cycle(done=WINDOW)
+    assert bench.status.action == 1
+    bench.cycle(done=moves)
+    assert bench.window() == list(range(WINDOW + 1, moves + 1))
+    assert bench.status.state == State.DONE
+    assert bench.status.action == bench.status.actions == 2
+
+
+def test_refused_plan_hands_nothing_down() -> None:
+    bench = Bench(HOME)
+    bench.plan([], error=Error.UNREACHABLE)
+    assert bench.window() == []
+    assert (bench.status.state, bench.status.reason) == (State.ERROR, "no")
+
+
+def test_error_below_names_the_action_that_it_ended() -> None:
+    bench = Bench(HOME, HOME)
+    bench.plan([0, 1])
+    bench.cycle(done=1, state=State.ERROR, error=Error.FOLLOWING, reason="joint 2 strays")
+    assert (bench.status.error, bench.status.reason) == (Error.FOLLOWING, "action 1: joint 2 strays")
+
+
+def test_action_that_is_late_is_an_error() -> None:
+    bench = Bench({**HOME, "by": 5.0})
+    bench.plan([0])
+    bench.cycle()
+    bench.cycle()
+    assert bench.seconds == 6.0
+    assert bench.status.state == State.EXECUTING
+    bench.cycle()
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.TOO_LATE)
+    assert bench.status.reason == "action 0, home, was not done by 5 s"
+
+
+def test_task_that_stands_still_ends_with_who_is_in_the_way() -> None:
+    bench, below = Bench(HOME, stalled_s=5.0), {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
+    bench.plan([0])
+    bench.cycle(current=1, progress=0.1)
+    assert bench.status.state == State.EXECUTING
+    bench.cycle(current=1, progress=0.2, **below)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, below["reason"])
+    for _ in range(2):
+        bench.cycle(current=1, progress=0.2, **below)
+    assert bench.status.state == State.HOLDING
+    bench.cycle(current=1, progress=0.2, **below)
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
+    assert bench.status.reason == f"nothing has moved for 5 s: {below['reason']}"
+
+
+def test_task_that_moves_slowly_does_not_stand_still() -> None:
+    bench = Bench(HOME, stalled_s=5.0)
+    bench.plan([0])
+    for k in range(8):
+        bench.cycle(current=1, progress=0.01 * k)
+    assert bench.status.state == State.EXECUTING
+
+
+def test_task_without_a_plan_ends_and_says_so() -> None:
+    bench = Bench(HOME, stalled_s=5.0)
+    for _ in range(4):
+        bench.cycle()
+    assert bench.status.error == Error.STALLED
+    assert "no plan" in bench.status.reason
+
+
+@pytest.mark.parametrize(("current", "why"), [(1, "move 1 is under way"), (0, "no path yet for move 1")])
+def test_task_that_nobody_holds_says_what_it_waits_for(current: int, why: str) -> None:
+    bench = Bench(HOME, stalled_s=5.0)
+    bench.plan([0])
+    for _ in range(8):
+        bench.cycle(current=current)
+    assert bench.status.reason == f"nothing has moved for 5 s: {why}"
+
+
+def test_task_that_an_operator_holds_stands_still_as_long_as_that_lasts() -> None:
+    bench, below = Bench(HOME, stalled_s=5.0), {"state": State.HOLDING, "reason": "primitive held by the operator"}
+    bench.plan([0])
+    for _ in range(10):
+        bench.cycle(current=1, operated=1, **below)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, below["reason"])
+    for _ in range(4):
+        bench.cycle(current=1)
+    assert bench.status.error == Error.STALLED
+
+
+def test_restarted_executor_remembers_what_was_done() -> None:
+    bench = Bench(HOME)
+    bench.plan([0] * (WINDOW + 2))
+    bench.cycle(done=2)
+    bench.restart("task")
+    bench.cycle()
+    assert bench.status.moves_done == 2
+    assert bench.window() == list(range(3, WINDOW + 3))
+
+
+def test_level_without_a_program_is_idle() -> None:
+    bench = Bench()
+    bench.cycle()
+    assert bench.status.state == State.IDLE
+
+
+class Obedient(Executor):
+    """A level below that does every move as soon as it is shown."""
+
+    inputs = {"command": Input(TASK_COMMAND, "above.command")}
+    outputs = {"status": MOVE_STATUS}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        write.status.done = read.command.value.id
+
+
+class PlannedBench(Lockstep):
+    """Executor and planner of the task level; the arm is at home, and resting objects are seen from tick `seen` on."""
+
+    def __init__(self, *actions: Mapping[str, Any], seen: int = 4) -> None:
+        outside = {"servo.status": SERVO_STATUS, "world.model": WORLD_MODEL}
+        boards = [
+            BoardSpec("task", 400, TaskExecutor, TaskPlanner, 2, below="elemental_move"),
+            BoardSpec("elemental_move", 100, Obedient, above="task"),
+        ]
+        super().__init__(boards, ROBOT, SCENE, {"action": list(actions)}, outside=outside)
+        servo = self.message("servo.status")
+        servo.target = np.array(ROBOT.home)
+        self.after(4, lambda: self.write("servo.status", servo))
+        self.after(seen, self._show)
+
+    def _show(self) -> None:
+        puma, world = cell("puma560"), self.message("world.model")
+        start = puma.start()
+        world.position, world.quaternion = start.xpos[puma.bodies], start.xquat[puma.bodies]
+        world.revision = 1
+        self.write("world.model", world)
+
+    def run_to_end(self) -> tuple[Message, int]:
+        """Run until the task is done or 20 s have passed; return its status, and how often a plan was published."""
+        self.run(20.0, until=lambda rack: rack.read("task.status").state == State.DONE)
+        return self.read("task.status"), self.boxes["task.plan"].at(self.tick)[0]
+
+
+@pytest.mark.parametrize(
+    ("finished", "away_ticks", "published"),
+    [(True, 40, 1), (True, 900, 1), (False, 40, 1)],
+    ids=["plan on its way", "plan followed", "plan never made"],
+)
+def test_planner_that_is_lost_plans_again_only_what_was_lost(finished: bool, away_ticks: int, published: int) -> None:
+    bench = PlannedBench(HOME)
+    bench.after(500, lambda: bench.lose("task.planner", away_ticks, finished))
+    status, plans = bench.run_to_end()
+    assert (status.state, plans) == (State.DONE, published)
+    bench.run(5.0)
+    assert bench.boxes["task.plan"].at(bench.tick)[0] == published
+
+
+def test_world_of_which_nothing_was_seen_is_not_planned_with() -> None:
+    bench = PlannedBench(HOME, seen=1004)
+    bench.run(3.0)
+    assert bench.boxes["task.plan"].at(bench.tick)[0] == 0
+    status, plans = bench.run_to_end()
+    assert (status.state, plans, bench.read("task.plan").count) == (State.DONE, 1, 1)
+
+
+def test_plan_that_is_lost_on_its_way_is_published_again() -> None:
+    bench = PlannedBench(HOME)
+    bench.disturb("task.plan", lose_some(1.0, seed=1), 1400)
+    status, plans = bench.run_to_end()
+    assert (status.state, plans) == (State.DONE, 2)

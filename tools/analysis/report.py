@@ -1,0 +1,207 @@
+"""report.json and report.md of one run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.message import State
+from rack.boards.config import RackConfig, wire
+from rack.boards.config.timing import tick_ns
+from rack.levels.messages import SERVO_STATUS, TASK_STATUS
+from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
+from rack.levels.timing.trace_times import (
+    communication_ns,
+    distribution,
+    execution_ns,
+    gaps_ns,
+    lateness_ns,
+    plan_ages,
+    residual_ns,
+)
+from rack.tools.analysis.report_markdown import markdown
+from rack.tools.faults.judge import faults
+from rack.tools.runs.history import counted, first_difference, holds, misses, steal
+from rack.tools.runs.measured_response import system_response
+from rack.tools.runs.recording import Recording
+
+Report = dict[str, Any]
+
+
+def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
+    """Write the report of the run in `folder` into it, and return it as data and as text.
+
+    With the folder of another run, `against`, it says where the two diverge.
+    """
+    recording = Recording(folder)
+    report = report_of(recording)
+    if against is not None:
+        report["against"] = _compared(recording, Recording(against), report["misses"])
+    text = markdown(report)
+    (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    (folder / "report.md").write_text(text)
+    return report, text
+
+
+def report_of(recording: Recording) -> Report:
+    """Return the report of a recorded run as plain data."""
+    config, layout = recording.rack_config, recording.layout
+    ended, found = recording.ended, misses(recording)
+    report = _head(config, ended, _last_tick(recording) + 1)
+    if not ended:
+        # Without the end of the run in the recording, the trace has to do.
+        report["missed"], report["skipped"] = counted(found)
+    return {
+        **report,
+        "folder": str(recording.folder),
+        "misses": found,
+        "steal": steal(recording),
+        "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
+        "holds": holds(recording),
+        **faults(recording, layout),
+        "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
+        "system_response": system_response(recording),
+        "task": _task_outcome(recording),
+        "motion": _motion(recording),
+        "recording": ended.get("recording", "without the end of the run"),
+        "rows_lost": {name: count for name, count in recording.lost.items() if count},
+    }
+
+
+def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
+    """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
+    unknown = (
+        *("misses", "steal", "notes", "holds", "faults", "unexplained", "restarts"),
+        *("system_response", "task", "motion", "rows_lost"),
+    )
+    layout = wire(config)
+    tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
+    head = _head(config, ended, 0)
+    return {**head, **dict.fromkeys(unknown), "folder": None, "tasks": tasks, "recording": ended["recording"]}
+
+
+def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
+    """Return the part that needs no recording; `ticks` is the length of a run whose end is not known."""
+    outcome, counters = ended.get("outcome", {}), ended.get("tasks", {}).values()
+    return {
+        "rack": config.name,
+        "folder": None,
+        "mode": config.clock.mode,
+        "speed": config.clock.speed,
+        "clock_ms": config.clock.period_ms,
+        "worked": ended.get("worked", False),
+        "outcome": outcome or None,
+        "digest": outcome.get("digest"),
+        "simulated_s": round(outcome.get("ticks", ticks) * config.clock_ns * 1e-9, 6),
+        "wall_s": round(ended.get("wall_s", 0.0), 6),
+        "clock_skipped": ended.get("clock_skipped", 0),
+        "missed": sum(task["missed"] for task in counters),
+        "skipped": sum(task["skipped"] for task in counters),
+    }
+
+
+def _last_tick(recording: Recording) -> int:
+    return max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
+
+
+def _compared(recording: Recording, other: Recording, found: list[Report]) -> Report:
+    difference = first_difference(recording, other)
+    missed = min((miss["tick"] for miss in [*found, *misses(other)]), default=None)
+    return {
+        "folder": str(other.folder),
+        "first_difference": asdict(difference) if difference is not None else None,
+        "first_miss_tick": missed,
+        "explained": difference is None or (missed is not None and missed <= difference.tick),
+    }
+
+
+def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
+    is_lockstep = config.clock.mode == "lockstep"
+    layout, cycles = recording.layout, recording.trace(task.name)
+    entry: Report = {
+        **_about(task, layout),
+        **recording.ended.get("tasks", {}).get(task.name, {}),
+        **task_times(task, cycles, layout.clock_ns if is_lockstep else tick_ns(config), is_lockstep),
+    }
+    plan = f"{task.board}.plan"
+    if task.role == "executor" and plan in recording.mailboxes:
+        made, visible_at = recording.signal(plan, "tick"), recording.signal(plan, "visible_at")
+        entry["plan_age_ms"] = distribution(plan_ages(cycles["tick"], made, visible_at) * (layout.clock_ns * 1e-6))
+    return entry
+
+
+def _about(task: TaskSpec, layout: Layout) -> Report:
+    return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
+
+
+def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: bool = False) -> Report:
+    """Return the times of a task's traced cycles, ms of the wall clock (eq. 3.5: R = t_exec + t_comm + t_residual).
+
+    `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and preemption.
+    `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its R is their time slice. In
+    lockstep a tick lasts as long as its tasks take: everything relative to a release or a time slice is None.
+    """
+    slice_ns = task.every * task.within_cycles * period_ns
+    gaps = gaps_ns(cycles)
+    by_the_clock = {
+        "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),
+        "residual_ms": distribution(residual_ns(cycles, slice_ns) * 1e-6),
+        "largest_gap_ms": round(float(gaps.max()) * 1e-6, 6) if len(gaps) else None,
+        **_worst(slice_ns, execution_ns(cycles).tolist(), communication_ns(cycles).tolist()),
+    }
+    return {
+        "traced": len(cycles),
+        "slice_ms": slice_ns * 1e-6,
+        "execution_ms": distribution(execution_ns(cycles) * 1e-6),
+        "communication_ms": distribution(communication_ns(cycles) * 1e-6),
+        "processor_ms": distribution(cycles["processor_ns"] * 1e-6),
+        **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
+    }
+
+
+def _worst(slice_ns: int, executions_ns: list[int], communications_ns: list[int]) -> dict[str, float | None]:
+    """Return alpha of eq. 3.6, the residual of the worst cycle, and the deviation of the residual; both in ms."""
+    if not executions_ns:
+        return {"alpha_ms": None, "deviation_ms": None}
+    alpha_ns = residual_bound_ns(slice_ns, executions_ns, communications_ns)
+    deviation_ns = residual_deviation_ns(executions_ns, communications_ns)
+    return {"alpha_ms": round(alpha_ns * 1e-6, 6), "deviation_ms": round(deviation_ns * 1e-6, 6)}
+
+
+def _task_outcome(recording: Recording) -> Report | None:
+    """Return the last status of the level that reports on the whole task."""
+    mailbox = _mailbox_of(recording, TASK_STATUS.name)
+    if mailbox is None:
+        return None
+
+    def last(field: str) -> Any:
+        return recording.signal(mailbox, field)[-1]
+
+    counts = {name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")}
+    return {"state": State(int(last("state"))).name.lower(), "reason": str(last("reason")), **counts}
+
+
+def _motion(recording: Recording) -> Report | None:
+    """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set points, or None."""
+    mailbox = _mailbox_of(recording, SERVO_STATUS.name)
+    if mailbox is None:
+        return None
+    error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
+    return {
+        "tracking_rms_mrad": round(float(np.sqrt(np.mean(error**2))), 6),
+        "tracking_peak_mrad": round(float(np.abs(error).max()), 6),
+        **{name: int(recording.signal(mailbox, name)[-1]) for name in ("touches", "violations", "pushed")},
+        "clipped_cycles": int(recording.signal(mailbox, "clipped")[-1]),
+    }
+
+
+def _mailbox_of(recording: Recording, message: str) -> str | None:
+    """Return the first mailbox with messages of a type; None when it is empty, or there is none."""
+    name = next((m.name for m in recording.layout.mailboxes if m.message == message), None)
+    return name if name in recording.mailboxes else None

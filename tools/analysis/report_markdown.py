@@ -1,0 +1,255 @@
+"""A report as text for people: report.md with every column, and a terminal's view with as many as fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+
+from rack.tools.holds import resume_command
+from rack.tools.runs import markdown as md
+from rack.tools.runs.history import counted
+from rack.tools.text_table import table
+
+Report = dict[str, Any]
+
+SHOWN = 10
+"""Most misses, holds and long responses in the text; report.json has them all."""
+
+FAULTS = ("fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after")
+COUNTS = ("task", "R", "cycles", "missed", "skipped")
+BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation", "alpha")
+"""Times relative to a release or a time slice: they mean nothing in lockstep."""
+USED = ("exec p50", "exec p99", "exec max", "comm p99", "proc p99", "plan age max")
+JUDGED = {True: "ok", False: "FAILS", None: "-"}
+DROPPED = (
+    *("deviation", "comm p99", "proc p99", "late p50", "exec p50", "alpha", "late p99", "exec p99"),
+    *("plan age max", "R", "cycles"),
+)
+"""Columns that a narrow terminal leaves out, the first of them first."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table; `dropped` are columns that a narrow terminal leaves out, the first of them first."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    dropped: Sequence[str] = ()
+
+
+def markdown(report: Report) -> str:
+    """Return report.md of a report."""
+    blocks = (md.table(block.head, block.rows) if isinstance(block, Grid) else (block,) for block in _blocks(report))
+    return "\n".join(line for lines in blocks for line in lines) + "\n"
+
+
+def show(report: Report, terminal: Console) -> None:
+    """Print as much of a report as the terminal's width permits."""
+    for block in _blocks(report):
+        if isinstance(block, Grid):
+            for line in table(block.head, block.rows, terminal.width, block.dropped):
+                terminal.print(line, highlight=False, markup=False)
+        else:
+            style = "bold" if block.startswith("#") else ""
+            terminal.print(block.lstrip("# "), style=style, highlight=False, markup=False)
+    terminal.print(f"\nall columns: {report['folder']}/report.md; all data: report.json", highlight=False, markup=False)
+
+
+def _blocks(report: Report) -> Iterator[str | Grid]:
+    outcome = report["outcome"] or {"cause": "no outcome recorded", "reason": "", "faults": []}
+    why = outcome["reason"] or "; ".join(outcome["faults"])
+    yield f"# {report['rack']}: {outcome['cause']}{': ' + why if why else ''}"
+    yield ""
+    yield (
+        f"{report['simulated_s']:.2f} s simulated in {report['wall_s']:.2f} s, {report['mode']}, "
+        f"{report['missed']} missed, {report['skipped']} skipped cycles."
+        f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
+    )
+    yield from (f"- fault: {fault}" for fault in outcome["faults"])
+    yield from (f"- {note}" for note in report["notes"])
+    yield from _steal(report["steal"])
+    if report["recording"] != "complete":
+        yield f"- recording: {report['recording']}"
+    if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
+        yield f"- the recorder lost rows: {lost}"
+    yield from _against(report.get("against"))
+    yield from _task(report["task"])
+    yield from _motion(report["motion"])
+    yield from _holds(report)
+    yield from _times(report)
+    yield from _faults(report)
+    yield from _misses(report)
+    yield from _response(report["system_response"])
+
+
+def _times(report: Report) -> Iterator[str | Grid]:
+    is_lockstep = report["mode"] == "lockstep"
+    yield from ("", "## Cycles, ms", "")
+    if is_lockstep:
+        yield "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no lateness, no residuals."
+        yield ""
+    head = (*COUNTS, *(() if is_lockstep else BY_THE_CLOCK), *USED)
+    cells = [_times_row(name, task) for name, task in report["tasks"].items()]
+    yield Grid(head, [[row[name] for name in head] for row in cells], DROPPED)
+
+
+def _holds(report: Report) -> Iterator[str | Grid]:
+    holds = report["holds"]
+    if not holds:
+        return
+    yield from ("", f"## Holds: {len(holds)}{_first(holds, 'longest')}", "")
+    longest = sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
+    rows = [
+        [
+            hold["level"],
+            f"{'operator: ' if hold['by'] == 'operator' else ''}{hold['why']}",
+            f"{hold['since_s']:.2f}",
+            "the end" if hold["until_s"] is None else f"{hold['until_s']:.2f}",
+            f"{hold['lasted_s']:.2f}",
+        ]
+        for hold in longest
+    ]
+    yield Grid(("level", "by", "since, s", "until, s", "lasted, s"), rows)
+    for level in (hold["level"] for hold in holds if hold["until_s"] is None and hold["by"] == "operator"):
+        yield from ("", f"Still held at the end: {level}; `{resume_command(report['rack'], level)}` releases it.")
+
+
+def _first(rows: Sequence[Any], which: str) -> str:
+    return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
+
+
+def _steal(steal: Report) -> Iterator[str]:
+    """Yield how many misses the hypervisor may have caused."""
+    if steal["ms"]:
+        cores = ", ".join(f"core {core} {ms} ms" for core, ms in steal["ms"].items())
+        yield (
+            f"- {steal['missed_during']} of {steal['missed']} misses while the hypervisor had the core; stolen: {cores}"
+        )
+
+
+def _against(against: Report | None) -> Iterator[str]:
+    if against is None:
+        return
+    difference = against["first_difference"]
+    if difference is None:
+        yield f"- every message equals that of {against['folder']}"
+        return
+    missed = against["first_miss_tick"]
+    why = f"the first miss is at tick {missed}" if missed is not None else "neither run has a miss"
+    yield f"- diverges from {against['folder']} at tick {difference['tick']}, first in {difference['mailbox']}; {why}"
+
+
+def _faults(report: Report) -> Iterator[str | Grid]:
+    faults, unexplained, restarts = report["faults"], report["unexplained"], report["restarts"]
+    if faults:
+        yield from ("", f"## Faults: {len(faults)}", "")
+        yield Grid(FAULTS, [_fault_row(fault) for fault in faults])
+    if restarts:
+        yield from ("", f"Restarts: {', '.join(f'{task} {count}' for task, count in restarts.items())}.")
+    if unexplained:
+        yield from ("", f"## Unexplained detections: {len(unexplained)}", "")
+        rows = [[str(found["tick"]), found["board"], found["code"], found["text"]] for found in unexplained]
+        yield Grid(("tick", "found by", "as", "what"), rows)
+
+
+def _fault_row(fault: Report) -> list[str]:
+    subject = fault["mailbox"] or fault["joint"]
+    is_struck = fault["seen"] != "not struck"
+    found = f"{fault['found_as']} by {fault['found_by']}" if fault["seen"] == "detected" else fault["seen"]
+    in_ms = fault["bound_ms"] is not None
+    unit, after, bound = ("ms", "delay_ms", "bound_ms") if in_ms else ("cycles", "delay_cycles", "bound_cycles")
+    return [
+        fault["kind"],
+        f"{fault['board']} {subject}".strip(),
+        str(fault["struck"]) if is_struck else "-",
+        found,
+        *("-" if fault[key] is None else f"{fault[key]:.3g} {unit}" for key in (after, bound)),
+        ", ".join(fault["reactions"]) or "-",
+        "-" if fault["recovery_ms"] is None else f"{fault['recovery_ms']:.1f} ms",
+    ]
+
+
+def _misses(report: Report) -> Iterator[str | Grid]:
+    misses = report["misses"]
+    if not misses:
+        return
+    late, skipped = counted(misses)
+    yield from ("", f"## Missed and skipped cycles: {late} and {skipped}{_first(misses, 'first')}", "")
+    if (late, skipped) != (report["missed"], report["skipped"]):
+        of_all = f"{report['missed']} and {report['skipped']}"
+        why = "the recorder lost rows" if report["rows_lost"] else "the recording does not hold all of it"
+        yield from (f"The tasks counted {of_all}; {why}.", "")
+    rows = [
+        [
+            str(miss["tick"]),
+            miss["task"],
+            miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
+            *(_given(miss, key) for key in ("started_ms", "took_ms")),
+        ]
+        for miss in misses[:SHOWN]
+    ]
+    yield Grid(("tick", "task", "what", "started late, ms", "took, ms"), rows)
+
+
+def _given(miss: Report, key: str) -> str:
+    return f"{miss[key]:.3f}" if key in miss else "-"
+
+
+def _task(task: Report | None) -> Iterator[str]:
+    if task is not None:
+        done = f"{task['action']} of {task['actions']} actions, {task['moves_done']} of {task['moves']} elemental moves"
+        yield from ("", f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}.")
+
+
+def _motion(motion: Report | None) -> Iterator[str]:
+    if motion is not None:
+        yield (
+            f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS, {motion['tracking_peak_mrad']:.3f} peak; "
+            f"{motion['touches']} touches, {motion['clipped_cycles']} cycles clipped; "
+            f"limits exceeded in {motion['violations']} substeps, by a push from outside in {motion['pushed']}."
+        )
+
+
+def _times_row(name: str, task: Report) -> dict[str, str]:
+    row = {"task": name, "R": f"{task['slice_ms']:g}"}
+    row |= {key: str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")}
+    for title, key in (("late", "lateness_ms"), ("exec", "execution_ms")):
+        row |= {f"{title} {part}": _ms(task[key], part) for part in ("p50", "p99", "max")}
+    row |= {key: "-" if task[f"{key}_ms"] is None else f"{task[f'{key}_ms']:.3f}" for key in ("deviation", "alpha")}
+    row |= {"comm p99": _ms(task["communication_ms"], "p99"), "proc p99": _ms(task["processor_ms"], "p99")}
+    return row | {"residual min": _ms(task["residual_ms"], "min"), "plan age max": _ms(task.get("plan_age_ms"), "max")}
+
+
+def _ms(distribution: Report | None, key: str) -> str:
+    return "-" if distribution is None else f"{distribution[key]:.3f}"
+
+
+def _response(response: Report | None) -> Iterator[str | Grid]:
+    if response is None:
+        return
+    yield from ("", "## System response, ms of simulated time", "")
+    bounds = f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
+    yield f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its cycle."
+    yield ""
+    ways = {"command, down": response["command"], "status, up": response["status"]}
+    rows = [
+        [
+            way,
+            *(_ms(found["measured_ms"], key) for key in ("p50", "max")),
+            f"{found['bound_ms']:g}",
+            JUDGED[found["holds"]],
+        ]
+        for way, found in ways.items()
+    ]
+    yield Grid(("way", "measured p50", "measured max", "bound", ""), rows)
+    for way, found in ways.items():
+        if found["beyond"]:
+            yield from ("", f"{way}: {len(found['beyond'])} beyond the bound{_first(found['beyond'], 'longest')}:")
+        for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
+            why = "; ".join(each["delayed_by"]) or "nothing in the recording says why"
+            yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
+        if found["unseen"]:
+            yield from ("", f"{way}: {found['unseen']} not measured, messages are missing in the recording.")

@@ -1,0 +1,182 @@
+"""Lanes, the rows of a Gantt chart, and their patterns: the order of unit functions in the cycles of a plan.
+
+A pattern is written as in the paper: "R X W P | R X W P U -".
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
+from typing import NamedTuple
+
+from rack.levels.timing.schedule import Chart, Span
+from rack.levels.timing.tasks import TimedTask, Unit
+
+Stretch = tuple[int, int]
+"""Start and end, ns."""
+IDLE = "-"
+SHORT = 0.02
+"""Part of a cycle below which a measured stretch may be a remnant, of a late wake-up or of a stretch cut in two."""
+REMNANT = 0.25
+"""Part of the median of a unit function: a remnant is shorter than that too, and left out."""
+GAP = 0.1
+"""Part of a cycle below which a measured gap is left out: waking up takes time, and is not idleness."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A row of a Gantt chart: the tasks of one board on one core.
+
+    That is an executor, with its planner where they are tightly coupled, or a planner alone. `cycle_ns` is the level's
+    cycle, `slice_ns` the time for one plan; without a planner, one cycle.
+    """
+
+    core: int
+    board: str
+    executor: str | None
+    planner: str | None
+    priority: int
+    cycle_ns: int
+    slice_ns: int
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Names of its tasks."""
+        return tuple(name for name in (self.executor, self.planner) if name is not None)
+
+    @property
+    def name(self) -> str:
+        """Name of the executor; of the planner where it is alone."""
+        return self.tasks[0]
+
+    @property
+    def title(self) -> str:
+        """Core and name."""
+        return f"core {self.core}  {self.name}"
+
+    @property
+    def is_tight(self) -> bool:
+        """Whether a planner shares the core with its executor."""
+        return self.executor is not None and self.planner is not None
+
+
+def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
+    """Return the lanes of `tasks`, by core, then by falling priority."""
+    places = dict.fromkeys((task.core, task.board) for task in tasks)
+    lanes = [_lane(core, [t for t in tasks if (t.core, t.board) == (core, board)]) for core, board in places]
+    return tuple(sorted(lanes, key=lambda lane: (lane.core, -lane.priority, lane.cycle_ns)))
+
+
+def _lane(core: int, tasks: list[TimedTask]) -> Lane:
+    planner = next((task for task in tasks if task.role == "planner"), None)
+    executor = next((task for task in tasks if task.role != "planner"), None)
+    return Lane(
+        core=core,
+        board=tasks[0].board,
+        executor=executor.name if executor is not None else None,
+        planner=planner.name if planner is not None else None,
+        priority=max(task.priority for task in tasks),
+        cycle_ns=tasks[0].every_ns,
+        slice_ns=(planner or tasks[0]).period_ns,
+    )
+
+
+class Patterns(NamedTuple):
+    """How often each pattern occurred in a lane: over the cycles of a plan, and in single cycles without one."""
+
+    plans: Counter[str]
+    cycles: Counter[str]
+
+    @classmethod
+    def none(cls) -> Patterns:
+        """Return a count of nothing."""
+        return cls(Counter(), Counter())
+
+    def add(self, other: Patterns) -> None:
+        """Add the counts of another stretch of time."""
+        self.plans.update(other.plans)
+        self.cycles.update(other.cycles)
+
+
+@dataclass(frozen=True)
+class Detail:
+    """The longest stretches that patterns leave out, ns: of each unit function, and of an idle core."""
+
+    short_ns: Mapping[Unit, int] = field(default_factory=dict)
+    gap_ns: int = 0
+
+    @classmethod
+    def measured(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> Detail:
+        """Return the detail of the measured patterns of a lane, from the medians of its unit functions."""
+        longest = round(SHORT * lane.cycle_ns)
+        short = {unit: min(longest, round(REMNANT * median)) for unit, median in median_ns.items()}
+        if lane.is_tight:
+            # Its plan is in its own memory: reading it is not communication, unless it takes long.
+            short[Unit.EXCHANGE] = longest
+        return cls(short, round(GAP * lane.cycle_ns))
+
+
+def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patterns:
+    """Return the patterns of a lane that began within a stretch, with " | " between the cycles of a plan.
+
+    `chart` must extend beyond the stretch by a slice.
+    """
+    counted = Patterns.none()
+    spans = _by_cycle([span for span in chart.spans if span.core == lane.core], lane.cycle_ns)
+    for start, cycles, is_plan in _beginnings(chart, lane, within):
+        first = start // lane.cycle_ns
+        of_cycles = [spans[first + cycle] for cycle in range(cycles)]
+        if lane.executor is None:
+            # The only cycles of a planner on its own processor are its plans.
+            of_cycles = [[span for spans_of_cycle in of_cycles for span in spans_of_cycle]]
+        length = cycles * lane.cycle_ns // len(of_cycles)
+        borders = (start + at * length for at in range(len(of_cycles)))
+        orders = (
+            _order(found, lane, (begin, begin + length), detail)
+            for begin, found in zip(borders, of_cycles, strict=True)
+        )
+        (counted.plans if is_plan else counted.cycles)[" | ".join(orders)] += 1
+    return counted
+
+
+def _by_cycle(spans: Sequence[Span], cycle_ns: int) -> dict[int, list[Span]]:
+    """Return the spans of each cycle, with those that extend into it."""
+    found: dict[int, list[Span]] = defaultdict(list)
+    for span in spans:
+        for cycle in range(span.start_ns // cycle_ns, (span.end_ns - 1) // cycle_ns + 1):
+            found[cycle].append(span)
+    return found
+
+
+def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
+    """Yield start, number of cycles and True for every plan; start, 1 and False for every cycle without one."""
+    slices = lane.slice_ns // lane.cycle_ns
+    plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
+    planned = {plan + at * lane.cycle_ns for plan in plans for at in range(slices)}
+    for at in range(-(-within[0] // lane.cycle_ns) * lane.cycle_ns, within[1], lane.cycle_ns):
+        if at in plans:
+            yield at, slices, True
+        elif at not in planned and lane.executor is not None:
+            yield at, 1, False
+
+
+def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -> str:
+    """Return the order of the unit functions within a stretch, as in "R X W P -"."""
+    stretches: list[tuple[Unit | None, int]] = []
+    busy_until = within[0]
+    for span in sorted(spans, key=lambda span: span.start_ns):
+        start, end = max(span.start_ns, within[0]), min(span.end_ns, within[1])
+        if start - busy_until > detail.gap_ns:
+            stretches.append((None, start - busy_until))
+        if span.task in lane.tasks:
+            stretches.append((span.unit, end - start))
+        busy_until = max(busy_until, end)
+    if within[1] - busy_until > detail.gap_ns:
+        stretches.append((None, within[1] - busy_until))
+    # Pieces of a unit function that other boards have preempted count as one.
+    wholes = [(unit, sum(ns for _, ns in pieces)) for unit, pieces in groupby(stretches, key=itemgetter(0))]
+    shown = [unit.value if unit else IDLE for unit, ns in wholes if unit is None or ns > detail.short_ns.get(unit, 0)]
+    return " ".join(letter for letter, _ in groupby(shown)) or IDLE

@@ -1,0 +1,149 @@
+"""The timing of a rack in the view: lanes and curves of every task, from its trace, and the ages of messages."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.levels.timing.trace_times import execution_ns, is_missed, lateness_ns, newest_visible, response_ns
+from rack.tools.viewer.activity import LEVELS, LOG
+from rack.tools.viewer.blocks import Block
+from rack.tools.viewer.lanes import style_lane, write_spans
+from rack.tools.viewer.palette import LIMIT, PHASES, of_joint
+from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.timelines import Ints
+
+BOARDS, LOAD, TIMES, AGES = "boards", "load", "times", "ages"
+MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
+MISSED = "missed"
+SPAN_S = 0.25
+"""Time marked around a missed cycle: the cycle itself would be too narrow to be visible."""
+
+
+def lane_of(task: TaskSpec) -> tuple[str, ...]:
+    """Return the lane of a task; lanes are in the order of slots."""
+    return (BOARDS, f"{task.slot}-{task.board}", task.role)
+
+
+class CycleLanes:
+    """Writes trace records as spans: read, process or plan, write, wait. Missed cycles are red.
+
+    In real time a span is where it was on the wall clock, scaled to simulated time. In lockstep, where simulated time
+    stands still meanwhile, it begins at its tick and is cut at the end of its time slice.
+    """
+
+    def __init__(self, stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> None:
+        self._stream, self._speed = stream, speed
+        self._lane = lane_of(task)
+        self._last_ns = task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS) if lockstep else None
+        self._work = "process" if task.role == "executor" else "plan"
+        style_lane(stream, self._lane, PHASES, quiet=["wait"])
+
+    def write(self, block: Block) -> None:
+        """Write four spans a cycle."""
+        rows = block.rows
+        moments = np.stack([rows[name] for name in MOMENTS], axis=1)
+        within = ((moments - rows["release_ns"][:, None]) * self._speed).astype(np.int64)
+        if self._last_ns is not None:
+            # Cut spans keep their order: no two of a lane begin at the same time.
+            within = np.minimum(within, self._last_ns + np.arange(len(MOMENTS)))
+        ticks = np.repeat(block.ticks, len(MOMENTS))
+        states = np.array([["read", self._work, "write", "wait"]] * len(rows))
+        states[is_missed(rows), :3] = MISSED
+        times = self._stream.times.columns(ticks, moments.ravel(), within.ravel())
+        write_spans(self._stream, self._lane, times, states.ravel().tolist())
+
+
+class Load:
+    """Writes trace records as curves: lateness, execution and deadline in ms, and the used part of the time slice.
+
+    In lockstep a tick lasts as long as its tasks take: there is only execution, without anything to compare it with.
+    """
+
+    def __init__(self, stream: Stream, task: TaskSpec, period_ns: int, is_lockstep: bool) -> None:
+        self._stream, self._task, self._is_lockstep = stream, task.name, is_lockstep
+        self._slice_ns = task.every * task.within_cycles * period_ns
+        curves = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
+        stream.static((TIMES, task.name), rr.SeriesLines(names=curves, colors=[of_joint(1), of_joint(0), LIMIT]))
+        stream.static((LOAD, task.name), rr.SeriesLines(names=[f"{task.name}, %"]))
+
+    def write(self, block: Block) -> None:
+        """Write every cycle; 100 % is the deadline."""
+        rows = block.rows
+        curves = np.column_stack((lateness_ns(rows), execution_ns(rows), np.full(len(rows), self._slice_ns))) * 1e-6
+        if self._is_lockstep:
+            curves[:, [0, 2]] = np.nan
+        self._stream.scalars((TIMES, self._task), block.times, curves)
+        if not self._is_lockstep:
+            used = response_ns(rows) * (100.0 / self._slice_ns)
+            self._stream.scalars((LOAD, self._task), block.times, used)
+
+
+class Misses:
+    """Writes missed cycles: as a lane that shows them at any zoom, and as one log line a block.
+
+    A task that never misses has no lane.
+    """
+
+    def __init__(self, stream: Stream, task: TaskSpec) -> None:
+        self._stream, self._task = stream, task.name
+        self._lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
+        self._span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
+        self._is_styled = False
+
+    def write(self, block: Block) -> None:
+        """Write the cycles that were missed."""
+        missed = np.flatnonzero(is_missed(block.rows))
+        if not len(missed):
+            return
+        if not self._is_styled:
+            style_lane(self._stream, self._lane, {MISSED: PHASES[MISSED]})
+            self._is_styled = True
+        self._mark(np.unique(block.ticks[missed] // self._span))
+        self._log(block.ticks[missed], int(block.stamps_ns[missed[0]]))
+
+    def _mark(self, spans: np.ndarray) -> None:
+        ends = np.setdiff1d(spans + 1, spans)
+        moments = np.concatenate((spans, ends))
+        order = np.argsort(moments)
+        ticks = moments[order] * self._span
+        states = np.array([MISSED] * len(spans) + [""] * len(ends))[order]
+        times = self._stream.times
+        write_spans(self._stream, self._lane, times.columns(ticks, times.stamps_of(ticks)), states.tolist())
+
+    def _log(self, ticks: np.ndarray, stamp_ns: int) -> None:
+        which = f"tick {ticks[0]}" if len(ticks) == 1 else f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
+        line = rr.TextLog(f"missed: {self._task}: {which}", level="WARN")
+        self._stream.at(int(ticks[0]), stamp_ns, (LOG, "misses"), line)
+
+
+class Age:
+    """Writes, at every release of a mailbox's fastest reader, the age in ms of the message that is visible then."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec, layout: Layout) -> None:
+        self._stream, self._lane = stream, (AGES, mailbox.name)
+        self._every = min([layout.task(reader).every for reader in mailbox.readers], default=mailbox.every)
+        self._visible_at: Ints = np.empty(0, dtype=np.int64)
+        self._made: Ints = np.empty(0, dtype=np.int64)
+        self._upto = -1
+        stream.static(self._lane, rr.SeriesLines(names=[f"{mailbox.name}, ms"]))
+
+    def write(self, block: Block) -> None:
+        """Take messages; they count from the tick at which they become visible."""
+        self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
+        self._made = np.concatenate((self._made, block.ticks))
+
+    def advance(self, tick: int) -> None:
+        """Write the ages at all releases before `tick`; every message visible before it has been taken."""
+        every = self._every
+        releases = np.arange((self._upto // every + 1) * every, tick, every)
+        self._upto = max(self._upto, tick - 1)
+        newest = newest_visible(releases, self._visible_at)
+        releases, newest = releases[newest >= 0], newest[newest >= 0]
+        if not len(releases):
+            return
+        times = self._stream.times
+        ages = (releases - self._made[newest]) * times.clock_ns * 1e-6
+        self._stream.scalars(self._lane, times.columns(releases, times.stamps_of(releases)), ages)
+        self._visible_at, self._made = self._visible_at[newest[-1] :], self._made[newest[-1] :]
