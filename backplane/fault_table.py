@@ -1,8 +1,8 @@
-"""The fault table: which faults are injected into a rack, in shared memory, in the system controller's window.
+"""The fault table: the faults injected into a rack, in shared memory, in the system controller's window.
 
-Whoever injects adds an entry. The clock alone decides, at the beginning of a tick, which faults begin and which are
-over, so that every task of the tick sees the same and a run in lockstep repeats with its faults. What a kind means,
-and what its parameters are, is known above: here are numbers.
+Any process may add an entry. The clock alone decides, at the beginning of a tick, which faults begin and which are
+over, so that every task of the tick sees the same and a run in lockstep repeats with its faults. The table holds
+numbers; the boards know what kinds and parameters mean.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 
 PARAMETERS = 8
-"""Parameters of one fault, at most."""
+"""Parameters of one fault."""
 NEVER = 1 << 62
 """`until` of a fault that lasts until the end of the run."""
 
@@ -33,16 +33,16 @@ class Stage(IntEnum):
 
 
 class Entry(IntEnum):
-    """Words of an entry. STAGE, FROM and UNTIL are the clock's once it waits, STRUCK and COUNT of whoever acts."""
+    """Words of an entry. While it waits, STAGE, FROM and UNTIL are the clock's; STRUCK and COUNT are of its actor."""
 
     STAGE = 0
-    KIND = 1
+    KIND = 1  # number of the kind, from its name
     TASK = 2  # index among the layout's tasks; -1: the clock
     MAILBOX = 3  # index among the layout's mailboxes; -1: every one that the task writes, or none
     FROM = 4  # first tick of the fault; -1: as soon as possible, or when its condition holds
     UNTIL = 5  # first tick after it; known once it has begun
-    TICKS = 6  # how long it lasts; 0: until the end of the run, or only once, as the kind has it
-    PHASE = 7  # when in its first tick it strikes, in 1/1000 of a tick of real time
+    TICKS = 6  # duration; 0: until the end of the run, or once, depending on the kind
+    PHASE = 7  # part of its first tick after which it strikes, in 1/1000
     SEED = 8
     WHEN_BOX = 9  # condition: index of a mailbox; -1: none
     WHEN_FIELD = 10  # index of a field in it
@@ -55,7 +55,7 @@ class Entry(IntEnum):
 
 @dataclass(frozen=True)
 class Injection:
-    """One fault as its entry holds it: see `Entry`. `when` is (mailbox, field, value), indices and a number."""
+    """One fault as an entry holds it: see `Entry`. `when` is (mailbox, field, value): two indices and a number."""
 
     kind: int
     task: int
@@ -84,7 +84,7 @@ class FaultEntry:
 
     @property
     def stage(self) -> Stage:
-        """Where the fault stands."""
+        """The stage of the fault."""
         return Stage(self.words[Entry.STAGE])
 
     def acted(self, tick: int, time_ns: int) -> None:
@@ -96,7 +96,7 @@ class FaultEntry:
 
 
 class FaultTable:
-    """The table of one rack. `entries` are all of them, free ones too."""
+    """The table of one rack. `entries` holds all entries, free ones too."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -106,14 +106,14 @@ class FaultTable:
 
     @property
     def generation(self) -> int:
-        """Rises whenever a fault begins or is over: a task that has seen this number need not look again."""
+        """Rises when a fault begins or is over: a task that has seen this number need not look again."""
         return self._words[System.FAULTS]
 
     def add(self, injection: Injection) -> FaultEntry:
         """Fill a free entry; its fault begins when the clock finds it due. Raises `FaultTableError`."""
         lock = ByteLock(self._segment, self._segment.map.faults)
         try:
-            # The bound of this wait is the time in which another process fills an entry.
+            # This wait is bounded by the time in which another process fills an entry.
             while not lock.take():
                 continue
             entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
@@ -126,13 +126,13 @@ class FaultTable:
         return entry
 
     def disarm(self, entry: FaultEntry) -> None:
-        """Have a fault that waits never come due; at the next tick the clock has seen it, and `free` may follow."""
+        """Keep a waiting fault from beginning; once the clock has given out a tick, `free` may follow."""
         # In this order: with no condition and a tick that has passed it would begin at once.
         entry.words[Entry.FROM] = NEVER
         entry.words[Entry.WHEN_BOX] = -1
 
     def free(self, entry: FaultEntry) -> bool:
-        """Give the entry of a disarmed fault back; False when the clock had begun it before."""
+        """Free the entry of a disarmed fault; return False when the clock has begun it before."""
         if entry.stage != Stage.WAITING:
             return False
         entry.words[Entry.STAGE] = Stage.FREE

@@ -19,7 +19,7 @@ Role = Literal["executor", "planner"]
 class FieldSpec:
     """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit, meaning.
 
-    `fields` holds the fields of a group (a nested message).
+    `fields` holds the fields of a group (a nested message), `values` the names (lower case) and numbers of an enum.
     """
 
     name: str
@@ -29,6 +29,7 @@ class FieldSpec:
     unit: str
     meaning: str
     fields: tuple[FieldSpec, ...] = ()
+    values: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True)

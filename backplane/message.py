@@ -34,12 +34,12 @@ class Field:
     """One field of a message: numpy scalar type, shape, unit and meaning.
 
     `shape` mixes integers and symbolic sizes; `kind` is a numpy type string or, for a group of
-    fields, a nested `MessageType`.
+    fields, a nested `MessageType`. The unit of a number that stands for a name is its enum.
     """
 
     name: str
     kind: str | MessageType
-    unit: str
+    unit: str | type[IntEnum]
     meaning: str
     shape: tuple[int | str, ...] = ()
 
@@ -92,7 +92,7 @@ def status(name: str, version: int, *fields: Field) -> MessageType:
     """Return a status type: `fields` after echo, state, error code and reason."""
     head = (
         Field("echo", "u4", "1", "serial of the command that this status answers"),
-        Field("state", "u1", "State", "idle, executing, done, error or holding"),
+        Field("state", "u1", State, "idle, executing, done, error or holding"),
         Field("error", "u2", "1", "error code of the level; 0: none"),
         Field("reason", f"S{REASON_BYTES}", "ASCII", "reason for the error or the hold, readable; empty: neither"),
     )

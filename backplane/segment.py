@@ -25,7 +25,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 3
+VERSION = 4
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -224,7 +224,8 @@ def _in_use(rack: str) -> str:
 
 def _field(entry: dict[str, Any]) -> FieldSpec:
     shape, fields = tuple(entry["shape"]), tuple(_field(f) for f in entry["fields"])
-    return FieldSpec(**{**entry, "shape": shape, "fields": fields})
+    values = tuple((name, number) for name, number in entry["values"])
+    return FieldSpec(**{**entry, "shape": shape, "fields": fields, "values": values})
 
 
 def layout_of(entry: dict[str, Any]) -> Layout:

@@ -116,6 +116,7 @@ class Fault(NamedTuple):
     parameters: Mapping[str, float]  # of the kind, by name
     seed: int  # makes everything random in it repeatable
     since: int  # tick at which it began
+    step: object  # acts the fault; of one of the classes that the level names in `faults`
 
 
 class Finding(NamedTuple):
@@ -162,8 +163,8 @@ class Executor(ABC):
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, MessageType]] = {}
-    faults: ClassVar[tuple[str, ...]] = ()
-    """Kinds of faults that can be injected into what the level drives."""
+    faults: ClassVar[tuple[type, ...]] = ()
+    """Classes of steps by which faults can strike what the level drives: see `rack.levels.faults`."""
     commands: ClassVar[Commands] = {}
     """An operator's commands to the level, with the forms of their goals; for a level that reads "own.operator"."""
     params: ClassVar[type[Table] | None] = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status
+from rack.backplane.words import Demand
 from rack.levels.operator import ANSWER, RESTS_ON
 
 WINDOW = 8
@@ -72,7 +73,7 @@ ELEMENTAL_MOVE = MessageType(
     (
         Field("id", "u4", "1", "serial of the move, rising by one from 1; 0: empty"),
         Field("action", "u2", "1", "index of the program's action that it serves"),
-        Field("verb", "u1", "Verb", "what to do"),
+        Field("verb", "u1", Verb, "what to do"),
         Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
         Field("position", "f8", "m", "tool position at the end", (3,)),
         Field("quaternion", "f8", "1", "tool orientation at the end", (4,)),
@@ -87,7 +88,7 @@ TASK_PLAN = MessageType(
     1,
     (
         Field("id", "u4", "1", "serial of the plan"),
-        Field("error", "u2", "Error", "why the program is refused; 0: it is not refused"),
+        Field("error", "u2", Error, "why the program is refused; 0: it is not refused"),
         Field("reason", "S120", "ASCII", "the refusal, readable"),
         Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
         Field("count", "u2", "1", "moves that follow"),
@@ -125,7 +126,7 @@ MOVE_STATUS = status(
     Field("done", "u4", "1", "newest elemental move done; 0: none yet"),
     Field("current", "u4", "1", "elemental move under way; 0: none"),
     Field("progress", "f8", "1", "part of its path done, 0 to 1"),
-    Field("verb", "u1", "Verb", "of the move under way"),
+    Field("verb", "u1", Verb, "of the move under way"),
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
     Field("planned", "u4", "1", "newest elemental move whose path is ready; 0: none yet"),
     Field("end", "f8", "rad", "joint positions at the end of that path", ("joints",)),
@@ -142,9 +143,9 @@ MOVE_PLAN = MessageType(
     (
         Field("move", "u4", "1", "elemental move that the plan serves"),
         Field("replan", "u4", "1", "request that it answers; 0: the first plan of the move"),
-        Field("error", "u2", "Error", "why there is no plan; 0: there is"),
+        Field("error", "u2", Error, "why there is no plan; 0: there is"),
         Field("reason", "S120", "ASCII", "the error, readable"),
-        Field("kind", "u1", "SegmentKind", "path or gripper"),
+        Field("kind", "u1", SegmentKind, "path or gripper"),
         Field("count", "u2", "1", "waypoints that follow"),
         Field("waypoints", "f8", "rad", "collision-free path in joint space", (WAYPOINTS, "joints")),
         Field("blend", "f8", "rad", "length over which corner k is rounded, before and after it", (WAYPOINTS,)),
@@ -157,7 +158,7 @@ SEGMENT = MessageType(
     (
         Field("id", "u4", "1", "serial of the segment, rising by one from 1; 0: empty"),
         Field("move", "u4", "1", "elemental move that it serves"),
-        Field("kind", "u1", "SegmentKind", "path or gripper"),
+        Field("kind", "u1", SegmentKind, "path or gripper"),
         Field("object", "i2", "1", "object held, or to be grasped; -1: none"),
         Field("touch", "u1", "1", "1: the object may touch supports and fingers (approach, depart)"),
         Field("count", "u2", "1", "waypoints that follow"),
@@ -202,7 +203,7 @@ TRAJECTORY = MessageType(
     1,
     (
         Field("segment", "u4", "1", "segment that it serves"),
-        Field("error", "u2", "Error", "why there is none; 0: there is"),
+        Field("error", "u2", Error, "why there is none; 0: there is"),
         Field("reason", "S120", "ASCII", "the error, readable"),
         Field("begin", "f8", "rad", "path parameter at which it begins"),
         Field("duration", "f8", "s", "from rest to rest"),
@@ -254,7 +255,7 @@ SERVO_STATUS = status(
     Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
     Field("stopped", "u1", "1", "1: set points are not followed: a demand, an operator, a fault, or brakes"),
     Field("braked", "u1", "1", "1: the brakes are engaged"),
-    Field("demand", "u1", "Demand", "stop that the rack's safety demands in this cycle"),
+    Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
     Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),
     Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
     Field("violations", "u4", "1", "substeps in which the arm drove a position, velocity or torque beyond its limit"),
@@ -283,7 +284,7 @@ ARM_STATE = MessageType(
             "tick",
             "ticks for which faults have kept the arm from its set points: see ServoParams.patience",
         ),
-        Field("error", "u2", "Error", "latched fault; 0: none"),
+        Field("error", "u2", Error, "latched fault; 0: none"),
         Field("reason", "S120", "ASCII", "that fault, readable"),
         Field("state", "f8", "", "mjSTATE_INTEGRATION of the simulated cell", ("state",)),
     ),

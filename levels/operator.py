@@ -53,8 +53,8 @@ class Answer(IntEnum):
 OPERATOR_COMMAND = command(
     "operator_command",
     1,
-    Field("what", "u1", "Operation", "what to do"),
-    Field("goal", "u1", "Goal", "form of the goal"),
+    Field("what", "u1", Operation, "what to do"),
+    Field("goal", "u1", Goal, "form of the goal"),
     Field("count", "u1", "1", "joints that follow"),
     Field("joints", "f8", "rad", "joint positions, for goal joints", (MAX_JOINTS,)),
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
@@ -66,8 +66,8 @@ RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or 
 ANSWER = (
     RESTS_ON,
     Field("order", "u4", "1", "newest command that an operator gave to this level; 0: none yet"),
-    Field("answer", "u1", "Answer", "this level's answer to it"),
-    Field("standing", "u1", "Operation", "operator's command in force; 0: none, the level does its own work"),
+    Field("answer", "u1", Answer, "this level's answer to it"),
+    Field("standing", "u1", Operation, "operator's command in force; 0: none, the level does its own work"),
     Field("objection", f"S{REASON_BYTES}", "ASCII", "why it was refused, readable"),
 )
 """Fields of a status that answer an operator."""

@@ -16,7 +16,7 @@ from rack.backplane.segment import SHM_FOLDER, Segment, unlink
 from rack.backplane.trace import FIELDS, Flag, TraceWriter
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block
-from rack.boards.faults.kinds import KINDS, NUMBERS
+from rack.boards.faults.kind import KINDS
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
@@ -108,9 +108,9 @@ class Link:
 
     def fault(self, kind: str, *parameters: float, seed: int = 7, mailbox: int = -1) -> FaultEntry:
         """Write with one more fault from now on."""
-        defaults = [p.default or 0.0 for p in KINDS[NUMBERS[kind]].parameters]
+        defaults = [p.default or 0.0 for p in KINDS[kind].parameters]
         given = (*parameters, *defaults[len(parameters) :])
-        entry = FaultTable(self.segment).add(Injection(NUMBERS[kind], 0, mailbox, seed=seed, parameters=given))
+        entry = FaultTable(self.segment).add(Injection(KINDS[kind].number, 0, mailbox, seed=seed, parameters=given))
         self.active.append((kind, entry))
         self.writer.ports.apply(self.active)
         return entry

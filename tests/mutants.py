@@ -154,7 +154,8 @@ def main() -> int:
         core = cores.get()
         wrong = examined(mutant, core)
         cores.put(core)
-        print(f"{mutant.detector if mutant else 'no mutation'}: {wrong or 'as it must be'}", flush=True)
+        name, good = ("no mutation", "passed") if mutant is None else (mutant.detector, "noticed")
+        print(f"{name}: {wrong or good}", flush=True)
         return not wrong
 
     wanted = sys.argv[1:]

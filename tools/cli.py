@@ -17,6 +17,7 @@ COMMANDS = (
     ("run", "rack.tools.run:run", "Run a rack until its task ends, and report on the run."),
     ("check", "rack.tools.check:check", "Validate a config and predict its timing."),
     ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
+    ("schema", "rack.tools.schema:schema", "Show the keys of a config, with unit, range, default and meaning."),
     ("list", "rack.tools.list:list_racks", "List the racks on this machine."),
     ("status", "rack.tools.status:status", "Show a running rack once."),
     ("stop", "rack.tools.stop:stop", "End a run and wait until it is gone."),
@@ -29,7 +30,7 @@ COMMANDS = (
     ("report", "rack.tools.report:report", "Report on a recorded run, or compare two runs."),
     ("analyze", "rack.tools.analyze:analyze", "Compare a run with the timing model, equation by equation."),
     ("gantt", "rack.tools.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
-    ("campaign", "rack.tools.campaign.command:campaign", "Inject random faults into many runs, and judge each."),
+    ("campaign", "rack.tools.campaign:campaign", "Inject random faults into many runs, and judge each."),
     ("bench", "rack.tools.bench.command:bench", "Measure costs on this machine."),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""

@@ -1,43 +1,49 @@
-"""`rack inject`: inject a fault into a rack that runs."""
+"""`rack inject`: inject a fault into a running rack."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from rack.tools.console.answer import Failure, Json, named, print_json
-from rack.tools.injecting.kinds import KindsCommand, kinds_document, kinds_text
+from rack.tools.console.tables import table
 
 Rack = Annotated[
     str | None,
     typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named),
 ]
 BoardName = Annotated[
-    str | None, typer.Argument(metavar="BOARD", help="task concerned: servo, servo.planner, ..., or clock")
+    str | None, typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock")
 ]
-KindName = Annotated[str | None, typer.Argument(metavar="KIND", help="what goes wrong; the kinds are listed below")]
+KindName = Annotated[str | None, typer.Argument(metavar="KIND", help="kind of fault; the kinds are listed below")]
 Parameters = Annotated[
     list[str] | None, typer.Argument(metavar="KEY=VALUE", help="parameters of the kind, as in size=0.05")
 ]
 For = Annotated[
-    str | None, typer.Option("--for", metavar="TIME", help="simulated time that it lasts, as in 0.5s or 20ms")
+    str | None, typer.Option("--for", metavar="TIME", help="duration in simulated time, as in 0.5s or 20ms")
 ]
-Cycles = Annotated[str | None, typer.Option(metavar="N", help="cycles of the task that it lasts")]
-Mailbox = Annotated[str | None, typer.Option(metavar="NAME", help="mailbox concerned; default: all the task writes")]
+Cycles = Annotated[str | None, typer.Option(metavar="N", help="duration in cycles of the task")]
+Mailbox = Annotated[
+    str | None, typer.Option(metavar="NAME", help="mailbox to strike; default: all that the task writes")
+]
 Tick = Annotated[str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")]
 When = Annotated[
     str | None, typer.Option(metavar="CONDITION", help='begin when it holds: "elemental_move.status.verb == grasp"')
 ]
-Phase = Annotated[str | None, typer.Option(metavar="X", help="when in its first tick it strikes, 0 to below 1")]
-Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of what is random in it")]
-Wait = Annotated[bool, typer.Option("--wait", help="wait until it is over, or the run is")]
+Phase = Annotated[
+    str | None, typer.Option(metavar="X", help="part of its first tick after which it strikes, 0 to below 1")
+]
+Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of its random choices")]
+Wait = Annotated[bool, typer.Option("--wait", help="wait until the fault, or the run, is over")]
 Timeout = Annotated[
     float | None,
     typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: wall-clock seconds, then exit status 1"),
 ]
 Withdraw = Annotated[
-    int | None, typer.Option(metavar="NO", help="take back a fault that still waits; --list shows its number")
+    int | None, typer.Option(metavar="NO", help="withdraw a fault that still waits; --list shows its number")
 ]
 List = Annotated[bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")]
 
@@ -85,7 +91,6 @@ def inject(
     2 usage.
     """
     from rack.tools.console.tables import terminal_width
-    from rack.tools.injecting.live import LiveRack
 
     if is_list and rack is None:
         print_json(kinds_document()) if as_json else print("\n".join(kinds_text(terminal_width())))
@@ -94,7 +99,9 @@ def inject(
     if rack is None or (needs_fault and (board is None or kind is None)):
         raise Failure("RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list", 2)
     if timeout is not None and not wait:
-        raise Failure("--timeout is the bound of --wait; give both, or neither", 2)
+        raise Failure("--timeout needs --wait; give both, or neither", 2)
+    from rack.tools.faults.live import LiveRack
+
     live = LiveRack(rack)
     if is_list:
         print_json(live.faults()) if as_json else print("\n".join(live.text(terminal_width())))
@@ -104,16 +111,73 @@ def inject(
     else:
         given: dict[str, Any] = {"board": board, "kind": kind, "for": lasts, "cycles": cycles, "mailbox": mailbox}
         given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
-        answer = live.inject({**given, **_named(parameters or [])}, wait, timeout)
+        answer = live.inject({**given, **_values(parameters or [])}, wait, timeout)
     print_json(answer) if as_json else print(answer["told"])
 
 
-def _named(parameters: list[str]) -> dict[str, str]:
+def _values(parameters: list[str]) -> dict[str, str]:
     """Return parameters by name. Raises `Failure`."""
     for text in parameters:
         if not text.partition("=")[0] or not text.partition("=")[2]:
             raise Failure(f"'{text}': a parameter must be key=value, as in size=0.05", 2)
     return {key.strip(): value.strip() for key, _, value in (text.partition("=") for text in parameters)}
+
+
+class KindsCommand(TyperCommand):
+    """A command whose help ends with the kinds of faults, which are imported only when it is asked for."""
+
+    def get_help(self, ctx: Any) -> str:
+        """Return the help."""
+        from rack.tools.console.tables import terminal_width
+
+        return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text(terminal_width())])
+
+
+def kinds_text(width: int | None = None) -> Iterator[str]:
+    """Yield the kinds as a table, and their parameters as another; with a width they fit into it."""
+    from rack.boards.faults import KINDS
+
+    rows = [[kind.name, kind.means, str(kind.bound), _remarks(kind.realtime, kind.once)] for kind in KINDS]
+    yield from table(["kind", "effect", "found within", ""], rows, width)
+    yield ""
+    yield "Cycles are the task's; a planner's is its time slice."
+    yield "A delivery is the time until a message is visible and its reader has read it."
+    yield ""
+    numbers = [
+        [
+            *(kind.name, p.name, p.unit, "none" if p.default is None else f"{p.default:g}"),
+            *(f"{p.least:g} to {p.most:g}", p.meaning),
+        ]
+        for kind in KINDS
+        for p in kind.parameters
+    ]
+    yield from table(["kind", "parameter", "unit", "default", "range", "meaning"], numbers, width)
+
+
+def _remarks(realtime: bool, once: bool) -> str:
+    return ", ".join([*(["real time only"] if realtime else []), *(["strikes once"] if once else [])])
+
+
+def kinds_document() -> list[dict[str, Any]]:
+    """Return the kinds as plain data."""
+    from rack.boards.faults import KINDS
+
+    numbers = ("name", "unit", "meaning", "default", "least", "most", "is_whole")
+    return [
+        {
+            "name": kind.name,
+            "where": kind.where,
+            "means": kind.means,
+            "seen_as": list(kind.codes),
+            "bound": str(kind.bound),
+            "parameters": [{key: getattr(p, key) for key in numbers} for p in kind.parameters],
+            "realtime": kind.realtime,
+            "once": kind.once,
+            "recoverable": kind.recoverable,
+            "takes_mailbox": kind.takes_mailbox,
+        }
+        for kind in KINDS
+    ]
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)

@@ -1,57 +1,134 @@
-"""What faults must agree on with the rack that they are injected into: every mistake of every one, at once."""
+"""Fault tables against the rack that they are for: every mistake of every one at once, then the entries they make."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from zlib import crc32
 
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
+from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout, Role
 from rack.boards.classes import find_class
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import Mistake
-from rack.boards.faults.condition import condition
-from rack.boards.faults.config import FaultConfig
-from rack.boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.bounds import cycle_ticks
+from rack.boards.faults.clock_board import PHASES
+from rack.boards.faults.config import FaultConfig, condition
+from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.levels.level import Executor
 
-FOR_THE_CLOCK = tuple(kind.name for kind in KINDS if kind.where == "clock" or kind.name == "kill")
-"""Kinds that the system controller can have."""
-WRITERS = ("writer", "bus", "lock")
-"""Where a kind strikes that is about mailboxes."""
-ROLES: Mapping[str, Role] = {"overrun": "executor", "planner-slow": "planner"}
+SEEDS = 2**31
+Steps = tuple[type, ...]
+"""Classes of steps, as `Executor.faults` names them."""
+Place = str
+"""The place of a fault in a config, as in "fault[0]"; empty for a fault from elsewhere."""
+
+
+def places(config: RackConfig) -> list[tuple[Place, FaultConfig]]:
+    """Return the faults of a config with their places in it."""
+    return [(f"fault[{at}]", fault) for at, fault in enumerate(config.fault)]
+
+
+def fault_mistakes(
+    faults: Iterable[tuple[Place, FaultConfig]],
+    config: RackConfig,
+    layout: Layout | None = None,
+    unspecified: frozenset[str] = frozenset(),
+) -> list[Mistake]:
+    """Return everything wrong with faults, given with their places.
+
+    Without a layout, rules that need one are not checked. Boards in `unspecified` have mistakes of their own.
+    """
+    rules = [FaultRules(place, fault, config, layout, unspecified) for place, fault in faults]
+    found = [mistake for rule in rules for mistake in rule.mistakes()]
+    if len(rules) > FAULT_ENTRIES:
+        found.append(Mistake("fault", len(rules), f"too many for one run; permitted: {FAULT_ENTRIES}"))
+    return found
+
+
+def injections(config: RackConfig, layout: Layout) -> tuple[Injection, ...]:
+    """Return the entries of a config's own faults, in which `fault_mistakes` has found no mistake."""
+    return tuple(_injection(fault, config, layout, place) for place, fault in places(config))
+
+
+def injection(fault: FaultConfig, config: RackConfig, layout: Layout) -> Injection:
+    """Return the entry of one fault that is not the config's. Raises `ConfigError` with every mistake."""
+    if mistakes := fault_mistakes([("", fault)], config, layout):
+        raise ConfigError(mistakes)
+    return _injection(fault, config, layout, "")
+
+
+def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: Place) -> Injection:
+    kind = KINDS[fault.kind]
+    names = [task.name for task in layout.tasks]
+    return Injection(
+        kind=kind.number,
+        task=-1 if fault.board == CLOCK else names.index(fault.board),
+        mailbox=_mailbox(fault, kind, layout),
+        tick=_first_tick(fault, layout.clock_ns),
+        ticks=_ticks(fault, layout),
+        phase=int(fault.phase * PHASES),
+        # Two faults of one config must not draw the same random numbers.
+        seed=crc32(f"{config.seed} {place}".encode()) % SEEDS if fault.seed is None else fault.seed,
+        when=None if fault.when is None else condition(fault.when, layout),
+        parameters=tuple(float(fault.parameters.get(p.name, p.default or 0.0)) for p in kind.parameters),
+    )
+
+
+def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
+    """Return the index of the mailbox; -1: every one that the task writes, or none."""
+    if fault.mailbox is None and kind.where != "bus":
+        return -1
+    named = (at for at, box in enumerate(layout.mailboxes) if box.name == fault.mailbox)
+    # One message is forged, in one mailbox: the first that has a reader.
+    own = (at for at, box in enumerate(layout.mailboxes) if box.writer == fault.board and box.readers)
+    return next(own if fault.mailbox is None else named, -1)
+
+
+def _first_tick(fault: FaultConfig, clock_ns: int) -> int:
+    if fault.at is not None:
+        return round(fault.at * 1e9 / clock_ns)
+    return -1 if fault.tick is None else fault.tick
+
+
+def _ticks(fault: FaultConfig, layout: Layout) -> int:
+    """Return the duration of a fault; 0: to the end of the run, or only once."""
+    if fault.cycles is not None:
+        return fault.cycles * cycle_ticks(layout, fault.board)
+    return 0 if fault.lasts is None else max(1, round(fault.lasts * 1e9 / layout.clock_ns))
 
 
 @dataclass(frozen=True)
 class FaultRules:
-    """The rules for one fault at `place`. Without a layout, what needs one is not looked at.
+    """The rules for one fault at `place`: see `fault_mistakes`."""
 
-    `untold` are boards whose own mistakes are told already.
-    """
-
-    place: str
+    place: Place
     fault: FaultConfig
     config: RackConfig
     layout: Layout | None = None
-    untold: frozenset[str] = frozenset()
+    unspecified: frozenset[str] = frozenset()
 
     def mistakes(self) -> Iterator[Mistake]:
         """Yield everything wrong with the fault."""
         yield from self._once_each()
-        kind = KINDS[NUMBERS[self.fault.kind]] if self.fault.kind in NUMBERS else None
+        fault = self.fault
+        tasks: dict[str, Role] = {place.name: place.role for place in self.config.tasks()}
+        # The levels' modules may add kinds.
+        driving = self._driving()
+        kind = KINDS.names.get(fault.kind)
         if kind is None:
-            yield self._mistake("kind", f"no such kind; kinds: {', '.join(NUMBERS)}")
+            yield self._mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
         else:
             yield from self._of_kind(kind)
-        tasks = self._tasks()
-        if self.fault.board != CLOCK and self.fault.board not in tasks:
-            if self.fault.board.partition(".")[0] not in self.untold:
+        if fault.board != CLOCK and fault.board not in tasks:
+            if fault.board.partition(".")[0] not in self.unspecified:
                 yield self._mistake("board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}")
         elif kind is not None:
-            yield from self._fit(kind, tasks)
-        if self.layout is not None and self.fault.when is not None:
+            yield from self._target(kind, tasks, driving)
+        if self.layout is not None and fault.when is not None:
             try:
-                condition(self.fault.when, self.layout)
+                condition(fault.when, self.layout)
             except LookupError as error:
                 yield self._mistake("when", str(error.args[0]))
 
@@ -64,27 +141,27 @@ class FaultRules:
 
     def _of_kind(self, kind: Kind) -> Iterator[Mistake]:
         if kind.realtime and self.config.clock.mode == "lockstep":
-            why = f"{kind.name} needs real time: in lockstep time waits for everybody; run without --lockstep"
+            why = f"{kind.name} needs real time: in lockstep time waits for every task; run without --lockstep"
             yield self._mistake("kind", why)
         for key in ("for", "cycles") if kind.once else ():
             if self._value(key) is not None:
-                yield self._mistake(key, f"{kind.name} strikes once, it does not last; leave it out")
+                yield self._mistake(key, f"{kind.name} strikes once and has no duration; leave it out")
         for key in ("tick", "at", "when") if kind.where == "start" else ():
             if self._value(key) is not None:
                 yield self._mistake(key, f"{kind.name} strikes as the board starts; leave it out")
-        if self.fault.phase and not kind.takes_phase:
-            takers = ", ".join(other.name for other in KINDS if other.takes_phase)
+        if self.fault.phase and not kind.within_tick:
+            takers = _listed(other.name for other in KINDS if other.within_tick)
             yield self._mistake("phase", f"{kind.name} begins with a cycle; kinds that strike within a tick: {takers}")
         if self.fault.mailbox is not None and not kind.takes_mailbox:
-            takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
-            yield self._mistake("mailbox", f"{kind.name} is of no mailbox; kinds that are: {takers}")
+            takers = _listed(other.name for other in KINDS if other.takes_mailbox)
+            yield self._mistake("mailbox", f"{kind.name} does not strike mailboxes; kinds that do: {takers}")
         yield from self._parameters(kind)
 
     def _parameters(self, kind: Kind) -> Iterator[Mistake]:
         known = {parameter.name: parameter for parameter in kind.parameters}
         for name, value in self.fault.parameters.items():
             if name not in known:
-                why = f"{kind.name} has no such parameter; parameters: {', '.join(known) or 'none'}"
+                why = f"{kind.name} has no such parameter; parameters: {_listed(known)}"
                 yield Mistake(self._at(name), _plain(value), why)
             elif why := _range(known[name], value, self._joints()):
                 yield Mistake(self._at(name), _plain(value), why)
@@ -92,54 +169,48 @@ class FaultRules:
             if parameter.default is None and parameter.name not in self.fault.parameters:
                 yield Mistake(self._at(parameter.name), None, f"missing; {parameter.meaning}, {parameter.unit}")
 
-    def _fit(self, kind: Kind, tasks: Mapping[str, Role]) -> Iterator[Mistake]:
-        """Whether the task can have such a fault."""
+    def _target(self, kind: Kind, tasks: Mapping[str, Role], driving: Mapping[str, Steps]) -> Iterator[Mistake]:
+        """Check that the task can have such a fault."""
         board = self.fault.board
         if board == CLOCK:
-            if kind.name not in FOR_THE_CLOCK:
-                yield self._mistake("board", f"the clock has no {kind.name}; its kinds: {', '.join(FOR_THE_CLOCK)}")
-        elif kind.where == "clock":
-            yield self._mistake("board", f'{kind.name} is of the clock; permitted: "{CLOCK}"')
-        elif tasks[board] != ROLES.get(kind.name, tasks[board]):
-            role = ROLES[kind.name]
-            fitting = ", ".join(name for name, other in tasks.items() if other == role) or "none"
-            yield self._mistake("board", f"{kind.name} is of {role}s; {role}s: {fitting}")
-        elif kind.where == "arm" and board not in (driving := self._driving(kind)):
-            yield self._mistake("board", f"drives nothing that can have {kind.name}; boards: {_listed(driving)}")
-        elif kind.where in WRITERS and self.layout is not None:
-            yield from self._mailbox(kind, self.layout)
+            if "clock" not in kind.tasks:
+                kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
+                yield self._mistake("board", f"the clock cannot have {kind.name}; its kinds: {kinds}")
+        elif kind.tasks == ("clock",):
+            yield self._mistake("board", f'{kind.name} strikes the clock; permitted: "{CLOCK}"')
+        elif tasks[board] not in kind.tasks:
+            role = kind.tasks[0]
+            fitting = _listed(name for name, other in tasks.items() if other == role)
+            yield self._mistake("board", f"{kind.name} strikes {role}s; {role}s: {fitting}")
+        elif kind.where == "arm":
+            able = [name for name, steps in driving.items() if isinstance(kind.step, steps)]
+            if board not in able:
+                yield self._mistake("board", f"drives nothing that can have {kind.name}; boards: {_listed(able)}")
+        elif kind.takes_mailbox and self.layout is not None:
+            yield from self._mailboxes(kind, self.layout)
 
-    def _mailbox(self, kind: Kind, layout: Layout) -> Iterator[Mistake]:
+    def _mailboxes(self, kind: Kind, layout: Layout) -> Iterator[Mistake]:
         written = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
         wanted = self.fault.mailbox
         if wanted is not None and wanted not in written:
             yield self._mistake("mailbox", f"'{self.fault.board}' does not write it; it writes: {_listed(written)}")
         elif kind.where == "bus" and wanted is None and not any(m.readers for m in written.values()):
-            yield self._mistake("mailbox", f"missing; nobody reads what '{self.fault.board}' writes")
+            yield self._mistake("mailbox", f"missing; what '{self.fault.board}' writes has no reader")
         elif kind.where == "lock":
             locked = [name for name, mailbox in written.items() if mailbox.protocol == "lock"]
             if wanted not in locked if wanted is not None else not locked:
-                why = f"lock-held needs protocol lock; mailboxes of '{self.fault.board}' with it: {_listed(locked)}"
+                why = f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' with it: {_listed(locked)}"
                 yield self._mistake("mailbox", why)
 
-    def _tasks(self) -> dict[str, Role]:
-        tasks: dict[str, Role] = {}
-        for name, board in self.config.board.items():
-            tasks[name] = "executor"
-            if board.planner is not None:
-                tasks[f"{name}.planner"] = "planner"
-        return tasks
-
-    def _driving(self, kind: Kind) -> list[str]:
-        """Return the boards whose executors drive what can have such a fault."""
-        found = []
+    def _driving(self) -> dict[str, Steps]:
+        """Return the classes of steps that can strike what each board's executor drives."""
+        found: dict[str, Steps] = {}
         for name, board in self.config.board.items():
             try:
-                if kind.name in find_class(board.executor, Executor).faults:
-                    found.append(name)
+                found[name] = find_class(board.executor, Executor).faults
             except LookupError:
-                # That there is no such class is a mistake of its own, and told.
-                found.append(name)
+                # A class that does not exist is a mistake of its own; this one must not hide it.
+                found[name] = (object,)
         return found
 
     def _joints(self) -> int | None:
@@ -155,27 +226,8 @@ class FaultRules:
         return Mistake(self._at(key), self._value(key), why)
 
 
-def fault_mistakes(
-    faults: Iterable[tuple[str, FaultConfig]],
-    config: RackConfig,
-    layout: Layout | None = None,
-    untold: frozenset[str] = frozenset(),
-) -> list[Mistake]:
-    """Return everything wrong with faults, given with their places."""
-    rules = [FaultRules(place, fault, config, layout, untold) for place, fault in faults]
-    found = [mistake for rule in rules for mistake in rule.mistakes()]
-    if len(rules) > FAULT_ENTRIES:
-        found.append(Mistake("fault", len(rules), f"more than one run can have; permitted: {FAULT_ENTRIES}"))
-    return found
-
-
-def places(config: RackConfig) -> list[tuple[str, FaultConfig]]:
-    """Return the faults of a config with their places in it."""
-    return [(f"fault[{at}]", fault) for at, fault in enumerate(config.fault)]
-
-
 def _range(parameter: Parameter, value: float, joints: int | None) -> str:
-    """Return why a value is none that the parameter can have; empty when it is one."""
+    """Return why the parameter cannot have a value; empty when it can."""
     most = joints - 1 if parameter.name == "joint" and joints is not None else parameter.most
     if not parameter.least <= value <= most or (parameter.is_whole and value != int(value)):
         whole = "whole numbers " if parameter.is_whole else ""

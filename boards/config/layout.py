@@ -249,9 +249,10 @@ def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec,
                 kind=f"V{scalar.itemsize}" if is_group else np.dtype(scalar).str,
                 shape=tuple(shape),
                 offset=offset,
-                unit=field.unit,
+                unit=field.unit if isinstance(field.unit, str) else field.unit.__name__,
                 meaning=field.meaning,
                 fields=field_specs(field.kind, sizes) if isinstance(field.kind, MessageType) else (),
+                values=() if isinstance(field.unit, str) else tuple((n.name.lower(), int(n)) for n in field.unit),
             )
         )
     return tuple(specs)

@@ -16,7 +16,7 @@ from rack.boards.config.files import EXTENDS
 from rack.boards.config.ports import all_ports
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake, shown
-from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.kind import KINDS
 
 UNIT = re.compile(
     r", ((?:kg m2|N s/m|N/m|N m|N|rad/s[23]?|rad|m/s|m|ms|s|Hz|ticks|cycles)(?: or (?:rad|N m))?)(?=$|[;:,])"

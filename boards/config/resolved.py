@@ -21,7 +21,7 @@ from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
-from rack.boards.config.faults import fault_mistakes
+from rack.boards.config.faults import fault_mistakes, injections
 from rack.boards.config.files import CONFIGS, anchor, read, with_faults
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
@@ -31,7 +31,7 @@ from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import Tables, override, parse
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.faults.config import FaultConfig
-from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.kind import KINDS
 from rack.boards.operating.command import CommandConfig
 from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
 from rack.levels.level import LevelContext, Pace
@@ -186,8 +186,6 @@ class _Examined:
         """Return everything that follows from a config without mistakes."""
         config, layout = self._config, self._layout
         assert layout is not None, "no mistakes"
-        from rack.boards.faults.request import injections
-
         faults = injections(config, layout)
         failing = {layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"}
         tasks = tuple(self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks)

@@ -18,7 +18,7 @@ from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
-from rack.boards.faults.text import board_of, joint_name, subject_of, what
+from rack.boards.faults.describe import board_of, describe_kind, joint_name, subject_of
 from rack.boards.operating.command import describe, level_of, message_of
 from rack.levels.operator import Operation
 
@@ -121,7 +121,7 @@ class AlarmEvents:
             entry, fault = self._faults.entries[number], number
             subject, board = subject_of(entry, self._layout, self._joints), board_of(entry, self._layout)
             code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
-            text = f"{what(entry, self._layout, self._joints)} {code}{self._duration(entry, code)}"
+            text = f"{describe_kind(entry, self._layout, self._joints)} {code}{self._duration(entry, code)}"
         elif alarm == Alarm.COMMANDED:
             request = self._operator.entries[number]
             board, message, kind, since = (

@@ -25,7 +25,7 @@ from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.crate.line import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload, received
-from rack.boards.faults.hog import hog
+from rack.boards.faults.tasks import hog
 from rack.boards.run.board import enter, run_clock_board, run_task_board
 from rack.boards.wiring import ClockWiring, TaskWiring
 

@@ -35,7 +35,7 @@ from rack.boards.crate.recovery import Recovery, Supervision
 from rack.boards.ending import Ending
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.events import Cause, Event, Journal, Outcome
-from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.kind import KINDS
 
 LAUNCH_S = 60.0
 """Bound of the launch: a large model with many meshes compiles for a while in every board."""

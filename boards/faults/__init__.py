@@ -1,1 +1,9 @@
-"""Faults: the kinds there are, how they are asked for, and how they are really done."""
+"""Faults: their kinds, one record each, and the steps that act them.
+
+`KINDS` holds the kinds that this process knows; see `rack.boards.faults.kind` for how to add one.
+"""
+
+import rack.boards.faults.kinds  # noqa: F401  adds the project's own kinds
+from rack.boards.faults.kind import KINDS, Consequence, Kind, Kinds, Parameter
+
+__all__ = ["KINDS", "Consequence", "Kind", "Kinds", "Parameter"]

@@ -1,26 +1,27 @@
-"""Bounds of detection: how many ticks after it first acted a fault must have been found, at the latest.
+"""Bounds of detection: the ticks within which a fault must be found, counted from the tick at which it first acted.
 
-A bound is made of cycles of the task concerned, a planner's being its time slice, and of what a reader adds: a message
-is seen only once it is visible, `delay` ticks behind its release, and only when its reader reads next.
+A bound is a sum of terms. Each term has its text and computes its ticks, so that help, judge and tests have one source.
+A cycle is that of the task concerned; a planner's is its time slice. A message is delivered when it is visible, a delay
+after its release, and its reader reads next.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.protocols import LOCK_WAIT_S
-from rack.boards.faults.kinds import Kind
 
 RACK_NS = 5_000_000
-"""Within this time the Rack knows of a death: the kernel tells it by a pidfd."""
+"""The Rack knows of a death within this time: the kernel reports it by a pidfd."""
 MEMORY_NS = 45_000_000
-"""Real time that the kernel may take, before that, to give back the memory of a process that was killed: up to half a
-millisecond a megabyte on a busy machine, and a planner with its libraries has 80."""
+"""Real time that the kernel may take, before that, to free the memory of a killed process: up to half a millisecond a
+megabyte on a busy machine, and a planner with its libraries has 80."""
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
@@ -31,116 +32,132 @@ def cycle_ticks(layout: Layout, board: str) -> int:
     return task.every * task.within_cycles
 
 
-@dataclass(frozen=True)
-class _Case:
-    """One fault as its bound depends on it, times in ticks.
+def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
+    """Return the ticks from the last message in any of these mailboxes until its slowest reader has read it."""
+    boxes = [layout.mailbox(name) for name in mailboxes]
+    return max((box.delay + cycle_ticks(layout, reader) for box in boxes for reader in box.readers), default=0)
 
-    `cycle` and `period` are of the task concerned: its time slice and the distance of its releases. `read`: the longest
-    time from one read of the detector to its next.
-    """
+
+@dataclass(frozen=True)
+class BoundCase:
+    """One fault, as its bound depends on it. `reader` is the task that finds it; None: whichever finds it first."""
 
     layout: Layout
-    cycle: int
-    period: int
-    parameter: float
-    mailboxes: tuple[MailboxSpec, ...]
-    read: int
-    at_rack: bool
+    injection: Injection
+    parameters: Mapping[str, float]
+    reader: str | None = None
+
+    @cached_property
+    def board(self) -> str:
+        """The task that the fault strikes; "clock" for the clock."""
+        return CLOCK if self.injection.task < 0 else self.layout.tasks[self.injection.task].name
+
+    @cached_property
+    def mailboxes(self) -> tuple[MailboxSpec, ...]:
+        """The mailboxes concerned that the reader reads, or that anybody reads."""
+        at, reader = self.injection.mailbox, self.reader
+        chosen = self.layout.mailboxes if at < 0 else self.layout.mailboxes[at : at + 1]
+        return tuple(m for m in chosen if m.writer == self.board and (reader in m.readers if reader else m.readers))
 
     @property
-    def seen(self) -> int:
-        """Ticks from a release of the writer until the detector has read what it wrote."""
+    def is_planner(self) -> bool:
+        """Whether it strikes a planner, whose messages have no period."""
+        return self.board != CLOCK and self.layout.task(self.board).role == "planner"
+
+    @property
+    def cycle(self) -> int:
+        """The task's cycle, in ticks."""
+        return cycle_ticks(self.layout, self.board)
+
+    @property
+    def period(self) -> int:
+        """Ticks from one release of the task to the next: a planner's are within its time slice."""
+        return 1 if self.board == CLOCK else self.layout.task(self.board).every
+
+    @property
+    def write(self) -> int:
+        """Ticks from one message to the next, of the slowest mailbox."""
+        return max(mailbox.every for mailbox in self.mailboxes)
+
+    @property
+    def delivery(self) -> int:
+        """Ticks from a release of the writer until what it wrote has been read."""
         return max(mailbox.delay for mailbox in self.mailboxes) + self.read
 
     @property
-    def every(self) -> int:
-        """The writer's period."""
-        return max(mailbox.every for mailbox in self.mailboxes)
+    def read(self) -> int:
+        """Longest time from one read to the next: of the reader, or of the fastest reader of each mailbox."""
+        if self.reader:
+            return cycle_ticks(self.layout, self.reader)
+        fastest = (min(cycle_ticks(self.layout, reader) for reader in m.readers) for m in self.mailboxes)
+        return max(fastest, default=0)
 
 
-def _kill(case: _Case) -> int:
-    """The Rack hears of it in 5 ms; a neighbour finds its message four cycles old, when it reads next."""
-    return ceil(RACK_NS / case.layout.clock_ns) if case.at_rack else 4 * case.cycle + case.read
+@dataclass(frozen=True)
+class Bound:
+    """A bound of detection: as text, and in ticks. `ticks` returns None where there is no bound."""
+
+    text: str
+    ticks: Callable[[BoundCase], int | None]
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __add__(self, other: Bound) -> Bound:
+        def ticks(case: BoundCase) -> int | None:
+            terms = self.ticks(case), other.ticks(case)
+            return None if None in terms else sum(term for term in terms if term is not None)
+
+        return Bound(f"{self.text} + {other.text}", ticks)
 
 
-def _cycles(count: int) -> Callable[[_Case], int]:
-    """So many cycles of the task concerned."""
-    return lambda case: count * case.cycle
+def cycles(count: int) -> Bound:
+    """Return so many cycles of the task; none is the cycle in which it strikes."""
+    return Bound(_counted(count, "cycle") if count else "the same cycle", lambda case: count * case.cycle)
 
 
-BOUNDS: Mapping[str, Callable[[_Case], int]] = {
-    "kill": _kill,
-    # Four releases without an answer, and the release at which that is seen.
-    "hang": _cycles(4 + 1),
-    "hog": _cycles(4 + 1),
-    # The next release comes before the end of the cycle.
-    "overrun": _cycles(1),
-    # The d cycles of its slice, and one more.
-    "planner-slow": lambda case: case.cycle + case.period,
-    # Age alone would do after two periods, and proves nothing: the writer must also have finished a release since.
-    "mute": lambda case: 2 * case.every + case.read,
-    # What is missing shows by the message behind it.
-    "drop": lambda case: case.every + case.seen,
-    "reorder": lambda case: case.every + case.seen,
-    "delay": lambda case: int(case.parameter) * case.every + case.seen,
-    "corrupt": lambda case: case.seen,
-    "babble": lambda case: case.seen,
-    "masquerade": lambda case: case.seen,
-    "lock-held": lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns) + case.read,
-    "clock-stop": lambda case: 3,
-    # It is seen at the first tick that is not left out.
-    "clock-skip": lambda case: int(case.parameter),
-    "clock-jitter": lambda case: 2,
-    "sensor-nan": _cycles(1),
-    "sensor-stuck": _cycles(20),
-    "sensor-dropout": _cycles(2),
-    "actuator-off": _cycles(5),
-    # What it gives is like a load that pulls, until it is told more and gives no more. The joint loop tells it more by
-    # 0.3 of what it lacks in a cycle (twice its bandwidth, 60 rad/s, times the cycle), and a sound motor gives 0.3 of
-    # that at least. Dry friction that turns round may give all that it lacks when it strikes: 1 / (0.3 * 0.3) cycles.
-    "actuator-saturated": _cycles(12),
-    # At the gate, in the same cycle: they never reach the arm.
-    "command-nan": _cycles(0),
-    "command-limit": _cycles(0),
-}
-"""By kind. Not here: what the start finds, and what depends on the size of the fault (sensor-bias, sensor-noise)."""
-READ = ("kill", "mute", "drop", "delay", "reorder", "corrupt", "babble", "masquerade", "lock-held")
-"""Kinds that a reader of the task's mailboxes finds."""
+def clock_ticks(count: int) -> Bound:
+    """Return so many ticks."""
+    return Bound(_counted(count, "tick"), lambda case: count)
 
 
-def bound_ticks(kind: Kind, injection: Injection, layout: Layout, reader: str | None = None) -> int | None:
-    """Return the ticks from the tick at which a fault first acted to its detection; None when there is no such bound.
-
-    `reader` is the task that finds it; None: whichever finds it first, for `kill` the Rack. A mailbox that nobody reads
-    has no bound, nor have a planner's plans that do not come: they have no period.
-    """
-    if kind.name not in BOUNDS:
-        return None
-    board = CLOCK if injection.task < 0 else layout.tasks[injection.task].name
-    at_rack = kind.name == "kill" and reader is None
-    mailboxes = _mailboxes(injection, layout, board, reader)
-    if kind.name in READ and not at_rack and not mailboxes:
-        return None
-    if kind.name == "mute" and layout.task(board).role == "planner":
-        return None
-    read = cycle_ticks(layout, reader) if reader else _first_read(mailboxes, layout)
-    parameter = injection.parameters[0] if injection.parameters else 0.0
-    cycle, period = cycle_ticks(layout, board), 1 if board == CLOCK else layout.task(board).every
-    return BOUNDS[kind.name](_Case(layout, cycle, period, parameter, mailboxes, read, at_rack))
+def writes(count: int) -> Bound:
+    """Return so many periods of the mailbox's writer."""
+    return Bound(_counted(count, "write"), lambda case: count * case.write)
 
 
-def _mailboxes(injection: Injection, layout: Layout, board: str, reader: str | None) -> tuple[MailboxSpec, ...]:
-    """Return the mailboxes concerned that the reader reads, or that anybody does."""
-    chosen = layout.mailboxes if injection.mailbox < 0 else layout.mailboxes[injection.mailbox : injection.mailbox + 1]
-    return tuple(m for m in chosen if m.writer == board and (reader in m.readers if reader else m.readers))
+def missing_writes(count: int) -> Bound:
+    """Return so many periods in which no message comes; a planner's messages have no period."""
+    return Bound(_counted(count, "write"), lambda case: None if case.is_planner else count * case.write)
 
 
-def _first_read(mailboxes: tuple[MailboxSpec, ...], layout: Layout) -> int:
-    """Return the cycle of the fastest reader of each mailbox, of the slowest such."""
-    return max((min(cycle_ticks(layout, reader) for reader in m.readers) for m in mailboxes), default=0)
+def delayed(parameter: str) -> Bound:
+    """Return as many periods of the mailbox's writer as a parameter says."""
+    return Bound("the delay", lambda case: int(case.parameters[parameter]) * case.write)
 
 
-def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
-    """Return the ticks from the last message of these mailboxes to its slowest reader: until then traces are found."""
-    boxes = [layout.mailbox(name) for name in mailboxes]
-    return max((box.delay + cycle_ticks(layout, reader) for box in boxes for reader in box.readers), default=0)
+def skipped(parameter: str) -> Bound:
+    """Return as many ticks as a parameter says: seen at the first tick that is not skipped."""
+    return Bound("the next tick", lambda case: int(case.parameters[parameter]))
+
+
+def by_rack_or(count: int) -> Bound:
+    """Return the bound of a death: at the Rack, or at a reader, whose message is then so many cycles old."""
+
+    def ticks(case: BoundCase) -> int:
+        return ceil(RACK_NS / case.layout.clock_ns) if case.reader is None else count * case.cycle + case.read
+
+    return Bound(f"{RACK_NS * 1e-6:g} ms by the Rack; {count} cycles + 1 read by a reader", ticks)
+
+
+READ = Bound("1 read", lambda case: case.read)
+DELIVERY = Bound("1 delivery", lambda case: case.delivery)
+SLICE = Bound("1 time slice", lambda case: case.cycle)
+RELEASE = Bound("1 cycle", lambda case: case.period)
+LOCK_WAIT = Bound("the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns))
+BY_SIZE = Bound("depends on its size", lambda case: None)
+NOT_ARMED = Bound("the rack does not arm", lambda case: None)
+
+
+def _counted(count: int, unit: str) -> str:
+    return f"{count} {unit}{'' if count == 1 else 's'}"

@@ -1,14 +1,17 @@
-"""The `[[fault]]` tables of a config: a fault as it is asked for, before the rack that it is for is looked at."""
+"""`[[fault]]` tables: a fault as a user writes it, and the condition on which it begins."""
 
 from __future__ import annotations
 
 import re
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
+from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.levels.tables import LAST_TICK, Finite, Table
 
+CONDITION = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
 DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s)\s*")
 
 
@@ -23,7 +26,7 @@ def _seconds(value: Any) -> Any:
 
 
 def _number(value: Any) -> Any:
-    """Return a switch as 0 or 1: parameters are numbers, `random = true` is one."""
+    """Return a switch as 0 or 1: parameters are numbers, `random = true` is 1."""
     return float(value) if isinstance(value, bool) else value
 
 
@@ -32,33 +35,79 @@ Seconds = Annotated[float, BeforeValidator(_seconds), Field(gt=0, le=1e6, allow_
 
 
 class FaultConfig(Table):
-    """`[[fault]]`: one fault. Keys that are not named here are parameters of its kind, numbers."""
+    """`[[fault]]`: one fault. Any other key is a parameter of its kind, a number."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     __pydantic_extra__: dict[str, Parameter]
 
-    kind: str = Field(description="what goes wrong; 'rack inject --help' lists the kinds")
-    board: str = Field(description="task concerned: a board, as in servo, its planner, as in servo.planner, or clock")
+    kind: str = Field(description="kind of fault; 'rack inject --help' lists the kinds")
+    board: str = Field(description="task to strike: a board, as in servo, its planner, as in servo.planner, or clock")
     tick: int | None = Field(
-        None, ge=0, le=LAST_TICK, description="first tick; at most one of tick, at and when; none: at the start"
+        None, ge=0, le=LAST_TICK, description="first tick; at most one of tick, at and when; without any: at the start"
     )
     at: float | None = Field(None, ge=0, le=1e9, allow_inf_nan=False, description="instead of tick: simulated time, s")
     when: str | None = Field(
         None, description='instead of tick: once a field has a value, as in "elemental_move.status.verb == grasp"'
     )
     lasts: Seconds | None = Field(
-        None, alias="for", description='simulated time that it lasts, as in "0.5s", "20ms" or 0.5; or give cycles'
+        None, alias="for", description='duration in simulated time, as in "0.5s", "20ms" or 0.5; or give cycles'
     )
-    cycles: int | None = Field(None, ge=1, le=10**6, description="instead of for: cycles of the task that it lasts")
-    phase: float = Field(
-        0.0, ge=0, lt=1, description="when in its first tick it strikes, in ticks of real time; not in lockstep"
-    )
+    cycles: int | None = Field(None, ge=1, le=10**6, description="instead of for: duration in cycles of the task")
+    phase: float = Field(0.0, ge=0, lt=1, description="part of its first tick after which it strikes; real time only")
     mailbox: str | None = Field(
-        None, description="mailbox concerned; default: all that the task writes, for masquerade the first"
+        None, description="mailbox to strike; default: all that the task writes, for masquerade the first"
     )
-    seed: int | None = Field(None, ge=0, le=2**31 - 1, description="seed; default: from the rack's and the place")
+    seed: int | None = Field(
+        None, ge=0, le=2**31 - 1, description="seed; default: from the rack's seed and the fault's place in the config"
+    )
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The parameters given, by name; whether the kind takes them is not known here."""
+        """The parameters given, by name; not yet checked against the kind."""
         return dict(self.__pydantic_extra__ or {})
+
+
+def condition(text: str, layout: Layout) -> tuple[int, int, int]:
+    """Return a condition as indices of mailbox and field, and a number. Raises `LookupError` with a reason."""
+    found = CONDITION.fullmatch(text)
+    if found is None:
+        raise LookupError('must be mailbox.field == value, as in "elemental_move.status.verb == grasp"')
+    mailboxes = {mailbox.name: at for at, mailbox in enumerate(layout.mailboxes)}
+    if found[1] not in mailboxes:
+        raise LookupError(f"there is no mailbox '{found[1]}'; mailboxes: {', '.join(mailboxes)}")
+    mailbox = layout.mailboxes[mailboxes[found[1]]]
+    fields = _integers(mailbox)
+    if found[2] not in fields:
+        raise LookupError(
+            f"'{mailbox.name}' has no integer field '{found[2]}'; integer fields: {', '.join(fields) or 'none'}"
+        )
+    field = fields[found[2]]
+    return mailboxes[mailbox.name], mailbox.fields.index(field), _value(found[3], field)
+
+
+def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
+    """Return a condition as a user writes it: the inverse of `condition`."""
+    mailbox = layout.mailboxes[when[0]]
+    field = mailbox.fields[when[1]]
+    names = {number: name for name, number in field.values}
+    return f"{mailbox.name}.{field.name} == {names.get(when[2], when[2])}"
+
+
+def _integers(mailbox: MailboxSpec) -> dict[str, FieldSpec]:
+    """Return the fields that a condition can be on: single integers."""
+    return {f.name: f for f in mailbox.fields if not f.fields and not f.shape and np.dtype(f.kind).kind in "iu"}
+
+
+def _value(text: str, field: FieldSpec) -> int:
+    names = dict(field.values)
+    if text.lower() in names:
+        return names[text.lower()]
+    permitted = np.iinfo(field.kind)
+    try:
+        value = int(text)
+    except ValueError:
+        value = None
+    if value is None or not permitted.min <= value <= permitted.max:
+        known = ", ".join(names) or f"a number from {permitted.min} to {permitted.max}"
+        raise LookupError(f"'{text}' is not a value of '{field.name}'; permitted: {known}")
+    return value

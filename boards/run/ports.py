@@ -12,7 +12,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
-from rack.boards.faults.writers import FaultyWriter
+from rack.boards.faults.messages import FaultyWriter
 from rack.levels.level import Ports, Reading, Verdict
 
 

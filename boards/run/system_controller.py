@@ -19,8 +19,7 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, Run, System
-from rack.boards.faults.stage import FaultStage
-from rack.boards.faults.strikes import Strikes
+from rack.boards.faults.clock_board import FaultStage
 from rack.boards.operating.desk import OperatorDesk
 from rack.boards.wiring import ClockWiring
 
@@ -35,7 +34,7 @@ class SystemController:
 
     def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
         self._words, self._wiring, self._driver = segment.words, wiring, driver
-        self._faults = FaultStage(segment, Strikes(segment, driver), driver.alarms)
+        self._faults = FaultStage(segment, driver)
         self._desk = OperatorDesk(segment, driver.alarms)
         self._settled: tuple[int, int, int] | None = None
         self._demand = Demand(self._words[System.DEMAND])

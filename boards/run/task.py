@@ -13,7 +13,7 @@ from rack.backplane.process import compute_until
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, System, TaskState
-from rack.boards.faults.task_faults import TaskFaults
+from rack.boards.faults.tasks import TaskFaults
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
 from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm
-from rack.levels.arm.faulty import KINDS
+from rack.levels.arm.faulty import STEPS
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
@@ -41,7 +41,7 @@ class ServoExecutor(Executor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
-    faults = KINDS
+    faults = STEPS
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
     params = ServoParams
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from wave_levels import Watch
 
 from rack.backplane.message import Field, State, status
-from rack.boards.faults.kinds import KINDS
+from rack.levels.faults import CommandStep, MotorStep, SensorStep
 from rack.levels.level import Executor, LevelContext, Ports
 
 PLACE = status("place", 1, Field("position", "f8", "rad", "where it is"), Field("mode", "i2", "1", "how it moves"))
@@ -15,7 +15,7 @@ class Driven(Executor):
     """Says that it stands."""
 
     outputs = {"status": PLACE}
-    faults = tuple(kind.name for kind in KINDS if kind.where == "arm")
+    faults = (SensorStep, MotorStep, CommandStep)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Say where it is."""

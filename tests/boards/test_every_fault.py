@@ -14,12 +14,11 @@ from rack.backplane.message import State
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block
 from rack.boards import Rack
+from rack.boards.config.faults import injections
 from rack.boards.errors import LaunchError
-from rack.boards.faults.bounds import bound_ticks, cycle_ticks
+from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.config import FaultConfig
-from rack.boards.faults.consequences import recovery_ticks
-from rack.boards.faults.kinds import KINDS, Kind
-from rack.boards.faults.request import injections
+from rack.boards.faults.kind import KINDS, Kind
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import FOLLOWED, LOCKED, PATIENCE_TICKS, TARGETS
 from tests.processes import BOUND_S
@@ -63,9 +62,8 @@ def test_a_fault_is_found_and_over_or_latched_within_its_bound(
         (entry,) = FaultTable(rack.segment).staged((Stage.ACTIVE, Stage.OVER))
         board = layout.tasks[entry[Entry.TASK]].name if entry[Entry.TASK] >= 0 else CLOCK
         rows = trace_ring(rack.segment, "watch").drain().rows
-    bound = bound_ticks(kind, injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None)
-    codes = {alarm.name.lower() for alarm in kind.seen_as} | ({"died"} if kind.name == "kill" else set())
-    found = min((event.tick for event in rack.events if event.code in codes), default=None)
+    bound = kind.bound_ticks(injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None)
+    found = min((event.tick for event in rack.events if event.code in kind.codes), default=None)
     if found is None:
         # One cycle may be too short to tell anything, or to hit a message.
         assert length == LENGTHS["one cycle"]
@@ -81,9 +79,9 @@ def test_a_fault_is_found_and_over_or_latched_within_its_bound(
     assert outcome.worked
     restart_s = rack.config.supervision.lockstep_restart_s
     over = max(entry[Entry.UNTIL] if entry.stage == Stage.OVER else 0, found)
-    if kind.name == "hang":
+    if kind.is_over_when_found:
         over = found
-    after = rows[rows["tick"] >= over + recovery_ticks(kind.name, board, layout, restart_s)]
+    after = rows[rows["tick"] >= over + kind.recovery_ticks(board, layout, restart_s)]
     assert len(after) > 20
     assert np.all(after["state"] == State.EXECUTING)
 

@@ -8,9 +8,9 @@ import pytest
 
 from rack.backplane.layout import Layout
 from rack.boards.config import wire
-from rack.boards.faults.bounds import BOUNDS, READ, bound_ticks, cycle_ticks
-from rack.boards.faults.kinds import KINDS, NUMBERS
-from rack.boards.faults.request import injections
+from rack.boards.config.faults import injections
+from rack.boards.faults.bounds import BY_SIZE, NOT_ARMED, cycle_ticks
+from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
@@ -56,7 +56,7 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
 def bound(config: MakeConfig, fault: dict[str, Any], reader: str | None, *settings: str) -> int | None:
     found = rack(config, fault, settings=settings)
     layout: Layout = wire(found)
-    return bound_ticks(KINDS[NUMBERS[fault["kind"]]], injections(found, layout)[0], layout, reader)
+    return KINDS[fault["kind"]].bound_ticks(injections(found, layout)[0], layout, reader)
 
 
 @pytest.mark.parametrize(("fault", "reader", "ticks"), CASES.values(), ids=CASES)
@@ -72,9 +72,19 @@ def test_a_lock_that_is_held_is_found_by_the_bound_of_a_wait(config: MakeConfig)
 
 
 def test_every_kind_has_a_bound_but_those_that_say_why_not() -> None:
-    without = {kind.name for kind in KINDS} - set(BOUNDS)
+    without = {kind.name for kind in KINDS if kind.bound in (BY_SIZE, NOT_ARMED)}
     assert without == {"sensor-bias", "sensor-noise", "self-test"}
-    assert set(READ) == {kind.name for kind in KINDS if kind.takes_mailbox} | {"kill"}
+
+
+def test_a_bound_says_in_words_how_it_is_computed() -> None:
+    words = {name: str(KINDS[name].bound) for name in ("hang", "mute", "planner-slow", "clock-stop", "command-nan")}
+    assert words == {
+        "hang": "5 cycles",
+        "mute": "2 writes + 1 read",
+        "planner-slow": "1 time slice + 1 cycle",
+        "clock-stop": "3 ticks",
+        "command-nan": "the same cycle",
+    }
 
 
 def test_the_clocks_cycle_is_a_tick_and_a_planners_is_its_slice(config: MakeConfig) -> None:

@@ -10,7 +10,7 @@ import pytest
 from rack.boards.config import FAULTS, load, loads, names, wire
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
-from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 

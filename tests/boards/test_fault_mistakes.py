@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import pytest
 
 from rack.backplane.address_map import FAULT_ENTRIES
-from rack.boards.config import load, wire
+from rack.backplane.layout import Layout
+from rack.boards.config import load, loads, wire
+from rack.boards.config.faults import fault_mistakes, injection
+from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.faults.kinds import KINDS, NUMBERS, Kind, Parameter
-from rack.boards.faults.request import injections
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kind import KINDS, Kind, Parameter
 from tests.boards.conftest import MakeConfig
-from tests.boards.fault_racks import LOCKED, TARGETS, inline, rack
+from tests.boards.fault_racks import DRIVEN, LOCKED, TARGETS, inline, rack
 
 Fault = dict[str, Any]
 TASKS = "wave, wave.planner, watch, driven, clock"
 MISTAKES: Mapping[str, tuple[Fault, str]] = {
-    "no kind": ({"board": "wave"}, "fault[0].kind: missing; what goes wrong"),
-    "no board": ({"kind": "kill"}, "fault[0].board: missing; task concerned"),
-    "unknown kind": ({"kind": "kil", "board": "wave"}, f'.kind = "kil": no such kind; kinds: {", ".join(NUMBERS)}'),
+    "no kind": ({"board": "wave"}, "fault[0].kind: missing; kind of fault"),
+    "no board": ({"kind": "kill"}, "fault[0].board: missing; task to strike"),
+    "unknown kind": ({"kind": "kil", "board": "wave"}, f'.kind = "kil": no such kind; kinds: {", ".join(KINDS.names)}'),
     "unknown board": ({"kind": "kill", "board": "wve"}, f'.board = "wve": no such task; tasks: {TASKS}'),
     "no such planner": ({"kind": "kill", "board": "watch.planner"}, f"no such task; tasks: {TASKS}"),
     "tick below 0": ({"kind": "kill", "board": "wave", "tick": -1}, ".tick = -1: should be greater than or equal to 0"),
@@ -53,31 +57,31 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
     "no mailbox": ({"kind": "mute", "board": "watch", "mailbox": "sea"}, "does not write it; it writes: watch.status"),
     "overrun of a planner": (
         {"kind": "overrun", "board": "wave.planner"},
-        "overrun is of executors; executors: wave, watch, driven",
+        "overrun strikes executors; executors: wave, watch, driven",
     ),
     "slow executor": (
         {"kind": "planner-slow", "board": "wave"},
-        '.board = "wave": planner-slow is of planners; planners: wave.planner',
+        '.board = "wave": planner-slow strikes planners; planners: wave.planner',
     ),
     "nothing driven": (
         {"kind": "sensor-nan", "board": "wave"},
         "drives nothing that can have sensor-nan; boards: driven",
     ),
-    "clock kind": ({"kind": "clock-skip", "board": "wave"}, 'clock-skip is of the clock; permitted: "clock"'),
+    "clock kind": ({"kind": "clock-skip", "board": "wave"}, 'clock-skip strikes the clock; permitted: "clock"'),
     "no kind of the clock": (
         {"kind": "mute", "board": "clock"},
-        "the clock has no mute; its kinds: kill, clock-stop, clock-skip, clock-jitter",
+        "the clock cannot have mute; its kinds: kill, clock-stop, clock-skip, clock-jitter",
     ),
-    "clock that hangs": ({"kind": "hang", "board": "clock"}, "the clock has no hang; its kinds: kill, clock-stop"),
+    "clock that hangs": ({"kind": "hang", "board": "clock"}, "the clock cannot have hang; its kinds: kill, clock-stop"),
     "no lock": ({"kind": "lock-held", "board": "wave"}, "needs protocol lock; mailboxes of 'wave' with it: none"),
-    "nobody reads": ({"kind": "masquerade", "board": "watch"}, "missing; nobody reads what 'watch' writes"),
+    "nobody reads": ({"kind": "masquerade", "board": "watch"}, "missing; what 'watch' writes has no reader"),
     "condition": (
         {"kind": "kill", "board": "wave", "when": "wave.status.state > 1"},
         'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"',
     ),
     "condition, mailbox": (
         {"kind": "kill", "board": "wave", "when": "sea.status.state == done"},
-        "no mailbox is called 'sea.status'; mailboxes: wave.status, wave.plan, watch.status, driven.status",
+        "there is no mailbox 'sea.status'; mailboxes: wave.status, wave.plan, watch.status, driven.status",
     ),
     "condition, field": (
         {"kind": "kill", "board": "wave", "when": "wave.status.height == 1"},
@@ -89,11 +93,11 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
     ),
     "condition, name": (
         {"kind": "kill", "board": "wave", "when": "wave.status.state == gone"},
-        "'gone' is no value of 'state'; permitted: idle, executing, done, error",
+        "'gone' is not a value of 'state'; permitted: idle, executing, done, error",
     ),
     "condition, number": (
         {"kind": "kill", "board": "wave", "when": "driven.status.mode == 40000"},
-        "'40000' is no value of 'mode'; permitted: a number from -32768 to 32767",
+        "'40000' is not a value of 'mode'; permitted: a number from -32768 to 32767",
     ),
 }
 PARAMETERS = [(kind, parameter) for kind in KINDS for parameter in kind.parameters]
@@ -105,8 +109,20 @@ def fault_of(kind: Kind, **keys: Any) -> Fault:
     return {"kind": kind.name, "board": board, **keys}
 
 
-def settings_for(kind: Kind) -> tuple[str, ...]:
-    return (LOCKED,) if kind.where == "lock" else ()
+@cache
+def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Layout]:
+    """Return the rack that can have every kind, but for those that need locks, or real time."""
+    mode = "lockstep" if lockstep else "realtime"
+    text = DRIVEN.replace('mode = "lockstep"', f'mode = "{mode}"')
+    found = loads(text + ('[protocol]\ndefault = "lock"\n' if locked else ""))
+    return found, wire(found)
+
+
+def told_of(kind: Kind, lockstep: bool = False, **keys: Any) -> str:
+    """Return the one mistake that a fault of that kind has, as its line."""
+    fault = FaultConfig.model_validate(fault_of(kind, **keys))
+    (mistake,) = fault_mistakes([("fault[0]", fault)], *rack_for(kind.where == "lock", lockstep))
+    return str(mistake)
 
 
 def mistakes(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> list[Mistake]:
@@ -130,24 +146,24 @@ def test_a_mistake_is_told_with_what_is_valid(config: MakeConfig, fault: Fault, 
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_every_kind_can_be_asked_for_by_its_name_and_target_alone(config: MakeConfig, kind: Kind) -> None:
-    found = rack(config, fault_of(kind), settings=settings_for(kind))
-    (injection,) = injections(found, wire(found))
-    assert KINDS[injection.kind] is kind
-    assert injection.parameters == tuple(parameter.default for parameter in kind.parameters)
+def test_every_kind_can_be_asked_for_by_its_name_and_target_alone(kind: Kind) -> None:
+    fault = FaultConfig.model_validate(fault_of(kind))
+    entry = injection(fault, *rack_for(kind.where == "lock", lockstep=False))
+    assert KINDS[entry.kind] is kind
+    assert entry.parameters == tuple(parameter.default for parameter in kind.parameters)
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_a_parameter_that_a_kind_lacks_lists_those_it_has(config: MakeConfig, kind: Kind) -> None:
+def test_a_parameter_that_a_kind_lacks_lists_those_it_has(kind: Kind) -> None:
     names = ", ".join(parameter.name for parameter in kind.parameters) or "none"
-    line = told(config, fault_of(kind, strength=2), settings=settings_for(kind))
+    line = told_of(kind, strength=2)
     assert line == f"fault[0].strength = 2: {kind.name} has no such parameter; parameters: {names}"
 
 
 @pytest.mark.parametrize(("kind", "parameter"), PARAMETERS, ids=lambda given: given.name)
-def test_a_parameter_out_of_range_is_told_with_its_range(config: MakeConfig, kind: Kind, parameter: Parameter) -> None:
+def test_a_parameter_out_of_range_is_told_with_its_range(kind: Kind, parameter: Parameter) -> None:
     for value in (parameter.least - 0.25, parameter.most + 0.25):
-        line = told(config, fault_of(kind, **{parameter.name: value}), settings=settings_for(kind))
+        line = told_of(kind, **{parameter.name: value})
         assert line.startswith(f"fault[0].{parameter.name} = {value!r}: out of range")
         assert f"{parameter.least:g} to {parameter.most:g}; {parameter.meaning}, {parameter.unit}" in line
 
@@ -155,23 +171,22 @@ def test_a_parameter_out_of_range_is_told_with_its_range(config: MakeConfig, kin
 @pytest.mark.parametrize(
     ("kind", "parameter"), [(k, p) for k, p in PARAMETERS if p.is_whole], ids=lambda given: given.name
 )
-def test_half_of_something_that_is_counted_is_refused(config: MakeConfig, kind: Kind, parameter: Parameter) -> None:
-    fault = fault_of(kind, **{parameter.name: parameter.least + 0.5})
-    assert "permitted: whole numbers" in told(config, fault, settings=settings_for(kind))
+def test_half_of_something_that_is_counted_is_refused(kind: Kind, parameter: Parameter) -> None:
+    assert "permitted: whole numbers" in told_of(kind, **{parameter.name: parameter.least + 0.5})
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.realtime], ids=lambda kind: kind.name)
-def test_a_kind_that_needs_real_time_says_so_in_lockstep(config: MakeConfig, kind: Kind) -> None:
-    line = told(config, fault_of(kind), settings=("clock.mode=lockstep", *settings_for(kind)))
+def test_a_kind_that_needs_real_time_says_so_in_lockstep(kind: Kind) -> None:
+    line = told_of(kind, lockstep=True)
     assert line == (
-        f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for everybody; '
+        f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for every task; '
         "run without --lockstep"
     )
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_phase], ids=lambda kind: kind.name)
-def test_a_kind_that_begins_with_a_cycle_has_no_phase(config: MakeConfig, kind: Kind) -> None:
-    line = told(config, fault_of(kind, phase=0.5), settings=settings_for(kind))
+@pytest.mark.parametrize("kind", [k for k in KINDS if not k.within_tick], ids=lambda kind: kind.name)
+def test_a_kind_that_begins_with_a_cycle_has_no_phase(kind: Kind) -> None:
+    line = told_of(kind, phase=0.5)
     assert line == (
         f"fault[0].phase = 0.5: {kind.name} begins with a cycle; kinds that strike within a tick: "
         "kill, hang, masquerade, clock-stop"
@@ -180,22 +195,22 @@ def test_a_kind_that_begins_with_a_cycle_has_no_phase(config: MakeConfig, kind: 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.once], ids=lambda kind: kind.name)
 @pytest.mark.parametrize("key", ["for", "cycles"])
-def test_a_kind_that_strikes_once_does_not_last(config: MakeConfig, kind: Kind, key: str) -> None:
-    line = told(config, fault_of(kind, **{key: 1}), settings=settings_for(kind))
+def test_a_kind_that_strikes_once_does_not_last(kind: Kind, key: str) -> None:
+    line = told_of(kind, **{key: 1})
     assert f"fault[0].{key} = 1" in line
-    assert f"{kind.name} strikes once, it does not last; leave it out" in line
+    assert f"{kind.name} strikes once and has no duration; leave it out" in line
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_mailbox], ids=lambda kind: kind.name)
-def test_a_kind_that_is_of_no_mailbox_lists_those_that_are(config: MakeConfig, kind: Kind) -> None:
+def test_a_kind_that_is_of_no_mailbox_lists_those_that_are(kind: Kind) -> None:
     takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
-    line = told(config, fault_of(kind, mailbox="wave.status"))
-    assert line == f'fault[0].mailbox = "wave.status": {kind.name} is of no mailbox; kinds that are: {takers}'
+    line = told_of(kind, mailbox="wave.status")
+    assert line == f'fault[0].mailbox = "wave.status": {kind.name} does not strike mailboxes; kinds that do: {takers}'
 
 
 @pytest.mark.parametrize("begin", [{"tick": 4}, {"at": 1.0}, {"when": "wave.status.state == executing"}])
-def test_a_self_test_fails_at_the_start_and_at_no_other_time(config: MakeConfig, begin: Fault) -> None:
-    line = told(config, fault_of(KINDS[NUMBERS["self-test"]], **begin))
+def test_a_self_test_fails_at_the_start_and_at_no_other_time(begin: Fault) -> None:
+    line = told_of(KINDS["self-test"], **begin)
     assert "self-test strikes as the board starts; leave it out" in line
 
 
@@ -214,7 +229,7 @@ def test_a_joint_that_the_arm_lacks_is_refused() -> None:
 
 def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None:
     faults = [{"kind": "kill", "board": "wave", "tick": tick} for tick in range(FAULT_ENTRIES + 1)]
-    assert told(config, *faults) == f"fault = {len(faults)}: more than one run can have; permitted: {FAULT_ENTRIES}"
+    assert told(config, *faults) == f"fault = {len(faults)}: too many for one run; permitted: {FAULT_ENTRIES}"
 
 
 def test_all_mistakes_of_all_faults_are_told_at_once(config: MakeConfig) -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from rack.boards.events import Cause, Event, Outcome
-from rack.tools.campaign.ending import Arm, Strike
-from rack.tools.campaign.plan import Plan
-from rack.tools.campaign.results import Faultless, Judged, Results, keep, kept, misses_of
-from rack.tools.campaign.trial import Trial
-from tests.tools.campaign_events import LAYOUT, event, found, strike
+from rack.tools.campaigns.plan import Plan
+from rack.tools.campaigns.results import Faultless, Judged, Results, keep, kept, misses_of
+from rack.tools.campaigns.trial import Trial
+from rack.tools.faults.ending import ArmEnd, Strike
+from tests.tools.fault_events import LAYOUT, event, found, strike
 
 FAULT = strike("mute", "lower", 100, 150)
 SEEN = found(105, "mute", "upper", "lower.status")
@@ -30,7 +30,7 @@ def trial(*events: Event, strikes: tuple[Strike, ...] = (FAULT,)) -> Trial:
         refused="",
         events=(*events, event(9999, "end", "")),
         strikes=strikes,
-        arm=Arm(),
+        arm=ArmEnd(),
         left=(),
         wall_s=1.0,
         offset_ns=0,
@@ -67,7 +67,7 @@ def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_noth
             replace(trial(SEEN), outcome=outcome("task failed", "level 'lower': blocked")),
             "the task is not done, and no fault had to end it: task failed; level 'lower': blocked",
         ),
-        (replace(trial(SEEN), arm=Arm(violations=3)), "limits violated at 3 substeps"),
+        (replace(trial(SEEN), arm=ArmEnd(violations=3)), "limits violated at 3 substeps"),
         (replace(trial(SEEN), left=("process 7 (x:servo)",)), "left behind: process 7 (x:servo)"),
         (trial(SEEN, found(9000, "gap", "upper", "lower.status")), "upper: gap: no fault explains it (tick 9000)"),
         (
@@ -83,8 +83,8 @@ def test_each_shortfall_is_a_line(bad: Trial, line: str) -> None:
 def test_a_task_is_safely_stopped_when_the_arm_stands_and_no_limit_was_violated() -> None:
     lost = replace(trial(SEEN), outcome=outcome("board lost", "board 'lower' ended"))
     assert Judged.of(lost).ended == "safely stopped"
-    assert Judged.of(replace(lost, arm=Arm(is_at_rest=False))).ended == "neither"
-    assert Judged.of(replace(lost, arm=Arm(violations=1))).ended == "neither"
+    assert Judged.of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
+    assert Judged.of(replace(lost, arm=ArmEnd(violations=1))).ended == "neither"
 
 
 def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -> None:
@@ -117,8 +117,8 @@ def test_a_rack_that_does_not_launch_without_a_reason_falls_short() -> None:
 
 def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
     calm = [
-        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())).finding(),
-        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())).finding(),
+        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())).result(),
+        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())).result(),
     ]
     document = Faultless("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm)).document()
     # One in half an hour: below 4.74 in that time, with 95 %.
@@ -129,9 +129,9 @@ def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
 
 
 def test_what_any_run_breaks_counts_whatever_the_run_is_for() -> None:
-    nominal = Judged.of(trial(strikes=())).finding()
-    swept = Judged.of(replace(trial(SEEN), arm=Arm(violations=2))).finding()
-    results = Results(nominal, trials=[Judged.of(trial(SEEN)).finding()], sizes=[swept])
+    nominal = Judged.of(trial(strikes=())).result()
+    swept = Judged.of(replace(trial(SEEN), arm=ArmEnd(violations=2))).result()
+    results = Results(nominal, trials=[Judged.of(trial(SEEN)).result()], sizes=[swept])
     assert sum(run.violations for run in results.runs) == 2
     assert len(results.faults) == 1
 
@@ -140,5 +140,5 @@ def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_pa
     judged, path = Judged.of(trial(SEEN, found(9000, "gap", "upper", "lower.status"))), tmp_path / "trials" / "1.json"
     assert kept(path) is None
     keep(judged, path)
-    assert kept(path) == judged.finding()
+    assert kept(path) == judged.result()
     assert [file.name for file in path.parent.iterdir()] == ["1.json"]

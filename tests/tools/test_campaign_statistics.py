@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from rack.tools.campaign.judge import Judgement
-from rack.tools.campaign.plan import EXTERNAL
-from rack.tools.campaign.statistics import by_kind, curve, part_of_bound, rate, spread, totals, wilson
-from tests.tools.campaign_events import TICK_NS
+from rack.tools.campaigns.statistics import by_kind, curve, part_of_bound, rate, spread, totals, wilson
+from rack.tools.faults.ending import EXTERNAL
+from rack.tools.faults.judge import Judgement
+from tests.tools.fault_events import TICK_NS
 
 FOUND = Judgement(
     kind="mute",

@@ -17,10 +17,10 @@ from rack.backplane.words import Demand, System
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.errors import ConfigError
-from rack.boards.faults.kinds import KINDS
+from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Failure
-from rack.tools.injecting import live
-from rack.tools.injecting.live import LiveRack
+from rack.tools.faults import live
+from rack.tools.faults.live import LiveRack
 from tests.boards.fault_racks import DRIVEN
 from tests.processes import RACK, wait_until
 
@@ -129,7 +129,7 @@ def test_the_faults_of_a_rack_are_listed(running: str) -> None:
         (["wave", "kil"], f'kind = "kil": no such kind; kinds: {", ".join(kind.name for kind in KINDS)}'),
         (["wave", "drop", "size=1"], "size = 1: drop has no such parameter; parameters: probability"),
         (["wave", "drop", "probability"], "'probability': a parameter must be key=value, as in size=0.05"),
-        (["wave", "kill", "--timeout", "1"], "--timeout is the bound of --wait; give both, or neither"),
+        (["wave", "kill", "--timeout", "1"], "--timeout needs --wait; give both, or neither"),
         (["wave"], "RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list"),
     ],
     ids=lambda given: " ".join(given) if isinstance(given, list) else "",
@@ -152,7 +152,7 @@ def test_what_cannot_be_is_one_line_that_says_what_can(running: str, words: list
         ("kill", {"tick": "0"}, "tick = 0: has passed; the rack is at tick "),
         ("kill", {"phase": "1.5"}, 'phase = "1.5": should be less than 1; '),
         ("kill", {"when": "sea"}, 'when = "sea": must be mailbox.field == value, as in "elemental_move.status.verb'),
-        ("self-test", {}, 'kind = "self-test": a rack that runs has passed its self-tests; give it in the config'),
+        ("self-test", {}, 'kind = "self-test": a running rack has passed its self-tests; give it in the config'),
         ("hog", {}, "for: missing; a hog must have an end: --for or --cycles"),
     ],
 )
@@ -193,7 +193,7 @@ def test_the_help_lists_every_kind_with_its_means_bound_and_parameters() -> None
     for kind in KINDS:
         line = next(line for line in shown.splitlines() if line.startswith(f"{kind.name} "))
         assert kind.means in line
-        assert kind.bound in line
+        assert str(kind.bound) in line
         for parameter in kind.parameters:
             assert any(line.split()[:2] == [kind.name, parameter.name] for line in shown.splitlines())
     listed = json.loads(rack("inject", "--list", "--json").stdout)

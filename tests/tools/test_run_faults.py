@@ -48,11 +48,11 @@ def test_a_run_with_a_script_repeats_with_its_faults(small: Path, rack_name: str
     ("script", "line"),
     [
         ("noisy", f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'),
-        ("[[fault]]\nkind = 'kill'", "fault[0].board: missing; task concerned"),
+        ("[[fault]]\nkind = 'kill'", "fault[0].board: missing; task to strike"),
         ("[[fault]]\nkind = 'kill'\nboard = 'servo'", 'fault[0].board = "servo": no such task; tasks: upper, lower'),
         ("[[fault]]\nkind = 'hog'\nboard = 'lower'", 'fault[0].kind = "hog": hog needs real time: in lockstep time'),
         ("[[fault]\n", "script.toml: not TOML: "),
-        ("[run]\n", "script.toml: run: a script of faults holds [[fault]] tables and nothing else"),
+        ("[run]\n", "script.toml: run: a fault script contains [[fault]] tables and nothing else"),
     ],
 )
 def test_a_script_that_does_not_fit_is_refused_before_anything_starts(

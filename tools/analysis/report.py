@@ -26,7 +26,7 @@ from rack.levels.timing.trace_times import (
     residual_ns,
 )
 from rack.tools.analysis.report_markdown import markdown
-from rack.tools.reporting.faults import faults
+from rack.tools.faults.judge import faults
 from rack.tools.runs.history import counted, first_difference, holds, misses, steal
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording

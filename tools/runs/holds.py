@@ -17,7 +17,7 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.events import Event
 from rack.boards.operating.command import describe
 from rack.levels.operator import Answer, Operation
-from rack.tools.campaign.ending import arm_of
+from rack.tools.faults.ending import arm_of
 
 STILL_S = 5.0
 """Simulated time without motion after which a held rack reports it as an event."""

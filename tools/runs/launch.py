@@ -14,9 +14,9 @@ from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
-from rack.tools.campaign.ending import Strike, strikes
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.faults.ending import Strike, strikes
 from rack.tools.runs.display import Display
 from rack.tools.runs.folder import EventLog
 from rack.tools.runs.holds import Standstill

@@ -13,7 +13,7 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
-from rack.boards.faults.text import describe
+from rack.boards.faults.describe import describe
 from rack.tools.runs.holds import Hold, Holds
 
 LOST = "lost"

@@ -8,7 +8,7 @@ from rack.backplane.mailbox.history import chains, digest
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System
-from rack.boards.faults.masquerade import masquerade
+from rack.boards.faults.messages import forge
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork
@@ -98,5 +98,5 @@ def test_a_damaged_message_has_no_hash_and_the_one_before_it_has(bus: Segment) -
 def test_a_forged_message_is_no_part_of_the_run(bus: Segment) -> None:
     write(bus, NAME, [1, 2, 3])
     before = chains(bus, 100)[NAME]
-    assert exit_status(fork(lambda: masquerade(bus, NAME, 6))) == 0
+    assert exit_status(fork(lambda: forge(bus, NAME, 6))) == 0
     assert chains(bus, 100)[NAME] == before

@@ -15,9 +15,9 @@ from rack.backplane.watch.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
+from rack.boards.config.faults import injections
 from rack.boards.crate.alarm_events import AlarmEvents
 from rack.boards.events import Event
-from rack.boards.faults.request import injections
 from rack.levels.robot.cell import build_cell
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack

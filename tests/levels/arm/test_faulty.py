@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.watch.alarms import Alarm
+from rack.boards.faults import KINDS
 from rack.levels.arm import FaultyLink, SimulatedArm
 from rack.levels.level import Fault
 from rack.levels.robot.cell import Cell
@@ -23,7 +24,7 @@ def linked(*faults: Fault) -> tuple[FaultyLink, SimulatedArm, list[int]]:
 
 
 def fault(kind: str, seed: int = 7, **parameters: float) -> Fault:
-    return Fault(kind, parameters, seed, 0)
+    return Fault(kind, parameters, seed, 0, KINDS[kind].step)
 
 
 HOLDING = Dynamics(cell("puma560")).terms(cell("puma560").home, np.zeros(6)).bias.copy()

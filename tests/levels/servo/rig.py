@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
+from rack.boards.faults import KINDS
 from rack.levels.level import Fault, Finding
 from rack.levels.messages import JOINT_SET_POINT
 from rack.levels.servo import ServoExecutor, ServoPlanner
@@ -99,7 +100,7 @@ class ServoRig:
 
     def inject(self, kind: str, seed: int = 5, **parameters: float) -> int:
         """Let a fault begin in the next tick, which is returned, beside those that are active."""
-        self._faults.append(Fault(kind, parameters, seed, self.rack.tick))
+        self._faults.append(Fault(kind, parameters, seed, self.rack.tick, KINDS[kind].step))
         self.servo.inject(self._faults)
         return self.rack.tick
 

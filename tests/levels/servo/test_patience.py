@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
+from rack.boards.faults import KINDS as FAULT_KINDS
 from rack.levels.level import Fault
 from rack.levels.messages import Error
 from tests.levels.arms import config
@@ -167,7 +168,7 @@ def test_nasrem_continues_after_all_sensors_were_stuck_for_half_a_second() -> No
     rack = WholeRack("nasrem")
     rack.run(4659 * 0.0025)
     servo = rack.tasks["servo"].level
-    servo.inject([Fault("sensor-stuck", {"joint": -1}, 5, 4659)])  # type: ignore[attr-defined]
+    servo.inject([Fault("sensor-stuck", {"joint": -1}, 5, 4659, FAULT_KINDS["sensor-stuck"].step)])  # type: ignore[attr-defined]
     rack.run(218 * 0.0025)
     assert rack.read("servo.status").state == State.HOLDING
     servo.inject([])  # type: ignore[attr-defined]

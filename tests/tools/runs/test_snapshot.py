@@ -12,7 +12,7 @@ from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Demand, System
 from rack.boards.config import load, wire
-from rack.boards.faults.request import injections
+from rack.boards.config.faults import injections
 from rack.tools.runs.snapshot import RackMonitor, TaskRow, joint_names
 
 FAULT = 'fault=[{ kind = "mute", board = "lower" }]'

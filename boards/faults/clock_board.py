@@ -1,0 +1,231 @@
+"""Faults as the clock's board directs them: each waits, is active, and is over, at ticks.
+
+The board also acts the faults that no task can act itself: signals to processes, forged messages, its own ticks.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+from rack.backplane.clock.driver import ClockDriver
+from rack.backplane.clock.released_task import ReleasedTask
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm
+from rack.backplane.words import Block, System
+from rack.boards.faults.kind import KINDS
+from rack.boards.faults.messages import forge
+
+OPEN = (Stage.WAITING, Stage.ACTIVE)
+PHASES = 1000
+"""Parts of a tick in which a phase is given."""
+LEAST_LATE = 0.6
+"""Least lateness of a tick that is moved, in ticks: a board calls a tick late from half a tick on."""
+
+
+class StruckRack:
+    """The rack, as the steps of the clock's board reach it.
+
+    In lockstep a process is struck between two cycles, when it has finished its release, and the run continues when its
+    end is known: so a run repeats with its faults.
+    """
+
+    def __init__(self, segment: Segment, driver: ClockDriver) -> None:
+        self.segment, self.driver = segment, driver
+        self.clock = SystemClock(segment)
+
+    def target(self, entry: FaultEntry) -> ReleasedTask | None:
+        """Return the task that a fault strikes; None for the clock."""
+        return next((task for task in self.driver.tasks if task.index == entry[Entry.TASK]), None)
+
+    def send(self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals) -> bool:
+        """Send a signal to a task's process; return False when the process is not there."""
+        if task.lost_tick >= 0:
+            return False
+        entry.acted(tick, time.monotonic_ns())
+        try:
+            os.kill(task.block[Block.PID], number)
+        except ProcessLookupError:
+            return False
+        return True
+
+
+Strike = Callable[[StruckRack, FaultEntry, int], None]
+
+
+def _nothing(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    """Do nothing."""
+
+
+@dataclass(frozen=True)
+class ClockStep:
+    """A step of the clock's board: as the fault begins, in each of its ticks, as it ends.
+
+    `is_void` says whether nothing is left of a fault before its time.
+    """
+
+    begin: Strike = _nothing
+    during: Strike = _nothing
+    end: Strike = _nothing
+    is_void: Callable[[StruckRack, FaultEntry], bool] = lambda rack, entry: False
+
+
+def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    task = rack.target(entry)
+    if task is None:
+        # The clock itself: the next clock finds the entry struck.
+        entry.acted(tick, time.monotonic_ns())
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif rack.send(entry, tick, task, signal.SIGKILL):
+        rack.driver.await_state(lambda: task.lost_tick >= 0)
+
+
+def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    task = rack.target(entry)
+    if task is not None and rack.send(entry, tick, task, signal.SIGSTOP):
+        task.is_stopped = True
+
+
+def _continue(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    task = rack.target(entry)
+    if task is not None and task.is_stopped and task.lost_tick < 0:
+        with suppress(ProcessLookupError):
+            os.kill(task.block[Block.PID], signal.SIGCONT)
+        task.is_stopped = False
+        rack.driver.settle()
+
+
+def _is_lost(rack: StruckRack, entry: FaultEntry) -> bool:
+    task = rack.target(entry)
+    return task is not None and task.lost_tick >= 0
+
+
+def _masquerade(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    entry.acted(tick, time.monotonic_ns())
+    forge(rack.segment, rack.segment.layout.mailboxes[entry[Entry.MAILBOX]].name, tick)
+
+
+def _stop_clock(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    entry.acted(tick, time.monotonic_ns())
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def _skip(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    entry.acted(tick, time.monotonic_ns())
+    rack.driver.skip = int(entry.parameters[0])
+
+
+def _delay(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+    entry.acted(tick, time.monotonic_ns())
+    part = random.Random(entry[Entry.SEED] + tick).uniform(LEAST_LATE, entry.parameters[0])
+    until = rack.clock.time_of(tick) + int(part * rack.clock.period_ns)
+    # Ticks are moved by less than a tick: the grid itself stays.
+    time.sleep(max(0, until - time.monotonic_ns()) * 1e-9)
+
+
+KILL = ClockStep(_kill)
+HANG = ClockStep(_hang, end=_continue, is_void=_is_lost)
+MASQUERADE = ClockStep(_masquerade)
+CLOCK_STOP = ClockStep(_stop_clock)
+CLOCK_SKIP = ClockStep(_skip)
+CLOCK_JITTER = ClockStep(during=_delay)
+ELSEWHERE = ClockStep()
+"""The step of a fault that another process acts."""
+
+
+def _step(entry: FaultEntry) -> ClockStep:
+    step = KINDS[entry[Entry.KIND]].step
+    return step if isinstance(step, ClockStep) else ELSEWHERE
+
+
+class FaultStage:
+    """Begins faults and ends them, at ticks, before anything of the tick is released.
+
+    In real time a fault with a phase strikes within its tick, after the releases.
+    """
+
+    def __init__(self, segment: Segment, driver: ClockDriver) -> None:
+        self._segment, self._words = segment, segment.words
+        self._rack, self._table, self._alarms = StruckRack(segment, driver), FaultTable(segment), driver.alarms
+        self._observers: dict[int, Reader] = {}
+        self._injected = 0
+        self._open: list[FaultEntry] = []
+        self._phased: list[FaultEntry] = []
+
+    @property
+    def is_quiet(self) -> bool:
+        """True when no fault waits or is active: there is nothing to do in this tick."""
+        return not self._open and self._words[System.INJECTED] == self._injected
+
+    def advance(self, tick: int) -> None:
+        """Begin the faults that are due at `tick`, and end those that are over."""
+        self._injected = self._words[System.INJECTED]
+        self._open = self._table.staged(OPEN)
+        over = [entry for entry in self._open if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)]
+        due = [entry for entry in self._open if entry.stage == Stage.WAITING and self._is_due(entry, tick)]
+        if over or due:
+            # Every cycle under way ends as it began, with the faults of its beginning.
+            self._rack.driver.settle()
+        for entry in over:
+            self._finish(entry, tick)
+        for entry in due:
+            self._begin(entry, tick)
+        for entry in self._open:
+            if entry.stage == Stage.ACTIVE:
+                _step(entry).during(self._rack, entry, tick)
+
+    def within(self, tick: int) -> None:
+        """Strike the faults that have a phase in `tick`, at their times; to be called after the releases."""
+        clock = self._rack.clock
+        for entry in sorted(self._phased, key=lambda e: e[Entry.PHASE]):
+            at = clock.time_of(tick) + entry[Entry.PHASE] * clock.period_ns // PHASES
+            time.sleep(max(0, at - time.monotonic_ns()) * 1e-9)
+            _step(entry).begin(self._rack, entry, tick)
+        self._phased.clear()
+
+    def _is_over(self, entry: FaultEntry, tick: int) -> bool:
+        kind = KINDS[entry[Entry.KIND]]
+        has_acted = kind.once and kind.is_of_task and entry[Entry.COUNT] > 0
+        return entry[Entry.UNTIL] <= tick or has_acted or _step(entry).is_void(self._rack, entry)
+
+    def _is_due(self, entry: FaultEntry, tick: int) -> bool:
+        """Say whether a fault begins; its condition is read in every tick, so that each read sees what is new."""
+        if entry[Entry.WHEN_BOX] < 0:
+            return entry[Entry.FROM] <= tick
+        box = entry[Entry.WHEN_BOX]
+        spec = self._segment.layout.mailboxes[box]
+        if box not in self._observers:
+            self._observers[box] = open_observer(self._segment, spec.name)
+        reading = self._observers[box].read(tick)
+        field = spec.fields[entry[Entry.WHEN_FIELD]].name
+        return reading.is_there and int(getattr(reading.value, field)) == entry[Entry.WHEN_VALUE]
+
+    def _begin(self, entry: FaultEntry, tick: int) -> None:
+        words, kind = entry.words, KINDS[entry[Entry.KIND]]
+        words[Entry.FROM] = tick
+        lasts = entry[Entry.TICKS]
+        # A task acts such a fault in its next cycle, whenever that comes.
+        is_over_at_once = kind.once and not kind.is_of_task
+        words[Entry.UNTIL] = tick + 1 if is_over_at_once else tick + lasts if lasts else NEVER
+        words[Entry.STAGE] = Stage.ACTIVE
+        self._words[System.FAULTS] += 1
+        self._alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)
+        if entry[Entry.PHASE] and not self._rack.clock.is_lockstep:
+            self._phased.append(entry)
+        else:
+            _step(entry).begin(self._rack, entry, tick)
+
+    def _finish(self, entry: FaultEntry, tick: int) -> None:
+        entry.words[Entry.STAGE] = Stage.OVER
+        self._words[System.FAULTS] += 1
+        _step(entry).end(self._rack, entry, tick)
+        self._alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry[Entry.COUNT])

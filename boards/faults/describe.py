@@ -1,0 +1,74 @@
+"""An entry of the fault table in words, and as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.fault_table import NEVER, Entry, FaultEntry, Stage
+from rack.backplane.layout import Layout
+from rack.boards.faults.kind import KINDS
+
+ALL_JOINTS = "all joints"
+
+
+def board_of(entry: FaultEntry, layout: Layout) -> str:
+    """Return the task that a fault strikes; "clock" for the clock."""
+    return CLOCK if entry[Entry.TASK] < 0 else layout.tasks[entry[Entry.TASK]].name
+
+
+def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
+    """Return the mailbox or the joint that a fault is about; empty when it is about its task alone."""
+    if entry[Entry.MAILBOX] >= 0:
+        return layout.mailboxes[entry[Entry.MAILBOX]].name
+    joint = KINDS[entry[Entry.KIND]].values(entry).get("joint")
+    return "" if joint is None else joint_name(int(joint), joints)
+
+
+def joint_name(at: int, joints: Sequence[str]) -> str:
+    """Return the name of the joint at that place; -1 is all of them."""
+    if at < 0:
+        return ALL_JOINTS
+    return joints[at] if at < len(joints) else f"joint {at}"
+
+
+def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
+    """Return an entry as plain data: unknown ticks are -1, an unknown `until` is None."""
+    kind, stage = KINDS[entry[Entry.KIND]], entry.stage
+    has_begun = stage in (Stage.ACTIVE, Stage.OVER)
+    return {
+        "fault": entry.index,
+        "kind": kind.name,
+        "board": board_of(entry, layout),
+        "mailbox": layout.mailboxes[entry[Entry.MAILBOX]].name if entry[Entry.MAILBOX] >= 0 else "",
+        "parameters": kind.values(entry),
+        "text": describe(entry, layout, joints),
+        "stage": stage.name.lower(),
+        "begins": entry[Entry.FROM],
+        "until": entry[Entry.UNTIL] if has_begun and entry[Entry.UNTIL] != NEVER else None,
+        "ticks": entry[Entry.TICKS],
+        "struck_tick": entry[Entry.STRUCK_TICK],
+        "acted": entry[Entry.COUNT],
+    }
+
+
+def describe(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
+    """Return a fault as one line: its kind, target and parameters."""
+    return _text(entry, layout, joints, f" of {board_of(entry, layout)}")
+
+
+def describe_kind(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
+    """Return a fault as one line without its target: its kind and parameters."""
+    return _text(entry, layout, joints, "")
+
+
+def _text(entry: FaultEntry, layout: Layout, joints: Sequence[str], target: str) -> str:
+    kind = KINDS[entry[Entry.KIND]]
+    about = [subject_of(entry, layout, joints)]
+    for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
+        if parameter.name != "joint":
+            unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"
+            about.append(f"{parameter.name} {value:g}{unit}")
+    details = ", ".join(text for text in about if text)
+    return f"{kind.name}{target}{f' ({details})' if details else ''}"

@@ -1,0 +1,145 @@
+"""Faults of one task: on its messages, in its computing time, in what it drives, and on its core."""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import monotonic_ns
+from typing import Protocol
+
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.layout import TaskSpec
+from rack.backplane.process import pin
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block
+from rack.boards.faults.kind import KINDS
+from rack.levels.level import Executor, Fault, Planner
+
+LEAST_S = 0.001
+"""Least time between two looks of a hog that waits."""
+LOOK_S = 0.05
+"""Longest time until a hog that waits for its tick looks whether it is still wanted."""
+
+
+@dataclass(frozen=True)
+class ExtraComputing:
+    """Computing time beyond a task's own, added to its cycle. `until` is the kind's step."""
+
+    entry: FaultEntry
+    spec: TaskSpec
+    clock: SystemClock
+    until: LoadStep
+
+    def burn(self, tick: int) -> None:
+        """Compute for as long as the fault says."""
+        now = monotonic_ns()
+        self.entry.acted(tick, now)
+        end = self.until(self, tick, now)
+        while monotonic_ns() < end:
+            pass
+
+    def cycles_ns(self, cycles: float) -> int:
+        """Return the length of so many cycles of the task."""
+        return int(cycles * self.spec.every * self.clock.period_ns)
+
+
+LoadStep = Callable[[ExtraComputing, int, int], int]
+"""Takes the tick and the time now, CLOCK_MONOTONIC; returns the time at which computing ends."""
+
+
+def overrun(load: ExtraComputing, tick: int, now: int) -> int:
+    """Let an executor take so many cycles longer, or a random part of that."""
+    by, is_random, *_ = load.entry.parameters
+    part = random.Random(load.entry[Entry.SEED] + tick).random() if is_random else 1.0
+    return now + load.cycles_ns(part * by)
+
+
+def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
+    """Let a planner exceed its time slice by so many cycles."""
+    slice_end = load.clock.time_of(tick + load.spec.every * load.spec.within_cycles)
+    return max(now, slice_end) + load.cycles_ns(load.entry.parameters[0])
+
+
+class Outputs(Protocol):
+    """The ports through which a task writes."""
+
+    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
+        """Write with these faults, by kind, from now on."""
+
+
+class TaskFaults:
+    """Keeps a task's active faults in force. `loads` are those of its computing time."""
+
+    def __init__(self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner) -> None:
+        self._table = FaultTable(segment)
+        self._spec, self._outputs, self._level = spec, outputs, level
+        self._clock = SystemClock(segment)
+        self._arm: list[FaultEntry] = []
+        self.loads: list[ExtraComputing] = []
+
+    def refresh(self) -> int:
+        """Take over the faults that are active now; return the generation of the table that was seen."""
+        generation = self._table.generation
+        active = [(KINDS[entry[Entry.KIND]], entry) for entry in self._table.active(self._spec.name)]
+        self.loads = [
+            ExtraComputing(entry, self._spec, self._clock, kind.step)
+            for kind, entry in active
+            if kind.where == "load" and callable(kind.step)
+        ]
+        self._outputs.apply([(kind.name, entry) for kind, entry in active if kind.where in ("writer", "lock")])
+        arm = [(kind, entry) for kind, entry in active if kind.where == "arm"]
+        self._arm = [entry for _, entry in arm]
+        if isinstance(self._level, Executor):
+            faults = [Fault(k.name, k.values(e), e[Entry.SEED], e[Entry.FROM], k.step) for k, e in arm]
+            self._level.inject(faults)
+        return generation
+
+    def burn(self, tick: int) -> None:
+        """Compute for as long as the faults of computing time say."""
+        for load in self.loads:
+            load.burn(tick)
+
+    def count(self, places: Sequence[int], tick: int) -> None:
+        """Count that the arm's faults at these places of the injected sequence have acted."""
+        now = monotonic_ns()
+        for place in places:
+            self._arm[place].acted(tick, now)
+
+
+def take_core(segment: Segment, entry: FaultEntry) -> None:
+    """Wait until the clock begins the fault, then keep the core of its board busy until the fault is over: a hog.
+
+    To be called in a process of its own. Raises `PermissionError` where real-time priorities are refused: an ordinary
+    process takes no core from a board.
+    """
+    task = segment.layout.tasks[entry[Entry.TASK]]
+    block, clock = segment.block(task.name), SystemClock(segment)
+    pin(block[Block.CORE])
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(99, block[Block.PRIORITY] + 1)))
+    while entry.stage == Stage.WAITING and not clock.is_stopped:
+        wait_ns = clock.time_of(max(entry[Entry.FROM], clock.tick + 1)) - time.monotonic_ns()
+        # On the clock's grid: the first tick at which the fault can begin, or the next one. Where that has passed
+        # already, and before the start, it sleeps: at this priority no other process would get to run.
+        time.sleep(min(wait_ns * 1e-9 if wait_ns > 0 else LEAST_S, LOOK_S))
+    end = clock.time_of(entry[Entry.UNTIL])
+    entry.acted(clock.now(), time.monotonic_ns())
+    while time.monotonic_ns() < end and not clock.is_stopped:
+        pass
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def act_on_core(segment: Segment, entry: FaultEntry) -> None:
+    """Run the step of a fault that acts from another process on the task's core."""
+    step = KINDS[entry[Entry.KIND]].step
+    assert callable(step), "a fault of a core has a function"
+    step(segment, entry)
+
+
+def hog(segment: Segment, index: int) -> int:
+    """Act the fault at that place of the fault table, in a process forked by the crate; return the exit status."""
+    act_on_core(segment, FaultTable(segment).entries[index])
+    return 0

@@ -1,0 +1,124 @@
+"""Faults of what a level drives: the steps that spoil its samples, its motors and its commands.
+
+A level names in `Executor.faults` the classes of steps that it lets act. Any kind of fault whose step is of such a
+class can then strike it: a new kind needs no change of the level. The steps here are the project's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.level import Fault
+
+Array = NDArray[np.float64]
+Key = tuple[str, int, int, int]
+Sample = Any
+"""A `rack.levels.arm.Sensed`; the arm's room, which loads MuJoCo, is not imported here."""
+
+APART = np.array([[1e-2], [1e-2]])
+"""Distance from the truth, rad and rad/s, from which a stuck sensor counts as wrong: while a joint only creeps, that
+need not be noticed before the joint has moved so far."""
+
+
+@dataclass(frozen=True)
+class ActiveFault:
+    """An injected fault. `place` is its place among those injected; `joints` (joints,) is True where it strikes.
+
+    `every` is the level's cycle in ticks; `kept` holds the first sample of each fault, by key.
+    """
+
+    place: int
+    fault: Fault
+    joints: NDArray[np.bool_]
+    every: int
+    kept: dict[Key, Sample]
+
+    @cached_property
+    def key(self) -> Key:
+        """Identify the fault, also after the set of injected faults has changed."""
+        return (self.fault.kind, self.fault.seed, self.fault.since, int(self.joints.argmax()))
+
+    def __getitem__(self, parameter: str) -> float:
+        """Return a parameter of the fault."""
+        return self.fault.parameters[parameter]
+
+    def draw(self, tick: int) -> np.random.Generator:
+        """Return the random numbers of one tick: a restarted board draws the same."""
+        return np.random.default_rng((self.fault.seed, tick))
+
+    def first(self, sample: Sample) -> Sample:
+        """Return the sample with which the fault began."""
+        if self.key not in self.kept:
+            copy = sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
+            self.kept[self.key] = copy
+        return self.kept[self.key]
+
+
+@dataclass(frozen=True)
+class SensorStep:
+    """Spoils a sample. `act` returns the spoilt sample, and whether it differs from the truth."""
+
+    act: Callable[[Sample, ActiveFault], tuple[Sample, bool]]
+
+
+@dataclass(frozen=True)
+class MotorStep:
+    """Weakens motors. `part` returns the part of its torque limit that a motor still gives, 0 to 1."""
+
+    part: Callable[[ActiveFault], float]
+
+
+@dataclass(frozen=True)
+class CommandStep:
+    """Corrupts torques on their way to the arm. `act` takes torques and limits, N m, and returns torques (joints,)."""
+
+    act: Callable[[Array, Array, ActiveFault], Array]
+
+
+def _with_position(sample: Sample, position: Array, fault: ActiveFault) -> tuple[Sample, bool]:
+    return sample._replace(position=position), bool(fault.joints.any())
+
+
+def position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+    """Make positions NaN."""
+    return _with_position(sample, np.where(fault.joints, np.nan, sample.position), fault)
+
+
+def position_biased(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+    """Add `size`, rad, to positions."""
+    return _with_position(sample, sample.position + fault["size"] * fault.joints, fault)
+
+
+def position_noisy(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+    """Add noise of standard deviation `size`, rad, to positions."""
+    noise = fault["size"] * fault.draw(sample.tick).standard_normal(len(fault.joints))
+    return _with_position(sample, sample.position + noise * fault.joints, fault)
+
+
+def sample_missing(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+    """Repeat the sample of the cycle before the fault."""
+    first = fault.first(sample)
+    return first._replace(tick=first.tick - fault.every), True
+
+
+def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+    """Keep positions and velocities as they were when the fault began."""
+    first, truth = fault.first(sample), (sample.position, sample.velocity)
+    stuck = np.where(fault.joints, (first.position, first.velocity), truth)
+    return sample._replace(position=stuck[0], velocity=stuck[1]), bool((np.abs(stuck - truth) > APART).any())
+
+
+def torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:
+    """Make torques NaN."""
+    return np.full_like(torque, np.nan)
+
+
+def torque_excessive(torque: Array, limits: Array, fault: ActiveFault) -> Array:
+    """Ask for `factor` times the limit, in the direction of the torque."""
+    return fault["factor"] * np.copysign(limits, torque)

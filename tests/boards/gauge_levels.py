@@ -1,0 +1,67 @@
+"""A user's own level, with an enum of its own in its status and a kind of fault of its own: one record."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from wave_levels import Watch
+
+from rack.backplane.message import Field, State, status
+from rack.backplane.watch.alarms import Alarm
+from rack.boards.faults import KINDS, Kind, Parameter
+from rack.boards.faults import drawing as draw
+from rack.boards.faults.bounds import DELIVERY, writes
+from rack.boards.faults.messages import MessageStep, Outgoing
+from rack.levels.level import Executor, Ports
+
+OPENS_AT = 40
+
+
+class Valve(IntEnum):
+    """State of the valve."""
+
+    SHUT = 0
+    OPEN = 3
+
+
+class LoseEvery(MessageStep):
+    """Loses every n-th message."""
+
+    def send(self, message: Outgoing) -> None:
+        """Lose a message whose turn it is."""
+        if message.released // self.writer.spec.every % round(self.entry.parameters[0]) == 0:
+            self.acts(message)
+            self.writer.lose()
+        else:
+            self.onward(message)
+
+
+KINDS.add(
+    Kind(
+        name="lose-every",
+        where="writer",
+        means="every n-th message is lost",
+        step=LoseEvery,
+        parameters=(Parameter("n", "messages", "the n", 4, 2, 8, is_whole=True, drawn=draw.whole(2, 4)),),
+        detected_as=(Alarm.GAP,),
+        bound=writes(1) + DELIVERY,
+        lasts=draw.messages(8, 12),
+    )
+)
+
+
+class Gauge(Executor):
+    """Opens its valve at a tick."""
+
+    outputs = {"status": status("gauge", 1, Field("valve", "u1", Valve, "its valve"), Field("value", "f8", "1", "0"))}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Say how the valve is."""
+        write.status.state = State.EXECUTING
+        write.status.valve = Valve.OPEN if tick >= OPENS_AT else Valve.SHUT
+
+
+class GaugeWatch(Watch):
+    """Reads the gauge."""
+
+    inputs = {"status": Watch.inputs["status"]._replace(type=Gauge.outputs["status"])}

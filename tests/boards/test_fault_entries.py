@@ -1,0 +1,145 @@
+"""From faults of a config to entries of the fault table: ticks, indices, seeds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
+from rack.backplane.message import State
+from rack.backplane.segment import Segment, unlink
+from rack.boards.config import wire
+from rack.boards.config.faults import injection, injections
+from rack.boards.errors import ConfigError
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.describe import describe, document
+from rack.boards.faults.kind import KINDS
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import rack
+
+
+def injected(config: MakeConfig, *faults: dict[str, Any]) -> tuple[Injection, ...]:
+    found = rack(config, *faults)
+    return injections(found, wire(found))
+
+
+@pytest.mark.parametrize(
+    ("begin", "tick"),
+    [({}, -1), ({"tick": 40}, 40), ({"tick": 0}, 0), ({"at": 0.1}, 40), ({"at": 0.1012}, 40), ({"at": 0.1013}, 41)],
+)
+def test_a_fault_begins_at_a_tick_or_at_the_tick_nearest_to_its_time(
+    config: MakeConfig, begin: dict[str, Any], tick: int
+) -> None:
+    (found,) = injected(config, {"kind": "kill", "board": "wave", **begin})
+    assert found.tick == tick
+
+
+@pytest.mark.parametrize(
+    ("board", "end", "ticks"),
+    [
+        ("wave", {}, 0),
+        ("wave", {"for": "50ms"}, 20),
+        ("wave", {"for": "1ms"}, 1),
+        ("wave", {"cycles": 3}, 3),
+        ("watch", {"cycles": 3}, 24),
+        # A plan takes four cycles of its planner.
+        ("wave.planner", {"cycles": 3}, 12),
+    ],
+)
+def test_a_fault_lasts_for_a_time_or_for_cycles_of_its_task(
+    config: MakeConfig, board: str, end: dict[str, Any], ticks: int
+) -> None:
+    (found,) = injected(config, {"kind": "mute", "board": board, **end})
+    assert found.ticks == ticks
+
+
+def test_targets_are_places_in_the_layout(config: MakeConfig) -> None:
+    faults = [
+        {"kind": "mute", "board": "watch", "mailbox": "watch.status"},
+        {"kind": "clock-skip", "board": "clock", "ticks": 3},
+        {"kind": "mute", "board": "wave"},
+    ]
+    layout = wire(rack(config))
+    first, second, third = injected(config, *faults)
+    assert (layout.tasks[first.task].name, layout.mailboxes[first.mailbox].name) == ("watch", "watch.status")
+    assert (second.task, second.mailbox, second.parameters) == (-1, -1, (3.0,))
+    assert (layout.tasks[third.task].name, third.mailbox) == ("wave", -1)
+
+
+def test_a_forged_message_goes_to_the_first_mailbox_that_is_read(config: MakeConfig) -> None:
+    (found,) = injected(config, {"kind": "masquerade", "board": "wave.planner"})
+    assert wire(rack(config)).mailboxes[found.mailbox].name == "wave.plan"
+
+
+@pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
+def test_a_condition_is_a_number_or_the_name_of_one(config: MakeConfig, value: str) -> None:
+    (found,) = injected(config, {"kind": "kill", "board": "wave", "when": f"watch.status.state=={value}"})
+    layout = wire(rack(config))
+    assert found.when is not None
+    box, field, number = found.when
+    assert (layout.mailboxes[box].name, layout.mailboxes[box].fields[field].name) == ("watch.status", "state")
+    assert number == State.DONE
+
+
+def test_verbs_of_elemental_moves_have_names() -> None:
+    from rack.boards.config import load
+
+    setting = 'fault=[{ kind = "kill", board = "servo", when = "elemental_move.status.verb == grasp" }]'
+    config = load("nasrem", [setting])
+    (found,) = injections(config, wire(config))
+    assert found.when is not None
+    assert found.when[2] == 4
+
+
+def test_parameters_stand_in_the_order_of_their_kind(config: MakeConfig) -> None:
+    (found,) = injected(config, {"kind": "sensor-bias", "board": "driven", "joint": 3})
+    assert found.parameters == (3.0, 0.02)
+    (found,) = injected(config, {"kind": "overrun", "board": "wave", "random": True})
+    assert found.parameters == (1.5, 1.0)
+
+
+def test_a_phase_is_cut_to_thousandths_of_a_tick(config: MakeConfig) -> None:
+    (found,) = injected(config, {"kind": "kill", "board": "wave", "phase": 0.2505})
+    assert found.phase == 250
+
+
+def test_faults_throw_dice_of_their_own_that_the_racks_seed_repeats(config: MakeConfig) -> None:
+    drop = {"kind": "drop", "board": "wave"}
+    first, second, given = injected(config, drop, drop, {**drop, "seed": 7})
+    assert first.seed != second.seed
+    assert given.seed == 7
+    assert injected(config, drop, drop)[1].seed == second.seed
+    other = rack(config, drop, settings=("seed=1",))
+    assert injections(other, wire(other))[0].seed != first.seed
+
+
+def test_one_fault_outside_a_config_is_checked_alike(config: MakeConfig) -> None:
+    found = rack(config)
+    fault = FaultConfig.model_validate({"kind": "hang", "board": "wave", "for": 0.1, "size": 1})
+    with pytest.raises(ConfigError, match=r"^size = 1: hang has no such parameter; parameters: none$"):
+        injection(fault, found, wire(found))
+
+
+def test_the_table_holds_and_tells_what_was_asked_for(config: MakeConfig, rack_name: str) -> None:
+    faults = [
+        {"kind": "corrupt", "board": "wave", "mailbox": "wave.status", "tick": 8, "cycles": 2, "bits": 5},
+        {"kind": "sensor-bias", "board": "driven", "joint": 1, "size": 0.1},
+    ]
+    found = rack(config, *faults)
+    layout = wire(found)
+    segment = Segment.create(layout, found.text())
+    try:
+        table = FaultTable(segment)
+        entries = [table.add(each) for each in injections(found, layout)]
+        assert [entry.stage for entry in entries] == [Stage.WAITING] * 2
+        assert (entries[0][Entry.KIND], entries[0][Entry.FROM]) == (KINDS["corrupt"].number, 8)
+        assert describe(entries[0], layout, ()) == "corrupt of wave (wave.status, probability 1, bits 5)"
+        assert describe(entries[1], layout, ("a", "b")) == "sensor-bias of driven (b, size 0.1 rad)"
+        assert document(entries[0], layout, ())["until"] is None
+        entries[1].words[Entry.STAGE], entries[1].words[Entry.UNTIL] = Stage.ACTIVE, NEVER
+        told = document(entries[1], layout, ("a", "b"))
+        assert (told["stage"], told["until"], told["parameters"]) == ("active", None, {"joint": 1.0, "size": 0.1})
+    finally:
+        segment.close()
+        unlink(rack_name)

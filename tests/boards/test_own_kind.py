@@ -1,0 +1,113 @@
+"""A new kind of fault is one record: listed, checked, acted, detected, drawn and judged with no other change."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rack.boards import Rack
+from rack.boards.config import wire
+from rack.boards.config.faults import injections
+from rack.boards.errors import ConfigError
+from rack.boards.faults import KINDS, Kind, Parameter
+from rack.boards.faults.bounds import cycles
+from rack.tools.inject import kinds_text
+from tests.boards.conftest import PLAIN, MakeConfig
+from tests.processes import RACK
+
+BOUND_S = 60
+MODULE = "gauge_levels"
+GAUGED = PLAIN.replace("wave_levels:Wave", f"{MODULE}:Gauge").replace("wave_levels:Watch", f"{MODULE}:GaugeWatch")
+
+
+@pytest.fixture(autouse=True)
+def _forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Forget the kind after the test: other tests go through all kinds."""
+    monkeypatch.setattr(KINDS, "_by_name", dict(KINDS._by_name))
+    monkeypatch.setattr(KINDS, "_by_number", dict(KINDS._by_number))
+    yield
+    sys.modules.pop(MODULE, None)
+
+
+def fault(keys: str) -> str:
+    return f'fault=[{{ kind = "lose-every", board = "wave", {keys} }}]'
+
+
+def test_a_kind_of_a_users_own_is_listed_with_its_bound_and_parameters(config: MakeConfig) -> None:
+    wire(config(text=GAUGED))
+    lines = [line.split("  ") for line in kinds_text() if line.startswith("lose-every ")]
+    kind, parameter = ([cell.strip() for cell in line if cell] for line in lines)
+    assert kind == ["lose-every", "every n-th message is lost", "1 write + 1 delivery"]
+    assert parameter == ["lose-every", "n", "messages", "4", "2 to 8", "the n"]
+
+
+def test_a_kind_of_a_users_own_is_checked_in_a_config(config: MakeConfig) -> None:
+    with pytest.raises(ConfigError) as error:
+        wire(config(fault("n = 9, cycles = 2, mailbox = 'sea'"), text=GAUGED))
+    assert [str(mistake) for mistake in error.value.mistakes] == [
+        "fault[0].n = 9: out of range; permitted: whole numbers 2 to 8; the n, messages",
+        "fault[0].mailbox = \"sea\": 'wave' does not write it; it writes: wave.status",
+    ]
+
+
+@pytest.mark.parametrize("valve", ["open", "OPEN", "3"])
+def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(config: MakeConfig, valve: str) -> None:
+    found = config(fault(f'cycles = 80, when = "wave.status.valve == {valve}"'), text=GAUGED)
+    layout = wire(found)
+    (injection,) = injections(found, layout)
+    assert injection.when == (0, [field.name for field in layout.mailboxes[0].fields].index("valve"), 3)
+
+
+def test_a_value_that_a_users_own_enum_lacks_lists_those_it_has(config: MakeConfig) -> None:
+    with pytest.raises(ConfigError, match="'ajar' is not a value of 'valve'; permitted: shut, open"):
+        wire(config(fault('when = "wave.status.valve == ajar"'), text=GAUGED))
+
+
+def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
+    with Rack(config(fault('cycles = 80, n = 4, when = "wave.status.valve == open"'), text=GAUGED)) as rack:
+        outcome = rack.run(1.0)
+        events = rack.events
+    assert outcome.worked
+    begins = next(event for event in events if event.kind == "fault")
+    assert (begins.tick, begins.text.partition(",")[0]) == (41, "lose-every (n 4 messages) begins")
+    detected = next(event for event in events if event.kind == "detection")
+    assert (detected.code, detected.subject) == ("gap", "wave.status")
+    assert sum(event.kind == "fault" and "acted 20 time" in event.text for event in events) == 1
+
+
+def test_a_campaign_draws_and_judges_a_kind_of_a_users_own(tmp_path: Path) -> None:
+    path, out = tmp_path / "gauge.toml", tmp_path / "campaign"
+    path.write_text(GAUGED)
+    command = [*RACK, "campaign", str(path), "--lockstep", "--injections", "2", "--kinds", "lose-every"]
+    done = subprocess.run(
+        [*command, "--seconds", "6", "--out", str(out), "--json"],
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+    report = json.loads(done.stdout)
+    assert (done.returncode, report["shortfalls"]) == (0, [])
+    figures = report["by_kind"]["lose-every"]
+    assert (figures["injected"], figures["detected"], figures["within_bound"]) == (2, 2, 2)
+    assert figures["bound"] == "1 write + 1 delivery"
+
+
+def test_two_kinds_of_one_name_are_refused() -> None:
+    with pytest.raises(ValueError, match="kind 'kill': there is one already: 'kill'"):
+        KINDS.add(Kind("kill", "process", "", (), cycles(1)))
+
+
+def test_a_kind_has_no_more_parameters_than_an_entry_of_the_fault_table_holds() -> None:
+    nine = tuple(Parameter(f"p{at}", "1", "a number", 0, 0, 1) for at in range(9))
+    with pytest.raises(ValueError, match="kind 'many': 9 parameters; at most 8"):
+        KINDS.add(Kind("many", "process", "", (), cycles(1), parameters=nine))
+
+
+def test_a_kind_that_this_process_has_not_imported_is_an_unknown_fault() -> None:
+    assert KINDS[1].name == "unknown fault"

@@ -1,1 +1,0 @@
-"""`rack campaign`: faults of all kinds at random, and what came of each."""

@@ -1,0 +1,146 @@
+"""The plan of a trial, and the targets in a rack that a plan can choose from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.boards.config.ports import all_ports
+from rack.boards.config.schema import RackConfig
+from rack.boards.config.toml import to_toml
+from rack.boards.faults.bounds import cycle_ticks
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kind import KINDS, Kind
+from rack.levels.level import Executor
+from rack.tools.console.answer import Failure
+from rack.tools.faults.ending import EXTERNAL, record_of
+
+Purpose = Literal["faults", "kills", "sizes", "nominal", "faultless"]
+
+
+@dataclass(frozen=True)
+class Kill:
+    """One SIGKILL from outside, of the process of `board`. `phase` is the part of the tick that has passed."""
+
+    board: str
+    tick: int
+    phase: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One trial. `faults` are tables as in a config; `rack run CONFIG --faults FILE` repeats a plan."""
+
+    number: int
+    purpose: Purpose
+    lockstep: bool
+    faults: tuple[Mapping[str, Any], ...] = ()
+    kills: tuple[Kill, ...] = ()
+
+    def config(self, config: RackConfig, rack: str) -> RackConfig:
+        """Return the config that runs this plan, as a rack of another name."""
+        # Only real time has a speed.
+        clock = {"mode": "lockstep", "speed": 1.0} if self.lockstep else {"mode": "realtime"}
+        faults = tuple(FaultConfig.model_validate(table) for table in self.faults)
+        return config.model_copy(
+            update={"name": rack, "clock": config.clock.model_copy(update=clock), "fault": config.fault + faults}
+        )
+
+    def toml(self, config: str) -> str:
+        """Return the faults as a file for `--faults`; kills from outside, which no file can hold, as comments."""
+        mode = " --lockstep" if self.lockstep else ""
+        lines = [f"# Trial {self.number}: rack run {config}{mode} --faults THIS_FILE"]
+        lines += [f"# {EXTERNAL}: {kill.board} at tick {kill.tick} + {kill.phase:g}" for kill in self.kills]
+        return "\n".join([*lines, "", to_toml({"fault": [dict(table) for table in self.faults]})])
+
+
+def needs_real_time(kind: str) -> bool:
+    """Say whether a kind does not exist in lockstep, or means nothing there: no time passes while a process dies."""
+    return kind == EXTERNAL or KINDS[kind].realtime
+
+
+@dataclass(frozen=True)
+class Target:
+    """A place for a fault. `cycle`, `reader`: periods in ticks of the task and of its mailbox's fastest reader."""
+
+    kind: str
+    board: str
+    cycle: int
+    mailbox: str | None = None
+    reader: int = 0
+
+    @property
+    def record(self) -> Kind:
+        """The kind's record."""
+        return record_of(self.kind)
+
+
+class Targets:
+    """The places in one rack where a fault of each kind can strike and be seen. `joints` is the number of the arm's."""
+
+    def __init__(self, config: RackConfig, layout: Layout) -> None:
+        self.layout = layout
+        self.joints = len(config.robot.joints) if config.robot is not None else 0
+        self._roles = {task.name: task.role for task in layout.tasks}
+        self._driving = {
+            ports.task: ports.kind.faults for ports in all_ports(config, []) if issubclass(ports.kind, Executor)
+        }
+        self.by_kind = {kind.name: self._of(kind) for kind in KINDS}
+        # The clock's process can be killed like any other.
+        self.by_kind[EXTERNAL] = [Target(EXTERNAL, task, self._cycle(task)) for task in [*self._roles, CLOCK]]
+
+    def _of(self, kind: Kind) -> list[Target]:
+        if kind.takes_mailbox:
+            return [self._at(kind, box) for box in self.layout.mailboxes if self._is_seen(kind, box)]
+        return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
+
+    def _tasks(self, kind: Kind) -> list[str]:
+        if kind.where == "clock":
+            return [CLOCK]
+        if kind.where == "arm":
+            return [task for task, steps in self._driving.items() if isinstance(kind.step, steps)]
+        return [task for task, role in self._roles.items() if role in kind.tasks]
+
+    def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
+        """Say whether the mailbox has readers, and messages often enough: plans are not periodic."""
+        # The clock writes only for an operator.
+        if not box.readers or box.writer == CLOCK or (kind.where == "lock" and box.protocol != "lock"):
+            return False
+        role = self._roles[box.writer]
+        return role in kind.tasks and (kind.where != "writer" or role == "executor")
+
+    def _at(self, kind: Kind, box: MailboxSpec) -> Target:
+        reader = min(cycle_ticks(self.layout, task) for task in box.readers)
+        return Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader)
+
+    def _cycle(self, task: str) -> int:
+        return cycle_ticks(self.layout, task)
+
+
+def kinds_for(wanted: str | None, targets: Targets, realtime: bool) -> list[str]:
+    """Return the kinds of a campaign, `wanted` as in "kill,mute"; None: all that the rack can have.
+
+    Raises `Failure` for an unknown kind, or one that the rack cannot have.
+    """
+    known = {kind.name: kind.realtime for kind in KINDS} | {EXTERNAL: False}
+    permitted = [name for name, needs in known.items() if (realtime or not needs) and targets.by_kind[name]]
+    if wanted is None:
+        return permitted
+    named = [name.strip() for name in wanted.split(",") if name.strip()]
+    for name in named:
+        if name not in permitted:
+            raise Failure(f"--kinds {name}: {_why_not(name, known, realtime)}; kinds: {', '.join(permitted)}", 2)
+    if not named:
+        raise Failure(f"--kinds: names no kind; kinds: {', '.join(permitted)}", 2)
+    return list(dict.fromkeys(named))
+
+
+def _why_not(name: str, known: Mapping[str, bool], realtime: bool) -> str:
+    if name not in known:
+        return "no such kind"
+    if known[name] and not realtime:
+        return f"{name} needs real time, and the campaign is in lockstep"
+    return "nothing in this rack can have it"

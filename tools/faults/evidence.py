@@ -1,0 +1,178 @@
+"""Events as evidence of faults: which event can be the detection of which fault, and the reactions to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.watch.alarms import Alarm
+from rack.boards.events import Event
+from rack.boards.faults.describe import ALL_JOINTS
+from rack.boards.faults.kind import DIED, Where
+from rack.tools.faults.ending import Strike
+
+FOUND = ("detection", "miss", DIED)
+"""Kinds of events that can be a detection."""
+MAILBOX_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.LOCKED}
+CLOCK_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE}
+TASK_ALARMS = {alarm.name.lower() for alarm in (Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED)}
+BRAKES = "brakes_closed"
+LATCHED = "latched"
+"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
+COLLISION = Alarm.COLLISION.name.lower()
+"""Code of the detection to which brakes in the same tick are a reaction; they are none to a fault then."""
+UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
+"""Reactions, and the recovery that undoes each."""
+TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
+"""Places of faults that keep boards from their cycles."""
+
+
+@dataclass(frozen=True)
+class Detection:
+    """An event that reports a fault: how long after it struck, and the time permitted (None: no bound).
+
+    `delay` and `bound` are ticks; ticks that the clock itself skipped did not happen and are not counted. `delay_ms` is
+    wall-clock time, None in lockstep, where it means nothing. `bound_ms` is the bound of a death in real time, and then
+    the only one.
+    """
+
+    event: Event
+    delay: int
+    bound: int | None
+    delay_ms: float | None = None
+    bound_ms: float | None = None
+
+    @property
+    def is_within(self) -> bool:
+        """Whether the fault was found within its bound."""
+        if self.bound_ms is not None and self.delay_ms is not None:
+            return self.delay_ms <= self.bound_ms
+        return self.bound is None or self.delay <= self.bound
+
+    @property
+    def order(self) -> tuple[bool, int, float]:
+        """Key by which the best of several detections comes first: one within its bound, then the earliest."""
+        return not self.is_within, self.delay, self.delay_ms or 0.0
+
+
+def fits(event: Event, strike: Strike) -> bool:
+    """Say whether an event can be the detection of a fault: it is of its kind, about the same thing, and not before it.
+
+    A fault may strike a moment before its tick is given out; a process that reads the tick then sees the one before.
+    """
+    if event.kind not in FOUND or strike.tick < 0 or event.tick < strike.tick - (event.kind == DIED):
+        return False
+    return event.code in strike.record.codes and is_about(event, strike)
+
+
+def explains(strike: Strike, event: Event) -> bool:
+    """Say whether an event in a fault's time can come of it: as its detection, or as a consequence of its kind."""
+    follows = strike.record.consequence
+    if event.kind == "miss":
+        # A fault that takes one task's cycles may take those of any task on its core.
+        return takes_cycles(strike)
+    if event.kind == DIED:
+        return strike.board == event.board and follows.ends_process
+    if event.code in _codes(follows.arm):
+        return True
+    return event.code in _codes(follows.own).union(strike.record.codes) and is_about(event, strike)
+
+
+def _codes(alarms: Sequence[Alarm]) -> set[str]:
+    return {alarm.name.lower() for alarm in alarms}
+
+
+def is_about(event: Event, strike: Strike) -> bool:
+    """Say whether an event is about the target of a fault: its mailboxes, its task, its joint."""
+    if event.code == DIED:
+        return event.board == strike.board
+    if event.code in MAILBOX_ALARMS:
+        return event.subject in strike.mailboxes
+    if event.code in TASK_ALARMS:
+        return event.subject == strike.board
+    if event.code in CLOCK_ALARMS:
+        return strike.board == CLOCK
+    # An alarm about all joints may be about any, and the other way round.
+    return not event.subject or not strike.joint or event.subject in (strike.joint, ALL_JOINTS)
+
+
+class SkippedTicks:
+    """The ticks that the clock skipped in a run."""
+
+    def __init__(self, events: Sequence[Event]) -> None:
+        name = Alarm.CLOCK_SKIPPED.name.lower()
+        self._skips: dict[str, list[tuple[int, int]]] = {}
+        for event in events:
+            if event.kind == "miss" and event.code == name:
+                self._skips.setdefault(event.board, []).append((event.tick, int(event.value)))
+
+    def between(self, first: int, last: int) -> int:
+        """Return how many ticks after `first`, up to `last`, did not happen: as many as any one task has missed."""
+        sums = (sum(count for tick, count in skips if first < tick <= last) for skips in self._skips.values())
+        return min(max(sums, default=0), max(0, last - first))
+
+
+class Aftermath(NamedTuple):
+    """Reactions by code, whether all of them were undone, and the ticks from the strike to the last undone.
+
+    `lacking`: codes of reactions that must follow a fault of this kind, and did not; brakes that were engaged when it
+    struck cannot be engaged again.
+    """
+
+    reactions: tuple[str, ...] = ()
+    is_undone: bool = True
+    recovery: int | None = None
+    lacking: tuple[str, ...] = ()
+
+
+def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermath:
+    """Return the reactions to a fault and their end; reactions from tick `horizon` on are not to it."""
+    if strike.tick < 0:
+        return Aftermath()
+    after = [event for event in events if event.tick >= strike.tick]
+    struck = {e.tick for e in after if e.code == COLLISION}
+    to_fault = (e for e in after if e.kind == "reaction" and not (e.code == BRAKES and e.tick in struck))
+    reactions = [e for e in to_fault if e.tick < horizon and _can_react(strike, e)]
+    undone = [_undone(reaction, after) for reaction in reactions]
+    names = tuple(dict.fromkeys(event.code for event in reactions))
+    required = strike.record.consequence.reactions
+    lacking = tuple(c for c in required if c not in names and not (c == BRAKES and _are_engaged(strike.tick, events)))
+    last = max((tick for tick in undone if tick is not None), default=None)
+    if None in undone or last is None:
+        return Aftermath(names, None not in undone, None, lacking)
+    return Aftermath(names, True, last - strike.tick, lacking)
+
+
+def _can_react(strike: Strike, reaction: Event) -> bool:
+    """Say whether a reaction can be to a fault: brakes that engage for missed cycles are to one that takes cycles.
+
+    A latch is a reaction to a kind that may be latched.
+    """
+    if reaction.code == LATCHED:
+        return strike.record.consequence.latches
+    for_misses = reaction.code == BRAKES and reaction.value > 0
+    return not for_misses or takes_cycles(strike)
+
+
+def takes_cycles(strike: Strike) -> bool:
+    """Say whether a fault keeps tasks from their cycles, so that these are missed because of it."""
+    return strike.record.where in TAKE_CYCLES
+
+
+def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
+    """Say whether the brakes were engaged before a tick, and are released after it."""
+    before = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
+    undone = (_undone(event, events) for event in before)
+    return any(released is None or released > tick for released in undone)
+
+
+def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
+    """Return the tick at which a reaction was undone; None when it was not."""
+    if reaction.code == BRAKES and reaction.value > 0:
+        # They were engaged for the cycles without torque; the event comes when there is torque again.
+        return reaction.tick
+    code, board = UNDONE_BY.get(reaction.code), reaction.board if reaction.code == "restart" else None
+    later = (e for e in after if e.kind == "recovery" and e.code == code and e.tick >= reaction.tick)
+    return min((event.tick for event in later if board in (None, event.board)), default=None)

@@ -1,0 +1,314 @@
+"""The judge of faults: did each strike, was it found within its bound, reacted to, and recovered from?"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, Protocol
+
+from rack.backplane.fault_table import Injection
+from rack.backplane.layout import Layout
+from rack.boards.events import Event
+from rack.boards.faults.bounds import MEMORY_NS, RACK_NS, cycle_ticks, last_read
+from rack.boards.faults.kind import DIED
+from rack.tools.faults.ending import EXTERNAL, Strike
+from rack.tools.faults.evidence import (
+    COLLISION,
+    LATCHED,
+    MAILBOX_ALARMS,
+    Aftermath,
+    Detection,
+    SkippedTicks,
+    aftermath,
+    explains,
+    fits,
+)
+
+Seen = Literal["detected", "missed", "not struck"]
+Report = dict[str, Any]
+
+SETTLE_S = 0.25
+"""Simulated time after a fault's bounds in which its traces may still be found."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The judgement of one fault. Delays, bounds and recovery are ticks, `cycle` the ticks of the task's cycle.
+
+    `is_judged`: False for a size below the one from which its kind must be found. `recovery` is the time from the
+    strike until every reaction is undone; None: there was none, or it was not undone. `recovery_bound` is counted from
+    the strike too. `lacking` are required reactions that did not follow. `is_latched`: the kind may end the task, and
+    it did.
+    """
+
+    kind: str
+    board: str
+    mailbox: str
+    joint: str
+    size: float | None
+    began: int
+    struck: int
+    seen: Seen
+    is_judged: bool
+    cycle: int
+    found_by: str = ""
+    found_as: str = ""
+    delay: int | None = None
+    delay_ms: float | None = None
+    bound: int | None = None
+    bound_ms: float | None = None
+    is_within: bool = False
+    reactions: tuple[str, ...] = ()
+    is_recovered: bool = True
+    recovery: int | None = None
+    recovery_bound: int | None = None
+    lacking: tuple[str, ...] = ()
+    is_latched: bool = False
+
+
+@dataclass(frozen=True)
+class FaultVerdict:
+    """The judgements of a run's faults, and the detections and misses that no fault explains."""
+
+    faults: tuple[Judgement, ...]
+    unexplained: tuple[Event, ...]
+    misses: tuple[Event, ...] = ()
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """The run whose faults are judged.
+
+    `offset_ns` turns CLOCK_MONOTONIC into the events' time. `restart_s`: simulated time that a restart may take.
+    `has_failed`: the task ended with an error, as some kinds permit. `moving`: obstacles that move, and may run into an
+    arm that a fault has stopped in their way.
+    """
+
+    layout: Layout
+    offset_ns: int
+    is_lockstep: bool = False
+    restart_s: float = 2.0
+    has_failed: bool = False
+    moving: tuple[str, ...] = ()
+
+
+def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> FaultVerdict:
+    """Judge the faults of a run by its events.
+
+    One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet. A
+    fault of the arm that is over before its bound, and is not found, has not struck; nor has one whose run ends before
+    the bound of its recovery.
+    """
+    return _Judge(strikes, events, run).verdict()
+
+
+class _Judge:
+    def __init__(self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> None:
+        self._events, self._run, self._layout = events, run, run.layout
+        shown = [_shown(strike, events) for strike in strikes]
+        self._strikes = sorted(shown, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
+        self._tasks = [task.name for task in run.layout.tasks]
+        self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
+        self._skipped = SkippedTicks(events)
+        self._last = max((event.tick for event in events), default=0)
+        self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
+
+    def verdict(self) -> FaultVerdict:
+        used: set[int] = set()
+        judged = []
+        windows = [self._window(strike) for strike in self._strikes]
+        for place, strike in enumerate(self._strikes):
+            found = self._detections(strike, windows[place][1], used)
+            best = min((d for d in found if not self._is_of(d, place)), key=lambda d: d.order, default=None)
+            if best is not None:
+                used.add(id(best.event))
+            elif self._is_brief(strike):
+                strike = replace(strike, tick=-1)
+            horizon = self._horizon(place, windows[place][1])
+            judgement = self._judgement(strike, best, horizon)
+            if not judgement.is_recovered and self._last < strike.tick + (judgement.recovery_bound or 0):
+                # The run ended too early to decide: a campaign draws it again.
+                judgement = self._judgement(replace(strike, tick=-1), None, horizon)
+            judged.append(judgement)
+        stray = [event for event in self._events if self._is_stray(event, windows)]
+        detections = tuple(event for event in stray if event.kind != "miss")
+        return FaultVerdict(tuple(judged), detections, tuple(event for event in stray if event.kind == "miss"))
+
+    def _bound(self, strike: Strike, reader: str | None) -> int | None:
+        """Return the ticks within which a fault must be found, by a reader or, None, by any process."""
+        task = self._tasks.index(strike.board) if strike.board in self._tasks else -1
+        injection = strike.injection or Injection(strike.record.number, task)
+        return strike.record.bound_ticks(injection, self._layout, reader)
+
+    def _recovery(self, strike: Strike) -> int:
+        return strike.record.recovery_ticks(strike.board, self._layout, self._run.restart_s)
+
+    def _window(self, strike: Strike) -> tuple[int, int]:
+        """Return the first and the last tick at which an event may come of a fault."""
+        first = strike.tick if strike.tick >= 0 else strike.began
+        if strike.record.takes_mailbox and self._layout.task(strike.board).role == "planner":
+            # The plan's writer itself may find the fault, when it makes the next plan.
+            return first - 1, self._last
+        over = max(self._ends(strike), first + (self._bound(strike, None) or 0))
+        return first - 1, over + self._recovery(strike) + last_read(strike.mailboxes, self._layout) + self._settle
+
+    def _ends(self, strike: Strike) -> int:
+        # A task that hangs is killed as soon as that is found, however long it was to hang.
+        if strike.record.consequence.ends_process:
+            return strike.tick
+        return strike.ends if strike.ends >= 0 else self._last
+
+    def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
+        fitting = (e for e in self._events if e.tick <= until and fits(e, strike) and id(e) not in used)
+        return [self._detection(event, strike) for event in fitting]
+
+    def _is_of(self, late: Detection, place: int) -> bool:
+        """Say whether a detection, too late for one fault, is in time for one that struck after it."""
+        after = (strike for strike in self._strikes[place + 1 :] if fits(late.event, strike))
+        return not late.is_within and any(self._detection(late.event, strike).is_within for strike in after)
+
+    def _is_brief(self, strike: Strike) -> bool:
+        """Say whether a fault of the arm acted in fewer cycles than it may take to be found."""
+        if strike.tick < 0 or strike.record.where != "arm":
+            return False
+        return strike.count * self._cycles[strike.board] < (self._bound(strike, None) or 0)
+
+    def _detection(self, event: Event, strike: Strike) -> Detection:
+        delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
+        if event.code != "clock_skipped":
+            delay -= self._skipped.between(strike.tick, event.tick)
+        if event.kind == DIED:
+            # Lockstep waits for the end of a process that its own clock has killed. It knows nothing of any other, and
+            # runs as fast as it can: neither ticks nor time are a measure.
+            unbounded = self._run.is_lockstep and strike.kind == EXTERNAL
+            bound_ms = None if self._run.is_lockstep else (RACK_NS + MEMORY_NS) * 1e-6
+            return Detection(event, delay, None if unbounded else self._bound(strike, None), delay_ms, bound_ms)
+        reader = event.board if event.code in MAILBOX_ALARMS else None
+        return Detection(event, delay, self._bound(strike, reader), delay_ms)
+
+    def _delay_ms(self, event: Event, strike: Strike) -> float | None:
+        if self._run.is_lockstep:
+            return None
+        # A fault of the arm is counted after the cycle that has already found it.
+        return max(0, event.time_ns - self._run.offset_ns - strike.time_ns) * 1e-6
+
+    def _horizon(self, place: int, last: int) -> int:
+        """Return the tick up to which reactions are of this fault: the next one strikes then, or it is long over."""
+        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick]
+        return min([*later, last + 1])
+
+    def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
+        record, after = strike.record, aftermath(strike, self._events, horizon)
+        seen: Seen = "not struck" if strike.tick < 0 else "missed" if best is None else "detected"
+        bound = self._recovery_bound(strike, best)
+        is_latched = self._is_latched(strike, after)
+        is_undone = after.is_undone and (after.recovery or 0) <= bound
+        return Judgement(
+            kind=strike.kind,
+            board=strike.board,
+            mailbox=strike.mailboxes[0] if record.takes_mailbox and len(strike.mailboxes) == 1 else "",
+            joint=strike.joint,
+            size=strike.size,
+            began=strike.began,
+            struck=strike.tick,
+            seen=seen,
+            is_judged=record.visible_from is None or (strike.size or 0.0) >= record.visible_from,
+            cycle=cycle_ticks(self._layout, strike.board),
+            found_by=best.event.board if best and best.event.kind != DIED else "the Rack" if best else "",
+            found_as=(best.event.code or best.event.kind) if best else "",
+            delay=best.delay if best else None,
+            delay_ms=None if best is None or best.delay_ms is None else round(best.delay_ms, 3),
+            bound=best.bound if best else self._bound(strike, None),
+            bound_ms=best.bound_ms if best else None,
+            is_within=best is not None and best.is_within,
+            reactions=after.reactions,
+            is_recovered=is_latched or is_undone,
+            recovery=after.recovery,
+            recovery_bound=bound,
+            lacking=() if strike.tick < 0 else after.lacking,
+            is_latched=is_latched,
+        )
+
+    def _recovery_bound(self, strike: Strike, best: Detection | None) -> int:
+        """Return the ticks from a strike within which every reaction must be undone."""
+        found = best.event.tick if best is not None else strike.tick
+        over = max(self._ends(strike), found) - strike.tick
+        return over + self._recovery(strike)
+
+    def _is_latched(self, strike: Strike, after: Aftermath) -> bool:
+        """Say whether the task has ended with an error because of a fault that may end it so."""
+        may = strike.record.consequence.latches and self._run.has_failed
+        return may and LATCHED in after.reactions
+
+    def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
+        """Say whether no fault explains a detection, a death or a miss."""
+        if event.kind not in ("detection", DIED, "miss") or self._is_met(event):
+            return False
+        # An event of a task has the tick of its release, and may come of anything until the end of its cycle.
+        until = event.tick + self._cycles.get(event.board, 1) - 1
+        windowed = zip(self._strikes, windows, strict=True)
+        around = [strike for strike, (first, last) in windowed if first <= until and event.tick <= last]
+        return not any(explains(strike, event) for strike in around if strike.tick >= 0)
+
+    def _is_met(self, event: Event) -> bool:
+        """Say whether an obstacle has hit an arm that a fault has stopped, or that waits for another path since."""
+        is_moving = event.code == COLLISION and any(f"'{name}'" in event.text for name in self._run.moving)
+        return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
+
+
+def _shown(strike: Strike, events: Sequence[Event]) -> Strike:
+    """Return a fault of the arm as having struck no later than it was found.
+
+    It counts as acting from a certain difference to the truth; finding it at a smaller difference is right as well.
+    """
+    if strike.began < 0 or strike.record.where != "arm":
+        return strike
+    begun = replace(strike, tick=strike.began)
+    last = strike.tick if strike.tick >= 0 else strike.ends
+    found = min((e.tick for e in events if fits(e, begun) and (last < 0 or e.tick <= last)), default=strike.tick)
+    return strike if found == strike.tick else replace(strike, tick=found, count=max(1, strike.count))
+
+
+class Recorded(Protocol):
+    """A recorded run."""
+
+    @property
+    def events(self) -> Sequence[Mapping[str, Any]]:
+        """Its events, as plain data."""
+
+
+def faults(recording: Recorded, layout: Layout) -> Report:
+    """Return every fault injected into a run, detections that none explains, and restarts by task."""
+    events = [Event(**event) for event in recording.events if "tick" in event]
+    ended: Mapping[str, Any] = next((event for event in recording.events if event["kind"] == "outcome"), {})
+    strikes = [_strike(entry) for entry in ended.get("faults", [])]
+    is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
+    verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep))
+    restarts = Counter(event.board for event in events if event.code == "restart")
+    return {
+        # Faults that never struck come last.
+        "faults": [_row(found, layout) for found in sorted(verdict.faults, key=lambda f: (f.struck < 0, f.struck))],
+        "unexplained": [
+            {"tick": event.tick, "board": event.board, "code": event.code or event.kind, "text": event.text}
+            for event in verdict.unexplained
+        ],
+        "restarts": dict(restarts),
+    }
+
+
+def _strike(entry: Mapping[str, Any]) -> Strike:
+    injection = {**entry["injection"], "parameters": tuple(entry["injection"]["parameters"]), "when": None}
+    return Strike(**{**entry, "mailboxes": tuple(entry["mailboxes"]), "injection": Injection(**injection)})
+
+
+def _row(found: Judgement, layout: Layout) -> Report:
+    tick_ms, cycle = layout.clock_ns * 1e-6, found.cycle
+    return {
+        **asdict(found),
+        "reactions": list(found.reactions),
+        "lacking": list(found.lacking),
+        "delay_cycles": None if found.delay is None else round(found.delay / cycle, 3),
+        "bound_cycles": None if found.bound is None else round(found.bound / cycle, 3),
+        "recovery_ms": None if found.recovery is None else round(found.recovery * tick_ms, 6),
+    }

@@ -1,0 +1,177 @@
+"""Faults in a running rack: written as in a config, put into its fault table, and followed."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.process import set_priority
+from rack.backplane.segment import Segment
+from rack.backplane.words import Run, System
+from rack.boards.config import loads
+from rack.boards.config.faults import injection
+from rack.boards.config.mistakes import mistakes_of
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.config import FaultConfig, condition_text
+from rack.boards.faults.describe import describe, document
+from rack.boards.faults.kind import KINDS
+from rack.boards.faults.tasks import act_on_core
+from rack.tools.console.answer import Failure
+from rack.tools.console.tables import table
+
+BEGIN_S = 5.0
+"""Longest wait for a fault to begin at the next tick."""
+LOOK_S = 0.001
+SEEDS = 2**31
+
+
+class LiveRack:
+    """A rack by name, with its config and its fault table. Raises `SegmentError` when there is none."""
+
+    def __init__(self, rack: str) -> None:
+        self._segment = Segment.attach(rack)
+        self._config = loads(self._segment.config)
+        self._table = FaultTable(self._segment)
+        self._joints = self._config.robot.joints if self._config.robot is not None else ()
+
+    def inject(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> dict[str, Any]:
+        """Inject a fault; return it as plain data when it has begun, or, with a tick or a condition, when it is armed.
+
+        With `wait`, return when it is over. Raises `ConfigError` with every mistake, and `Failure` when it does not
+        begin, or is not over within `timeout_s` of wall-clock time.
+        """
+        if self._is_over:
+            raise Failure(f"rack '{self._segment.rack}': its run is over")
+        fault = self._fault({key: value for key, value in given.items() if value is not None})
+        checked = injection(fault, self._config, self._segment.layout)
+        self._check(fault)
+        entry = self._table.add(checked)
+        if KINDS[fault.kind].where == "core":
+            # This very process takes the core.
+            if entry.stage == Stage.WAITING:
+                print(self._state(entry), file=sys.stderr, flush=True)
+            act_on_core(self._segment, entry)
+        elif fault.tick is None and fault.when is None:
+            self._await_begin(entry)
+        if wait:
+            self._await_end(entry, timeout_s)
+        return {**self._document(entry), "told": self._state(entry)}
+
+    def withdraw(self, number: int) -> dict[str, Any]:
+        """Withdraw a fault that waits for its tick or condition; return it as plain data. Raises `Failure`."""
+        waiting = {entry.index: entry for entry in self._table.staged((Stage.WAITING,))}
+        if number not in waiting:
+            known = ", ".join(map(str, waiting)) or "none"
+            raise Failure(f"fault {number} is not waiting; waiting: {known}", 2)
+        entry = waiting[number]
+        answer = self._document(entry)
+        self._table.disarm(entry)
+        words, deadline = self._segment.words, time.monotonic() + BEGIN_S
+        tick = words[System.TICK]
+        while words[System.TICK] <= tick + 1 and not self._is_over and time.monotonic() < deadline:
+            time.sleep(LOOK_S)
+        if not self._table.free(entry):
+            raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
+        return {**answer, "stage": "free", "told": f"{answer['text']}: withdrawn"}
+
+    def faults(self) -> list[dict[str, Any]]:
+        """Return the faults injected so far, as plain data."""
+        injected = self._table.staged((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
+        return [self._document(entry) for entry in injected]
+
+    def text(self, width: int | None = None) -> Iterator[str]:
+        """Yield the faults injected so far, as a table that fits into `width`."""
+        numbers = ("begins", "struck_tick", "until", "acted")
+        rows = [
+            [
+                *(str(fault["fault"]), fault["text"], fault["stage"]),
+                *("-" if fault[key] is None or fault[key] < 0 else str(fault[key]) for key in numbers),
+                fault["waits_for"],
+            ]
+            for fault in self.faults()
+        ]
+        yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"], rows, width)
+
+    def _fault(self, given: dict[str, Any]) -> FaultConfig:
+        """Return a fault as in a config. Raises `ConfigError`."""
+        # Two faults of one run must not draw the same random numbers.
+        given.setdefault("seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS)
+        try:
+            # A command line holds text: numbers are read from it, as they are not from a config.
+            return FaultConfig.model_validate(given, strict=False)
+        except ValidationError as error:
+            raise ConfigError(mistakes_of(error, FaultConfig, given)) from None
+
+    def _check(self, fault: FaultConfig) -> None:
+        """Refuse a fault that a running rack, or this process, cannot have. Raises `ConfigError`, `Failure`."""
+        tick, where = self._segment.words[System.TICK], KINDS[fault.kind].where
+        if where == "start":
+            why = "a running rack has passed its self-tests; give it in the config or with 'rack run --faults'"
+            raise ConfigError([Mistake("kind", fault.kind, why)])
+        if fault.tick is not None and fault.tick <= tick:
+            raise ConfigError([Mistake("tick", fault.tick, f"has passed; the rack is at tick {tick}")])
+        if where != "core":
+            return
+        if fault.lasts is None and fault.cycles is None:
+            raise ConfigError([Mistake("for", None, f"missing; a {fault.kind} must have an end: --for or --cycles")])
+        if not set_priority(1):
+            raise Failure(f"{fault.kind}: SCHED_FIFO is refused to this user; no core can be taken from a board")
+        set_priority(0)
+
+    def _await_begin(self, entry: FaultEntry) -> None:
+        deadline = time.monotonic() + BEGIN_S
+        while entry.stage == Stage.WAITING:
+            if self._is_over:
+                raise Failure(f"{self._described(entry)}: the run ended before it began")
+            if time.monotonic() > deadline:
+                raise Failure(f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s")
+            time.sleep(LOOK_S)
+
+    def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
+        """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it never began."""
+        if entry.stage == Stage.WAITING:
+            print(self._state(entry), file=sys.stderr, flush=True)
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while entry.stage != Stage.OVER and not self._is_over:
+            if time.monotonic() > deadline:
+                raise Failure(f"timed out after {timeout_s:g} s: {self._state(entry)}")
+            time.sleep(LOOK_S)
+        if entry.stage == Stage.WAITING:
+            raise Failure(f"{self._described(entry)}: the run ended before it began")
+
+    def _state(self, entry: FaultEntry) -> str:
+        begun, until = entry[Entry.FROM], entry[Entry.UNTIL]
+        if entry.stage == Stage.WAITING:
+            how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
+            return f"{self._described(entry)}: armed, waits for {self._awaited(entry)}; {how}"
+        if entry.stage == Stage.OVER:
+            acted = "once" if entry[Entry.COUNT] == 1 else f"{entry[Entry.COUNT]} times"
+            return f"{self._described(entry)}: ticks {begun} to {until - 1}, acted {acted}"
+        end = "to the end of the run" if until == NEVER else f"to tick {until - 1}"
+        return f"{self._described(entry)}: from tick {begun} {end}"
+
+    def _awaited(self, entry: FaultEntry) -> str:
+        """Return the tick or the condition that a fault waits for."""
+        if entry[Entry.WHEN_BOX] < 0:
+            now = self._segment.words[System.TICK]
+            return f"tick {entry[Entry.FROM]}; the rack is at tick {now}" if entry[Entry.FROM] > 0 else "the next tick"
+        when = (entry[Entry.WHEN_BOX], entry[Entry.WHEN_FIELD], entry[Entry.WHEN_VALUE])
+        return condition_text(when, self._segment.layout)
+
+    def _document(self, entry: FaultEntry) -> dict[str, Any]:
+        """Return a fault as plain data; `waits_for` is empty once it has begun."""
+        waits_for = self._awaited(entry) if entry.stage == Stage.WAITING else ""
+        return {**document(entry, self._segment.layout, self._joints), "waits_for": waits_for}
+
+    def _described(self, entry: FaultEntry) -> str:
+        return describe(entry, self._segment.layout, self._joints)
+
+    @property
+    def _is_over(self) -> bool:
+        return self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive

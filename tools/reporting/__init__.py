@@ -1,1 +1,0 @@
-"""What a run says about itself: report.json and report.md, from its recording alone."""
