@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.algebra import each
+from rack.levels.algebra import Array, each
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import SCENE, WORLD_MODEL
 from rack.levels.tables import Positive, Table, read_params
-
-Array = NDArray[np.float64]
 
 
 class WorldParams(Table):

@@ -15,15 +15,13 @@ from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Array
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
-
-Array = NDArray[np.float64]
 
 PATIENCE_CYCLES = 2
 """Torque cycles for which motors keep the last command when none comes; then the brakes engage."""

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import mat_vec, solve
+from rack.levels.algebra import Array, mat_vec, solve
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
-
-Array = NDArray[np.float64]
 
 STANDSTILL = 0.01
 """Joint speed, rad/s, below which a joint holds its position."""

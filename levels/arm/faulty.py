@@ -10,14 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
-
-Array = NDArray[np.float64]
 
 STEPS = (SensorStep, MotorStep, CommandStep)
 """Classes of steps that act on an arm, as `Executor.faults` names them."""

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from rack.levels.robot.cell import Cell, unintended_contacts
 from rack.levels.robot.lookup import geom_name
 
-Array = NDArray[np.float64]
-
 QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
 
 

@@ -7,10 +7,9 @@ from itertools import pairwise
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.algebra import norm
+from rack.levels.algebra import Array, norm
 from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
@@ -18,8 +17,6 @@ from rack.levels.level import Finding
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import MotionConfig, SceneConfig
-
-Array = NDArray[np.float64]
 
 STRUCK_TICKS = 40
 """Ticks after a contact, or after the last limit broken since, for which the arm's motion is that of the blow."""

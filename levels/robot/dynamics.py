@@ -12,12 +12,9 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import each, gram, mat_vec, transposed_mat_vec
+from rack.levels.algebra import Array, each, gram, mat_vec, transposed_mat_vec
 from rack.levels.robot.cell import Cell
-
-Array = NDArray[np.float64]
 
 FRICTION_SPEED = 0.01
 """Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at rest would excite the arm."""

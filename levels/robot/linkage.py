@@ -15,9 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
-
-Array = NDArray[np.float64]
 
 OPENINGS = 33
 """Openings at which the linkage is solved, evenly from one end to the other."""

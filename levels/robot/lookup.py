@@ -106,9 +106,6 @@ def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int
     return np.asarray(model.body_mocapid[bodies], dtype=int)
 
 
-# ==== levels/touches.py: """Which contacts a task means, and which are touches."""
-
-
 def below(model: mujoco.MjModel, roots: NDArray[np.int_]) -> NDArray[np.bool_]:
     """Mark (nbody,) the bodies `roots` and their descendants."""
     marked = np.zeros(model.nbody, dtype=bool)

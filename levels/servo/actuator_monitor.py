@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import each, mat_vec
+from rack.levels.algebra import Array, each, mat_vec
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
-
-Array = NDArray[np.float64]
 
 NOISE_PART = 0.005
 """Part of a torque limit that the equation of motion may leave unexplained; ten times that of faultless runs."""

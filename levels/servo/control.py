@@ -6,18 +6,16 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from rack.backplane.message import Message
-from rack.levels.algebra import mat_vec
+from rack.levels.algebra import Array, mat_vec
 from rack.levels.arm import find_arm
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
 from rack.levels.tables import GripperConfig, Positive, Table
 
-Array = NDArray[np.float64]
 Reacting = Literal["hold", "stop", "brake"]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
 from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm
@@ -22,8 +21,6 @@ from rack.levels.servo.reference import Reference
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
 from rack.levels.tables import read_params
-
-Array = NDArray[np.float64]
 
 
 class ServoExecutor(Executor):

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.operator import Commands, Operation, Orders, joints_of
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
-
-Array = NDArray[np.float64]
 
 
 class OperatorControl:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.algebra import mat_vec, transposed_mat_vec
+from rack.levels.algebra import Array, mat_vec, transposed_mat_vec
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
-
-Array = NDArray[np.float64]
 
 
 class ServoPlanner(Planner):

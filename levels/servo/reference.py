@@ -10,13 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.robot.limits import Bounds, Limits
 from rack.levels.servo.curves import Curve, Decay, Hermite, Motion, Passage, Ramp
-
-Array = NDArray[np.float64]
 
 MAX_ACCELERATION = 2.0
 """Multiple of the acceleration limits that the curve between two set points may need: planned motion, interpolated,

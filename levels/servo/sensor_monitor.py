@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.servo.control import ServoParams
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FIT_RAD = 5e-5

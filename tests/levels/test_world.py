@@ -7,16 +7,15 @@ from typing import cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.messages import SCENE
 from rack.levels.world import WorldModel
 from tests.levels.arms import config
 from tests.levels.box import lose_some
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
-Array = NDArray[np.float64]
 PERIOD = 8
 TICK_S = CLOCK_NS * 1e-9
 START = np.array([[0.5, 0.3, 0.475], [0.6, 0.3, 0.475], [0.5, -0.3, 0.5]])

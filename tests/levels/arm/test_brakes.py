@@ -7,17 +7,15 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, sizes
 from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config
-
-Array = NDArray[np.float64]
 
 
 def moving(name: str = "puma560", every: int = 1) -> tuple[SimulatedArm, Cell, Callable[[], Array]]:

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.config import load, wire
 from rack.boards.errors import ConfigError
-from rack.levels.algebra import solve
+from rack.levels.algebra import Array, solve
 from rack.levels.arm import Arm, Sensed
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
@@ -21,7 +20,6 @@ from rack.levels.tables import SceneConfig
 from tests.levels.arms import pendulum
 from tests.levels.servo.rig import Course, ServoRig
 
-Array = NDArray[np.float64]
 START, GOAL = np.array([0.0, 0.5]), np.array([0.6, -0.4])
 SUBSTEPS = 10
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
+from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.arm.simulated import ObstacleMotion
@@ -21,7 +21,6 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import MotionConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
 
-Array = NDArray[np.float64]
 Torque = Callable[[int], Array]
 TICK_S = CLOCK_NS * 1e-9
 

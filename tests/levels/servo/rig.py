@@ -6,18 +6,17 @@ from collections.abc import Callable
 from typing import NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS
+from rack.levels.algebra import Array
 from rack.levels.level import Fault, Finding
 from rack.levels.messages import JOINT_SET_POINT
 from rack.levels.servo import ServoExecutor, ServoPlanner
 from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
-Array = NDArray[np.float64]
 TICK_S = CLOCK_NS * 1e-9
 PERIOD = 8
 """Ticks between set points: 50 Hz."""

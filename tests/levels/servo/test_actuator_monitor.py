@@ -7,17 +7,15 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Array
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import MAX_CONTACT_PART
 from rack.levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
 from tests.levels.arms import cell, config
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
-
-Array = NDArray[np.float64]
 
 APPROACH_S = 1.5
 
@@ -189,8 +187,6 @@ def test_a_dead_motor_is_found_where_dry_friction_changes_sign_and_hides_it() ->
     rig.run(10, motion)
     assert [tick - begun for tick in found(rig)] == [4]
 
-
-Array = NDArray[np.float64]
 
 CELL = cell("puma560")
 REST = np.zeros(6)

@@ -6,17 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import State
+from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
 from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config, pendulum
 from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
-
-Array = NDArray[np.float64]
 
 GOALS = {"puma560": [0.6, 1.0, -2.6, 0.4, -1.2, 0.5], "k1607": [0.6, -0.5, 0.3, -1.2, 0.4, -0.5, 0.5]}
 

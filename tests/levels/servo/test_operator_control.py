@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.words import Demand
+from rack.levels.algebra import Array
 from rack.levels.operator import Answer, Operation
 from tests.levels.arms import cell, config
 from tests.levels.lockstep import Operator
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
 
-Array = NDArray[np.float64]
 HOME = cell("puma560").home
 LIMITS = cell("puma560").limits
 AWAY = HOME + np.array([0.3, -0.2, 0.2, 0.1, -0.2, 0.3])

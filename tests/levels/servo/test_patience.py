@@ -6,19 +6,17 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.boards.faults import KINDS as FAULT_KINDS
+from rack.levels.algebra import Array
 from rack.levels.level import Fault
 from rack.levels.messages import Error
 from tests.levels.arms import config
 from tests.levels.servo.rig import ServoRig
 from tests.levels.whole_rack import WholeRack
-
-Array = NDArray[np.float64]
 
 ROBOT, SCENE = config("puma560")
 HOME = np.array(ROBOT.home)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.watch.alarms import Alarm
 from tests.levels.arms import config
 from tests.levels.servo.rig import Course, ServoRig
-
-Array = NDArray[np.float64]
 
 BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
 GOAL = np.array([0.6, 1.0, -2.6, 0.4, -1.2, 0.5])

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Array
 from rack.levels.level import Demand
 from rack.levels.messages import Error
 from rack.levels.tables import MotionConfig
 from tests.levels.arms import config
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
-
-Array = NDArray[np.float64]
 
 BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
 ROBOT, SCENE = config("puma560_crossing")
