@@ -1,4 +1,4 @@
-"""The backplane: one shared-memory segment a rack, its mailboxes, its clock, and the watches over them.
+"""The backplane: one shared-memory segment per rack, with its mailboxes, its clock, and the watches on them.
 
 A level's author needs `Field`, `command` and `status` to declare messages, `State` for their statuses, and `Reading`
 with its `Verdict` for input ports. A program that looks into a running rack needs the rest:

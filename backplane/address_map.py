@@ -12,7 +12,7 @@ from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 
 PAGE = 4096
 LINE = 64
-"""A cache line: blocks of two writers never share one."""
+"""Bytes of a cache line: blocks of two writers never share one."""
 
 HEAD_SIZE = PAGE
 BLOCK_WORDS = 24
@@ -20,7 +20,7 @@ BLOCK_SIZE = BLOCK_WORDS * 8
 TRACE_RECORD_SIZE = 80
 ALARM_RECORD_SIZE = 64
 ALARM_DEPTH = 256
-"""Records in an alarm ring: it is read many times a second, and an alarm rings once an episode."""
+"""Records in an alarm ring: it is read many times a second, and an alarm is raised once per episode."""
 FAULT_ENTRY_SIZE = 256
 FAULT_ENTRIES = 64
 OPERATOR_HEAD_SIZE = LINE
@@ -43,7 +43,7 @@ class Window:
 
 
 class AddressMap:
-    """Addresses of everything on one backplane; `size` is the bytes of all of it, texts not included."""
+    """Addresses of everything on one backplane; `size` is their total in bytes, without the texts."""
 
     def __init__(self, layout: Layout) -> None:
         self.windows: list[Window] = []
@@ -108,8 +108,8 @@ def mailbox_size(mailbox: MailboxSpec) -> int:
 def oldest_kept(head: int, depth: int) -> int:
     """Return the number of the oldest record in a ring that its writer cannot have begun to overwrite.
 
-    The writer is at most one record beyond its `head`. A concurrent reader copies first, then compares with the head as
-    it is by then: a copy of an older record may be half another one, and proves nothing.
+    The writer is at most one record ahead of its `head`. A concurrent reader copies first, then compares with the
+    present head: a copy of an older record may be half overwritten, and proves nothing.
     """
     return head + 2 - depth
 

@@ -1,7 +1,7 @@
-"""An exclusive kernel lock on one byte of a segment, taken at once or not at all.
+"""An exclusive, non-blocking kernel lock on one byte of a segment.
 
-Each lock has its own file description, so two holders in one process exclude each other too. It ends with its process,
-however that ends.
+Each lock has its own file description, so two holders in one process exclude each other too. The kernel releases it
+when the process ends, even if it is killed.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class ByteLock:
     def __init__(self, segment: Segment, address: int) -> None:
         self._fd = os.open(f"/proc/self/fd/{segment.fd}", os.O_RDWR | os.O_CLOEXEC)
         self._take = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
-        self._give_back = _FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, address, 1, 0)
+        self._unlock = _FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, address, 1, 0)
 
     def take(self) -> bool:
-        """Take the lock; False when another holder has it."""
+        """Take the lock; False when it is held already."""
         try:
             fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._take)
         except (BlockingIOError, PermissionError):
@@ -39,9 +39,9 @@ class ByteLock:
         kind: int = _FLOCK.unpack(fcntl.fcntl(segment.fd, fcntl.F_OFD_GETLK, asked))[0]
         return kind != fcntl.F_UNLCK
 
-    def give_back(self) -> None:
+    def release(self) -> None:
         """Release the lock; it may be taken again."""
-        fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._give_back)
+        fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._unlock)
 
     def close(self) -> None:
         """Release the lock and its descriptor; may be called again."""

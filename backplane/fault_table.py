@@ -1,8 +1,8 @@
 """The fault table: the faults injected into a rack, in shared memory, in the system controller's window.
 
-Any process may add an entry. The clock alone decides, at the beginning of a tick, which faults begin and which are
-over, so that every task of the tick sees the same and a run in lockstep repeats with its faults. The table holds
-numbers; the boards know what kinds and parameters mean.
+Any process may add an entry. Only the clock, at the beginning of a tick, decides which faults begin and end: all tasks
+of a tick see the same faults, and a run in lockstep repeats with them. The table holds numbers; `boards` knows the
+meaning of kinds and parameters.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Stage(IntEnum):
 
 
 class Entry(IntEnum):
-    """Words of an entry. While it waits, STAGE, FROM and UNTIL are the clock's; STRUCK and COUNT are of its actor."""
+    """Words of an entry. Once it waits, the clock writes STAGE, FROM and UNTIL, its actor STRUCK_* and COUNT."""
 
     STAGE = 0
     KIND = 1  # number of the kind, from its name
@@ -88,7 +88,7 @@ class FaultEntry:
         return Stage(self.words[Entry.STAGE])
 
     def acted(self, tick: int, time_ns: int) -> None:
-        """Count that the fault acts now; the first time is kept."""
+        """Count one action of the fault; keep the time of the first one."""
         if self.words[Entry.STRUCK_TICK] < 0:
             self.words[Entry.STRUCK_NS] = time_ns
             self.words[Entry.STRUCK_TICK] = tick
@@ -106,14 +106,14 @@ class FaultTable:
 
     @property
     def generation(self) -> int:
-        """Rises when a fault begins or is over: a task that has seen this number need not look again."""
+        """Rises when a fault begins or ends: a task looks at the table only when this number has changed."""
         return self._words[System.FAULTS]
 
     def add(self, injection: Injection) -> FaultEntry:
         """Fill a free entry; its fault begins when the clock finds it due. Raises `FaultTableError`."""
         lock = ByteLock(self._segment, self._segment.map.faults)
         try:
-            # This wait is bounded by the time in which another process fills an entry.
+            # Bounded by the time in which another process fills an entry.
             while not lock.take():
                 continue
             entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
@@ -126,13 +126,13 @@ class FaultTable:
         return entry
 
     def disarm(self, entry: FaultEntry) -> None:
-        """Keep a waiting fault from beginning; once the clock has given out a tick, `free` may follow."""
-        # In this order: with no condition and a tick that has passed it would begin at once.
+        """Keep a waiting fault from beginning; `free` may follow after the next tick."""
+        # In this order: without a condition and with a tick that has passed, it would begin at once.
         entry.words[Entry.FROM] = NEVER
         entry.words[Entry.WHEN_BOX] = -1
 
     def free(self, entry: FaultEntry) -> bool:
-        """Free the entry of a disarmed fault; return False when the clock has begun it before."""
+        """Free the entry of a disarmed fault; False when the clock has already begun it."""
         if entry.stage != Stage.WAITING:
             return False
         entry.words[Entry.STAGE] = Stage.FREE

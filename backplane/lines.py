@@ -8,7 +8,7 @@ from rack.backplane.words import Block, System
 
 
 class UtilityLines:
-    """The lines of one rack. SYSFAIL has a word a slot, so that every word has one writer."""
+    """The lines of one rack. SYSFAIL has one word per slot, so that every word has one writer."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
@@ -45,7 +45,7 @@ class UtilityLines:
 
     @property
     def bad_inputs(self) -> list[str]:
-        """Reasons against a reset of the latch, as text: asserted utility lines, lost boards."""
+        """Reasons why the latch must not be reset: asserted utility lines, lost boards."""
         found = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
         found += ["ACFAIL"] if self.acfail else []
         return found + [f"board '{name}' is lost" for name, block in self._blocks.items() if block[Block.LOST]]

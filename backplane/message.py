@@ -46,7 +46,7 @@ class Field:
 
 @dataclass(frozen=True)
 class MessageType:
-    """A named, versioned layout. `fields` stand in the order of their bytes.
+    """A named, versioned layout. `fields` are ordered by offset.
 
     Raises `MailboxError` for a field name that a `Message` cannot have.
     """
@@ -144,7 +144,7 @@ _CLASSES: dict[np.dtype, type[Message]] = {}
 
 
 def _class_for(dtype: np.dtype) -> type[Message]:
-    """Return the subclass of `Message` with one property a field, made once a dtype."""
+    """Return the subclass of `Message` with one property per field, made once per dtype."""
     if dtype not in _CLASSES:
         names = dtype.names or ()
         properties = {name: _property(f"_{name}", dtype[name]) for name in names}

@@ -1,11 +1,11 @@
 """The operator table: commands from outside, in shared memory, in the system controller's window.
 
 Any process may add a request, at any time. Only the clock issues it, at the beginning of a tick: it publishes the
-message in the level's mailbox, whose only writer it is. So all tasks of a tick see the same, and a run in lockstep
-repeats with its commands. The meaning of a command is defined above this level: here it is the bytes of a message.
+message in the level's mailbox, whose only writer it is. All tasks of a tick therefore see the same commands, and a run
+in lockstep repeats with them. Here a command is only the bytes of a message; `levels` defines its meaning.
 
-A request belongs to the run, or to a client that waits for it; then it is withdrawn when the client's process ends,
-however that ends. The client holds a kernel lock meanwhile, which the clock can check in a microsecond.
+A request belongs to the run, or to a client that waits for it. The latter is withdrawn when the client's process ends,
+even if it is killed: the client holds a kernel lock, which the clock can check in a microsecond.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 
 _CLAIMS = 1 << 40
-"""Address of the byte locked by the client of ticket 0: beyond any segment, since a lock needs no memory."""
+"""Address of the byte that the client of ticket 0 locks: beyond any segment, since a lock needs no memory."""
 
 
 class RequestStage(IntEnum):
@@ -34,7 +34,7 @@ class RequestStage(IntEnum):
 
 
 class RequestWord(IntEnum):
-    """Words of an entry. The host writes them while it is free, then the clock writes STAGE, SERIAL and GIVEN_TICK."""
+    """Words of an entry. The host fills a free one; from then on the clock writes STAGE, SERIAL and GIVEN_TICK."""
 
     STAGE = 0
     TICKET = 1  # number of the request: it changes when the entry is filled again
@@ -75,7 +75,7 @@ class RequestEntry:
 
 
 class OperatorTable:
-    """The table of one rack. `entries` are all of them, free ones too."""
+    """The table of one rack. `entries` holds all entries, free ones too."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment, self._words = segment, segment.words
@@ -92,7 +92,7 @@ class OperatorTable:
 
     @contextmanager
     def claim(self, request: Request) -> Iterator[RequestEntry]:
-        """Add a request, as its client, for the length of a `with` block; if not issued by its end, it never is.
+        """Add a request as its client, and withdraw it at the end of the `with` block unless it has been issued.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
@@ -107,7 +107,7 @@ class OperatorTable:
     def _add(self, request: Request, has_client: bool = False) -> tuple[RequestEntry, ByteLock]:
         lock = ByteLock(self._segment, self._segment.map.operator)
         try:
-            # This wait lasts while another process fills an entry.
+            # Bounded by the time in which another process fills an entry.
             while not lock.take():
                 continue
             settled = [entry for entry in self.entries if not self.is_waiting(entry)]

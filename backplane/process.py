@@ -48,13 +48,13 @@ def _stat(pid: int) -> list[str]:
 
 
 def is_alive(pid: int, started: int = 0) -> bool:
-    """Say whether a process is alive; with `started`, whether it is still the same process: a pid is reused."""
+    """Say whether a process is alive; with `started`, whether it is still the same process, since pids are reused."""
     found = start_time(pid) if pid > 0 else 0
     return found > 0 and started in (0, found)
 
 
 def readable(fd: int, timeout_s: float) -> bool:
-    """Wait until a descriptor can be read, or the process of a pidfd has ended; False when the time is over.
+    """Wait until a descriptor can be read, or the process of a pidfd has ended; False after the timeout.
 
     Unlike `select` this takes descriptors above 1023.
     """
@@ -109,7 +109,7 @@ def name_process(name: str) -> None:
 
 
 def die_with_parent(parent: int) -> None:
-    """Let the kernel kill the calling process when its parent ends, however that ends."""
+    """Let the kernel kill the calling process when its parent ends, for whatever reason."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     # The parent may have ended between fork and prctl.
     if os.getppid() != parent:

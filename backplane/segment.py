@@ -1,7 +1,7 @@
-"""The backplane's memory: one POSIX shared-memory segment a rack.
+"""The backplane's memory: one POSIX shared-memory segment per rack.
 
 The Rack makes and unlinks it. All others attach by the rack's name and find the layout and the resolved config in the
-segment itself. It gets its name when it is complete: a launcher killed before that leaves nothing behind, and no
+segment itself. It gets its name only when it is complete: a launcher killed earlier leaves nothing in /dev/shm, and no
 process ever finds half a segment.
 """
 

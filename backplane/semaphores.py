@@ -1,7 +1,7 @@
-"""The named semaphores of a rack: one wake-up a task, one for the clock, one a locked mailbox.
+"""The named semaphores of a rack: one per task to wake it, one for the clock, one per locked mailbox.
 
 The Rack makes them, the crate opens them before it forks the boards, and the names are then removed: the boards keep
-the open semaphores, and nothing is left behind however they end.
+the open semaphores, and no name is left over even if they are killed.
 
 `posix_ipc` waits by the wall clock: if that is set back by an hour, a wait of 2 ms takes an hour. The C library can
 wait by CLOCK_MONOTONIC (since glibc 2.30). Alternatives considered: a futex through ctypes, and an eventfd with `poll`;
@@ -42,13 +42,13 @@ class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no 
         self.wait = partial(_sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline))
 
     def bind(self, timeout_s: float) -> int:
-        """Let waits end in `timeout_s` from now; return that time, CLOCK_MONOTONIC, ns."""
+        """Let waits end `timeout_s` from now; return that time, CLOCK_MONOTONIC, ns."""
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
         return deadline_ns
 
     def acquire(self, timeout_s: float) -> bool:
-        """Wait at most that long; False when the time is over."""
+        """Wait at most `timeout_s`; False after that."""
         try:
             super().acquire(0)
         except posix_ipc.BusyError:
@@ -65,16 +65,16 @@ _OPEN: dict[str, Semaphore] = {}
 
 def names(layout: Layout) -> list[str]:
     """Return the POSIX names of every semaphore that a rack needs."""
-    wake = [_wake(layout.rack, task.name) for task in layout.tasks]
-    locks = [_lock(layout.rack, m.name) for m in layout.mailboxes if m.protocol == "lock"]
-    return [_clock(layout.rack), *wake, *locks]
+    wake = [_name(layout.rack, "wake", task.name) for task in layout.tasks]
+    locks = [_name(layout.rack, "lock", m.name) for m in layout.mailboxes if m.protocol == "lock"]
+    return [_name(layout.rack, "clock"), *wake, *locks]
 
 
 def create(layout: Layout) -> None:
     """Make every semaphore of a rack, replacing those left by a killed rack of that name."""
     for name in names(layout):
         _unlink(name)
-        initial = 1 if name.startswith(_lock(layout.rack, "")) else 0
+        initial = 1 if name.startswith(_name(layout.rack, "lock", "")) else 0
         posix_ipc.Semaphore(name, posix_ipc.O_CREX, mode=0o600, initial_value=initial).close()
 
 
@@ -99,17 +99,17 @@ def unlink_all(rack: str) -> None:
 
 def wake_semaphore(rack: str, task: str) -> Semaphore:
     """Return the open semaphore that wakes a task."""
-    return _opened(_wake(rack, task))
+    return _opened(_name(rack, "wake", task))
 
 
 def clock_semaphore(rack: str) -> Semaphore:
     """Return the open semaphore on which lockstep waits for tasks to finish."""
-    return _opened(_clock(rack))
+    return _opened(_name(rack, "clock"))
 
 
 def lock_semaphore(rack: str, mailbox: str) -> Semaphore:
     """Return the open semaphore that guards a mailbox."""
-    return _opened(_lock(rack, mailbox))
+    return _opened(_name(rack, "lock", mailbox))
 
 
 def _opened(name: str) -> Semaphore:
@@ -118,16 +118,8 @@ def _opened(name: str) -> Semaphore:
     return _OPEN[name]
 
 
-def _clock(rack: str) -> str:
-    return f"/{PREFIX}{rack}.clock"
-
-
-def _wake(rack: str, task: str) -> str:
-    return f"/{PREFIX}{rack}.wake.{task}"
-
-
-def _lock(rack: str, mailbox: str) -> str:
-    return f"/{PREFIX}{rack}.lock.{mailbox}"
+def _name(rack: str, *parts: str) -> str:
+    return f"/{PREFIX}{'.'.join((rack, *parts))}"
 
 
 def _unlink(name: str) -> None:

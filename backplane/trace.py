@@ -4,9 +4,9 @@ One record gives lateness (start - release), t_comm (read and write parts), t_ex
 (deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 (plan - start), and the processor time of the cycle, without
 preemption. A reader that falls behind knows how many records it lost.
 
-A task traces a cycle after its last write. So the trace also proves things about messages (`CycleRecord`): one that is
-not there by then was not written, and one that comes later was held back. Age alone proves nothing, since the machine
-may have taken the core away.
+A task traces a cycle after its last write. The trace therefore also proves things about messages (`CycleRecord`): one
+that is missing by then was not written, and one that appears later was held back. Age alone proves nothing, since the
+task may have been preempted.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ RECORD = np.dtype(
         ("tick", "i8"),  # release, in ticks
         ("release_ns", "i8"),  # the grid point of that tick, CLOCK_MONOTONIC
         ("start_ns", "i8"),
-        ("plan_ns", "i8"),  # an executor has its plan over the bus (C of fig. 4); without one to read: start_ns
+        ("plan_ns", "i8"),  # an executor has read its plan over the bus (C of fig. 4); start_ns if it has none to read
         ("read_ns", "i8"),  # command, status and plan read
         ("process_ns", "i8"),  # process done
         ("end_ns", "i8"),  # command and status written
-        ("flags", "i8"),  # Flag in the low 16 bits; above them the releases skipped just before this one
+        ("flags", "i8"),  # Flag in the low 16 bits; above them the number of releases skipped just before
         ("state", "i8"),  # state of the level
         ("processor_ns", "i8"),  # processor time since the last record: this cycle, and waking up for it
     ]

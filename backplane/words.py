@@ -33,22 +33,22 @@ class System(IntEnum):
     PERIOD_NS = 35  # wall-clock time from tick to tick: the clock's period over the speed factor
     LOCKSTEP = 36
     STOP_REQUEST = 37  # written by the host
-    STOP_TICK = 38  # first tick that does not happen; 0: not known
+    STOP_TICK = 38  # first tick after the run; 0: not known
     CLOCK_SKIPPED = 39  # ticks skipped by the clock itself
-    FOLLOWER_PID = 40  # a recorder for which lockstep waits; 0: none
+    FOLLOWER_PID = 40  # of the recorder for which lockstep waits; 0: none
     FOLLOWER_TICK = 41  # everything up to here is recorded
     TICK_NS = 42  # CLOCK_MONOTONIC of the newest tick
-    FAULTS = 43  # rises with every change in the fault table that concerns tasks; the clock's
-    DEMAND = 44  # Demand of the utility lines on the arm; the clock's
+    FAULTS = 43  # rises with every change in the fault table that concerns tasks; written by the clock
+    DEMAND = 44  # Demand of the utility lines on the arm; written by the clock
     CLOCK_PID = 45
     INJECTED = 46  # faults put into the fault table so far
-    LOSSES = 47  # rises when a board is found dead; the crate's
+    LOSSES = 47  # rises when a board is found dead; written by the crate
     SYSRESET = 48
     ACFAIL = 49
     EMERGENCY_STOP = 50
     REQUESTED = 51  # commands put into the operator table so far
-    COMMANDED = 52  # serial of the newest command issued; the clock's
-    SYSFAIL = 64  # one word a slot, 22 of them: 1 until the board's self-test has passed
+    COMMANDED = 52  # serial of the newest command issued; written by the clock
+    SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 
 class Run(IntEnum):
@@ -68,7 +68,7 @@ class Demand(IntEnum):
 
 
 class Block(IntEnum):
-    """Words of a task's control block. The clock writes RELEASED, the finder LOST, the task all others."""
+    """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the finder of a loss."""
 
     RELEASED = 0  # newest release, as a tick; -1: none yet
     DEADLINE = 1  # tick before which that cycle, or plan, must be finished
@@ -102,7 +102,7 @@ class TaskState(IntEnum):
     RUNNING = 3
     ENDED = 4
     FAILED = 5
-    GIVEN_UP = 6  # lost, and not to be restarted; the Rack's
+    GIVEN_UP = 6  # lost, and not to be restarted; written by the Rack
 
 
 class Box(IntEnum):
@@ -111,8 +111,8 @@ class Box(IntEnum):
     HEAD = 0  # serial of the newest whole message; 0: none
     EPOCH = 1  # counts the writers that have claimed the mailbox
     WRITER_PID = 2
-    CLAIM = 3  # not a number: the writer holds the kernel's lock on this address
-    OWNER = 4  # likewise for the critical section, protocol lock; the number is its owner's process, 0: none
+    CLAIM = 3  # no value: the writer holds the kernel's lock on this address
+    OWNER = 4  # the same for the critical section of protocol lock; value: its owner's process id, 0: none
     CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
 
 

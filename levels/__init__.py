@@ -34,42 +34,8 @@ from rack.levels.messages import Error
 from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Commands, Goal, Operation, Orders
 from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, read_params
 
-__all__ = [
-    "ANSWER",
-    "OPERATOR_COMMAND",
-    "RESTS_ON",
-    "Alarm",
-    "Commands",
-    "Demand",
-    "Error",
-    "Executor",
-    "Fault",
-    "Field",
-    "Finding",
-    "Finite",
-    "Goal",
-    "Input",
-    "LevelContext",
-    "LevelError",
-    "Message",
-    "MessageType",
-    "Operation",
-    "Orders",
-    "Pace",
-    "Planner",
-    "Ports",
-    "Positive",
-    "Program",
-    "ProgramError",
-    "Reading",
-    "Refused",
-    "RobotConfig",
-    "RobotError",
-    "SceneConfig",
-    "State",
-    "Table",
-    "Verdict",
-    "command",
-    "read_params",
-    "status",
-]
+__all__ = ["ANSWER", "OPERATOR_COMMAND", "RESTS_ON", "Alarm", "Commands", "Demand", "Error", "Executor", "Fault"]
+__all__ += ["Field", "Finding", "Finite", "Goal", "Input", "LevelContext", "LevelError", "Message", "MessageType"]
+__all__ += ["Operation", "Orders", "Pace", "Planner", "Ports", "Positive", "Program", "ProgramError", "Reading"]
+__all__ += ["Refused", "RobotConfig", "RobotError", "SceneConfig", "State", "Table", "Verdict", "command"]
+__all__ += ["read_params", "status"]

@@ -62,20 +62,8 @@ from rack.backplane.words import Demand
 from rack.levels.operator import Commands
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 
-__all__ = [
-    "Demand",
-    "Executor",
-    "Fault",
-    "Finding",
-    "Input",
-    "LevelContext",
-    "Pace",
-    "Planner",
-    "Ports",
-    "Program",
-    "Reading",
-    "Verdict",
-]
+__all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Pace", "Planner", "Ports"]
+__all__ += ["Program", "Reading", "Verdict"]
 
 
 class Input(NamedTuple):

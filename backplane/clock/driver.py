@@ -20,7 +20,7 @@ Ended = Callable[[int], int | None]
 
 
 class Controller(Protocol):
-    """The system controller's work at every tick besides releasing tasks."""
+    """The system controller's work at every tick, apart from releasing tasks."""
 
     def begin(self, tick: int) -> None:
         """Do the work due before the tasks of `tick` are released."""
@@ -73,17 +73,17 @@ class ClockDriver(ABC):
 
     @property
     def first_tick(self) -> int:
-        """First tick to do: 0 for a new clock; a restarted one repeats the last tick.
+        """First tick of this clock: 0, or after a restart the last tick again.
 
-        No task is released twice for a tick: its deadline shows that it was.
+        No task is released twice for it: its deadline shows that it has been.
         """
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @abstractmethod
     def settle(self) -> None:
-        """In lockstep, wait until each task has finished what it was released for, plans too.
+        """In lockstep, wait until each task has finished the work of its release, plans too.
 
-        To be called before a change of anything that tasks read at any time rather than as of a tick.
+        Call it before changing anything that tasks read at any time rather than as of a tick.
         """
 
     @abstractmethod
@@ -110,7 +110,7 @@ class ClockDriver(ABC):
         return is_alive(*self._launcher)
 
     def end(self) -> None:
-        """End the run, and wake every task to see it."""
+        """End the run, and wake every task so that it sees that."""
         self.words[System.STATE] = Run.STOPPED
         for task in self.tasks:
             task.wake()
@@ -138,13 +138,13 @@ class RealtimeDriver(ClockDriver):
         self.end()
 
     def settle(self) -> None:
-        """Do not wait: in real time a change meets a task wherever it is."""
+        """Return at once: in real time a change may take effect within a cycle."""
 
     def await_state(self, condition: Callable[[], bool]) -> None:
-        """Do not wait: time does not."""
+        """Return at once: real time does not wait."""
 
     def _sleep_until_next(self, tick: int, epoch: int, period: int) -> int:
-        """Sleep to the next grid point; return the newest tick of the run that has come by then, or the one after."""
+        """Sleep until the next grid point; return the newest tick due by then, at least the one after `tick`."""
         wait = epoch + (tick + 1) * period - time.monotonic_ns()
         if wait > 0:
             time.sleep(wait * 1e-9)

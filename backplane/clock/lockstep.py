@@ -16,23 +16,18 @@ from rack.backplane.words import Run, System
 IDLE_S = 5.0
 """Bound of the wait for a recorder that is stopped, or dead and not restarted."""
 SLOW_S = 30.0
-"""Bound of the wait for a recorder that runs but takes no rows: a new one may still be importing its libraries."""
+"""Bound of the wait for a recorder that runs but reads no rows: a new one may still be importing its libraries."""
 
 
 class LockstepDriver(ClockDriver):
     """The driver of the clock in lockstep.
 
-    `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for each: this keeps
-    protocols exact whose messages are visible at once.
+    `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for each. Protocols whose
+    messages are visible at once need this to be repeatable.
     """
 
     def __init__(
-        self,
-        segment: Segment,
-        ended: Ended,
-        one_at_a_time: bool,
-        history_ticks: int,
-        alarms: AlarmWriter | None = None,
+        self, segment: Segment, ended: Ended, one_at_a_time: bool, history_ticks: int, alarms: AlarmWriter | None = None
     ) -> None:
         super().__init__(segment, ended, alarms)
         self._done = clock_semaphore(segment.rack)
@@ -67,7 +62,7 @@ class LockstepDriver(ClockDriver):
         return True
 
     def settle(self) -> None:
-        """Wait until every task has finished what it was released for, plans too."""
+        """Wait until every task has finished the work of its release, plans too."""
         self._wait(lambda: all(task.is_settled() for task in self.tasks))
 
     def await_state(self, condition: Callable[[], bool]) -> None:

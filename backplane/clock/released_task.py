@@ -1,8 +1,8 @@
 """A task as the clock sees it, and the watchdog that finds tasks not responding to their releases.
 
-A missed release is a miss and no more: on a busy machine any process may lose its core for a while. A task is lost only
-if there is proof: a signal has stopped its process, or it waits for something other than its release, or it has used so
-much processor time that it will not end. A task that gets no processor time is starved.
+A missed release does not prove a fault: on a busy machine any process may be preempted for a while. A task is lost only
+with proof: a signal has stopped its process, or it waits for something other than its release, or it has used so much
+processor time that it will not end. A task that gets no processor time is starved.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _RELEASED, _DEADLINE, _DONE, _LOST = (int(Block[name]) for name in ("RELEASED", 
 RELEASES_MISSED = 4
 """Missed releases before a task is checked: three gave one false trip in 24,000 cycles at 400 Hz."""
 LEAST_NS = 1_000_000_000
-"""Least processor time, or time of waiting, before a task counts as hanging."""
+"""Least processor time, or waiting time, before a task counts as hanging."""
 
 
 class ReleasedTask:
     """The clock's end of a task's control block.
 
-    `index` is its place in the layout. `missed` counts its releases since it last finished one: 1 when it has become
-    late, 2 while it finishes each one too late, more when it finishes none. `is_stopped`: a signal has stopped its
-    process, so lockstep must not wait for it.
+    `index` is its place in the layout. `missed` counts releases since it last finished one: 1 when it becomes late, 2
+    while it finishes each one late, more while it finishes none. `is_stopped`: a signal has stopped its process, so
+    lockstep must not wait for it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -71,7 +71,7 @@ class ReleasedTask:
         return self.block[_DONE] == self.block[_RELEASED]
 
     def is_settled(self) -> bool:
-        """Say whether there is no reason to wait: it has finished, or will not."""
+        """Say whether it has finished, or will not: there is nothing to wait for."""
         return self.is_idle() or bool(self.block[_LOST]) or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
@@ -98,7 +98,7 @@ class ReleasedTask:
 
     @property
     def is_given_up(self) -> bool:
-        """Whether a lost task will not come back."""
+        """Whether a lost task will not be restarted."""
         return self.block[Block.STATE] == TaskState.GIVEN_UP
 
     def lose(self, tick: int) -> None:
@@ -130,7 +130,7 @@ class Watchdog:
         self._used_ns: dict[int, int] = {}  # task -> processor time when it was first checked
 
     def check(self, task: ReleasedTask, tick: int) -> None:
-        """Ring for a task that has missed a release by `tick`, and find out whether it hangs."""
+        """Raise the alarms for a task that has missed a release by `tick`, and find out whether it hangs."""
         missed, spec = task.missed, task.spec
         if missed == 1:
             late = Alarm.LATE if spec.role == "executor" else Alarm.PLAN_LATE

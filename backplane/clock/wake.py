@@ -31,14 +31,14 @@ SPINS = 100_000
 class NextCycle:
     """The releases of one task, on the grid. A late task skips the releases that passed, and counts them.
 
-    An executor's release has passed when the next one comes. A planner's has passed at the end of its plan's time
-    slice: until then it is taken late, as of its own tick, since its result depends on ticks alone.
+    An executor's release has passed at the next one. A planner's has passed at the end of its plan's time slice: until
+    then it is taken late, as of its own tick, since its result depends on ticks alone.
     """
 
     def __init__(
         self, segment: Segment, task: str, poll: bool = False, clock_alarms: AlarmWriter | None = None
     ) -> None:
-        """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and ring there."""
+        """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and raise an alarm there."""
         self._spec = segment.layout.task(task)
         self._clock = SystemClock(segment)
         self._block = segment.block(task)
@@ -102,7 +102,7 @@ class NextCycle:
         return min((late if late > 0 else again) * 1e-9, CHECK_S)
 
     def _check_clock(self, alarms: AlarmWriter) -> None:
-        """Ring once for a clock that makes no ticks: its process is stopped, dead, or silent for too long."""
+        """Raise one alarm for a clock that makes no ticks: its process is stopped, dead, or silent for too long."""
         now, newest = self._clock.now(), self._words[_TICK]
         if now - newest < CLOCK_TICKS:
             self._clock_is_silent = False
@@ -110,11 +110,11 @@ class NextCycle:
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
         state = state_of(clock)
-        # A clock that could run is only late. Seen twice: after a pause of the whole machine it is about to wake.
+        # A clock that could run is only late. Twice: after a pause of the whole machine it may be about to wake.
         waits = silent_s > CLOCK_SILENT_S and state in WAITING
         has_stopped = state in STOPPED + GONE or (waits and self._waited_at == newest)
         self._waited_at = newest if waits else -1
-        # A tick meanwhile, or the end of the run, disproves it.
+        # A new tick, or the end of the run, disproves it.
         if has_stopped and not self._clock_is_silent and self._words[_TICK] == newest and not self._clock.is_stopped:
             self._clock_is_silent = True
             alarms.ring(now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest)
@@ -128,8 +128,8 @@ class NextCycle:
         return is_alive(*self._launcher)
 
     def _take_posts(self, count: int) -> None:
-        """Take the posts that a polling task does not wait for: over weeks the semaphore would overflow."""
-        # The newest post may come a moment after its release: the next cycle takes it.
+        """Take the posts that a polling task does not wait for: else the semaphore would overflow within weeks."""
+        # The newest post may follow its release a moment later: the next cycle takes it.
         while count and self._semaphore.acquire(0):
             count -= 1
 

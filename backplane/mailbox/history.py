@@ -2,8 +2,8 @@
 
 The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time. Each message carries
 the running hash of its mailbox, so the digest is complete even if a recorder lost rows, and a restarted writer
-continues it. Messages that become visible after the last tick do not count: whether they were finished in time is no
-part of the motion.
+continues it. Messages that become visible after the last tick do not count: nothing reads them, and whether they are
+written before the run ends depends on timing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rack.backplane.words import Box, Slot, System
 class MailboxRing(Ring):
     """The messages of a mailbox as a ring: fields of `words.Slot` in lower case, then `message`.
 
-    It leaves out what every reader rejects: lost and damaged messages, and those of an intruder.
+    It omits the messages that every reader rejects: lost, damaged or forged ones.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:

@@ -74,7 +74,7 @@ class Writer:
         self.message = self._slots.message
         self.bus_errors = 0
         self.held_up = 0
-        """Accesses so far for which a dead or stopped process held the lock."""
+        """Accesses so far that timed out because a dead or stopped process held the lock."""
         self.intruder = 0
         """Another process that has published since this writer's last message but one; 0: none."""
         self._claim = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.CLAIM)
@@ -115,7 +115,7 @@ class Writer:
         return True
 
     def lose(self) -> None:
-        """Take a serial whose message is lost."""
+        """Publish a serial without its message, as an injected loss does."""
         self._slots.lose()
 
     @property
@@ -124,7 +124,7 @@ class Writer:
         return self._slots.serial
 
     def close(self) -> None:
-        """Give the claim back."""
+        """Release the claim."""
         self._claim.close()
 
 
@@ -136,12 +136,12 @@ class ReadStatistics:
     def __init__(self) -> None:
         self.accesses = 0
         self.transfers = 0  # messages copied
-        self.bad_reads = 0  # with any of the following: one number to compare
+        self.bad_reads = 0  # reads with any of the following
         self.bus_errors = 0  # accesses that their bound cut off
         self.corrupt = 0  # messages that failed their CRC
         self.forged = 0  # messages of a process that does not hold the claim
-        self.forger = 0  # the last such process
-        self.held_up = 0  # accesses for which a dead or stopped process held the lock
+        self.forger = 0  # process id of the last such process
+        self.held_up = 0  # accesses that timed out because a dead or stopped process held the lock
 
 
 class Reader:
@@ -149,8 +149,8 @@ class Reader:
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
-        self.slots = self._fetched = Slots(segment, self.spec)
-        self._box = self._fetched.box
+        self.slots = Slots(segment, self.spec)
+        self._box = self.slots.box
         # The last good message has its own buffer: a corrupt copy never reaches it.
         self._good = Slots(segment, self.spec)
         self.message = self._good.message
@@ -158,7 +158,7 @@ class Reader:
         self._serial = 0
         self._signature = 0
         self.found = 0
-        """Serial of the newest message that the last read has found, good or not."""
+        """Serial of the newest message found by the last read, good or not."""
         self.newest = NOT_YET
         """Release tick of the last good message."""
         self.statistics = ReadStatistics()
@@ -174,9 +174,9 @@ class Reader:
 
     def _newest_visible(self, head: int, tick: int) -> int:
         """Return the newest serial visible at `tick`; stop at the last one read."""
-        visible_at = self._fetched.visible_at
+        visible_at = self.slots.visible_at
         # Older messages are overwritten: a serial beyond the slots fails when it is taken.
-        oldest, serial = max(self._serial, head - self._fetched.depth), head
+        oldest, serial = max(self._serial, head - self.slots.depth), head
         while serial > oldest and visible_at(serial) > tick:
             serial -= 1
         return serial
@@ -185,7 +185,7 @@ class Reader:
         if self._obtain(serial):
             return self._readings[Verdict.NEW]
         # The reader came too late: the slot is being overwritten.
-        if not self._fetched.keeps(serial):
+        if not self.slots.keeps(serial):
             return self._cut_off()
         self.statistics.bad_reads += 1
         self._blame(serial)
@@ -193,9 +193,9 @@ class Reader:
 
     def _step_back(self, serial: int, tick: int) -> Reading:
         """Take the newest good message before a lost, damaged or forged one, if it is unread."""
-        fetched, tries = self._fetched, MAX_STEP_BACK
-        for older in range(serial - 1, max(self._serial, serial - fetched.depth), -1):
-            if fetched.holds(older) and fetched.visible_at(older) <= tick:
+        slots, tries = self.slots, MAX_STEP_BACK
+        for older in range(serial - 1, max(self._serial, serial - slots.depth), -1):
+            if slots.holds(older) and slots.visible_at(older) <= tick:
                 if self._obtain(older):
                     return self._readings[Verdict.NEW]
                 self._blame(older)
@@ -205,28 +205,26 @@ class Reader:
         return self._readings[Verdict.OLD if self._serial else Verdict.NONE]
 
     def _obtain(self, serial: int) -> bool:
-        """Take a message over as the last good one; False when it is not good."""
+        """Keep a message as the last good one; False when it is not good."""
         self.statistics.transfers += 1
-        fetched = self._fetched
-        if not fetched.fetch(serial) or not (
-            fetched.signature == self._signature or fetched.is_lawful(self._signature)
-        ):
+        slots = self.slots
+        if not slots.fetch(serial) or not (slots.signature == self._signature or slots.is_lawful(self._signature)):
             return False
-        self._good.record[:] = fetched.record
-        self._serial, self._signature, self.newest = serial, fetched.signature, fetched.tick
+        self._good.record[:] = slots.record
+        self._serial, self._signature, self.newest = serial, slots.signature, slots.tick
         return True
 
     def _blame(self, serial: int) -> None:
-        """Count the fault of the message fetched last. Another message in its place is a loss: not counted."""
-        fetched = self._fetched
-        if not fetched.keeps(serial):
+        """Count the fault of the message fetched last. If its slot holds another message, it is lost: not counted."""
+        slots = self.slots
+        if not slots.keeps(serial):
             return
-        if not fetched.is_sound:
+        if not slots.is_sound:
             # Serial 0: an empty slot, as at the start.
-            self.statistics.corrupt += fetched.serial != 0
-        elif fetched.serial == serial:
+            self.statistics.corrupt += slots.serial != 0
+        elif slots.serial == serial:
             self.statistics.forged += 1
-            self.statistics.forger = pid_of(fetched.signature)
+            self.statistics.forger = pid_of(slots.signature)
 
     def _cut_off(self) -> Reading:
         self.statistics.bus_errors += 1
@@ -242,11 +240,6 @@ class Reader:
     def basis(self) -> int:
         """Tick of the oldest information that the last good message rests on."""
         return self._good.basis
-
-    @property
-    def chain(self) -> bytes:
-        """Running hash up to the last good message."""
-        return self._good.chain
 
     def peek(self) -> Reading:
         """Return the newest whole message at once, under any protocol: for the host side."""

@@ -28,8 +28,8 @@ _OWNER = int(Box.OWNER)
 class MailboxLock:
     """Mutual exclusion on one mailbox, with a bounded wait.
 
-    `held_up` counts the waits that ran out while a dead or stopped process held the lock: a fault, unlike a holder that
-    has lost its core.
+    `held_up` counts the waits that timed out while a dead or stopped process held the lock: a fault, unlike a holder
+    that has been preempted.
     """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
@@ -45,8 +45,8 @@ class MailboxLock:
         """Take the lock within its bound; False when a living holder keeps it."""
         if not self._semaphore.acquire(self._wait_s):
             self._check_holder()
-        # After a wait that ran out, the kernel's lock is free if the semaphore's holder is dead; one of several waiters
-        # gets it. After a successful wait it may be taken: such a waiter came between the two steps and is the owner.
+        # After a timeout, the kernel's lock is free if the semaphore's holder is dead; one of several waiters gets it.
+        # After a successful wait it may be taken: such a waiter got in between the two steps and is the owner.
         if not self._owner.take():
             return False
         self._box[_OWNER] = self._pid
@@ -61,11 +61,11 @@ class MailboxLock:
     def release(self) -> None:
         """Release the lock. Only its owner may."""
         self._box[_OWNER] = 0
-        self._owner.give_back()
+        self._owner.release()
         self._semaphore.release()
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Close the descriptor; this releases the lock."""
         self._owner.close()
 
 
@@ -89,7 +89,7 @@ class LockWriter(DoubleBufferWriter):
             self.lock.release()
 
     def close(self) -> None:
-        """Give the claim back."""
+        """Release the claim."""
         self.lock.close()
         super().close()
 
@@ -102,7 +102,7 @@ class LockReader(Reader):
         self.lock = MailboxLock(segment, name)
 
     def read(self, tick: int) -> Reading:
-        """Return the newest message; BUS_ERROR with the last good one when the wait ran out."""
+        """Return the newest message; BUS_ERROR with the last good one after a timeout."""
         statistics = self.statistics
         statistics.accesses += 1
         obtained = self.lock.acquire()
@@ -117,16 +117,8 @@ class LockReader(Reader):
             self.lock.release()
 
 
-WRITERS: dict[Protocol, type[Writer]] = {
-    "time-slice": Writer,
-    "double-buffer": DoubleBufferWriter,
-    "lock": LockWriter,
-}
-READERS: dict[Protocol, type[Reader]] = {
-    "time-slice": Reader,
-    "double-buffer": DoubleBufferReader,
-    "lock": LockReader,
-}
+WRITERS: dict[Protocol, type[Writer]] = {"time-slice": Writer, "double-buffer": DoubleBufferWriter, "lock": LockWriter}
+READERS: dict[Protocol, type[Reader]] = {"time-slice": Reader, "double-buffer": DoubleBufferReader, "lock": LockReader}
 
 
 def open_writer(segment: Segment, name: str) -> Writer:

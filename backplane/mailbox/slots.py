@@ -1,17 +1,17 @@
-"""The slots of one mailbox: the way of a whole message into shared memory, and out again.
+"""The slots of one mailbox: how whole messages get into shared memory and out again.
 
 A message is built in a local record, copied into the slot after the newest one, and published by one store of its
 serial in the mailbox's head. A writer killed at any instruction leaves every published message intact. A reader checks
 the serial and the CRC of its copy, so it never returns half a message.
 
 Memory order: the one writer fills the slot before it stores the head's serial. On x86-64 other cores see stores in that
-order. On weaker machines a reader may see the serial first: the CRC, or the serial in the slot, then does
-not fit its copy, and the read steps back to the message before. Words are aligned to 8 bytes, so they are never torn.
+order. On weaker machines a reader may see the serial first: its copy then fails the CRC, or holds another serial, and
+the read steps back to the message before. Words are aligned to 8 bytes, so they are never torn.
 
 Why a chained hash as well as a CRC: the CRC covers one message and tells a reader, in well under a microsecond, whether
 its copy is whole and undamaged. The hash covers this message and the hash before it, so the newest one stands for all
 that was ever written: one comparison shows whether two runs are equal (`history.digest`). It is longer than a CRC, so
-that no two runs agree by chance, and leaves out epoch and basis, which are not content. No reader checks it.
+that no two runs agree by chance, and omits epoch and basis, which are not content. No reader checks it.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ class Slots:
         self._chain_part = self.record[CHAIN_FROM:]
         self._chain = self.record[CHAIN_AT:SLOT_HEAD_SIZE]
 
-    def resume(self, signature: int) -> int:
-        """Take the writer's place after the newest published message; return its serial."""
+    def resume(self, signature: int) -> None:
+        """Continue after the newest published message, as a writer."""
         head = whole = self.box[Box.HEAD]
         # A serial may have been lost: the chain continues from the newest message that is in its slot.
         while whole > max(0, head - self.depth) and not self.holds(whole):
@@ -108,7 +108,6 @@ class Slots:
         self._words[_EPOCH] = signature
         chain = self._slots[whole & self.mask][CHAIN_AT:SLOT_HEAD_SIZE]
         self._chain[:] = bytes(chain) if whole and self.holds(whole) else bytes(8)
-        return head
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an intruder, 0: none.
@@ -134,7 +133,7 @@ class Slots:
         return intruder
 
     def lose(self) -> None:
-        """Take a serial whose message never gets into its slot."""
+        """Publish a serial without filling its slot."""
         self._words[_SERIAL] += 1
         self.box[0] = self._words[_SERIAL]
 
@@ -151,7 +150,7 @@ class Slots:
         return self._slot_words[serial & self.mask][_SERIAL] == serial
 
     def keeps(self, serial: int) -> bool:
-        """Say whether that serial's slot was not reused until now: a copy made before is of that message."""
+        """Say whether that serial's slot has not been reused: a copy made before this call is then of that message."""
         return serial >= oldest_kept(self.box[0], self.depth)
 
     def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
@@ -168,7 +167,7 @@ class Slots:
         return self._words[_SERIAL] == serial and self._words[_CRC] == crc32(self._crc_part)
 
     def copy(self, serial: int) -> bool:
-        """Copy that serial's slot, whatever it holds, into the local record; False when it was reused meanwhile."""
+        """Copy that serial's slot, without any check, into the local record; False when it was reused meanwhile."""
         self.record[:] = self._slots[serial & self.mask]
         return self.keeps(serial)
 
@@ -186,11 +185,6 @@ class Slots:
     def signature(self) -> int:
         """Signature of its writer: see `claim`."""
         return self._words[_EPOCH]
-
-    @property
-    def epoch(self) -> int:
-        """Writer's epoch of that message."""
-        return epoch_of(self._words[_EPOCH])
 
     def is_lawful(self, known: int) -> bool:
         """Say whether that message comes from the writer that holds the claim, or from an earlier holder.

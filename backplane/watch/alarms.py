@@ -1,6 +1,6 @@
-"""Alarm rings: a task or the clock reports what it has found wrong. One fixed record an alarm, never a wait.
+"""Alarm rings: a task or the clock reports the faults that it has found. One fixed record per alarm, never a wait.
 
-An alarm is rung once an episode: when a condition is found, not in every cycle that it lasts.
+An alarm is raised once per episode: when a condition is found, not in every cycle while it lasts.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rack.backplane.segment import Segment
 
 RECORD = np.dtype(
     [
-        ("tick", "i8"),  # release, in ticks, of the cycle that found it; the clock's: its tick
+        ("tick", "i8"),  # release, in ticks, of the cycle that found it; for the clock, its tick
         ("time_ns", "i8"),  # CLOCK_MONOTONIC
         ("code", "i8"),  # Alarm
         ("subject", "i8"),  # see Alarm; -1: none
@@ -32,54 +32,54 @@ RECORD = np.dtype(
 class Alarm(IntEnum):
     """Kinds of alarms. In brackets: subject; value."""
 
-    # Rung by the clock: faults, losses and demands.
+    # Raised by the clock: faults, losses and demands.
     FAULT_BEGINS = 1  # [entry of the fault table; -]
     FAULT_ENDS = 2  # [entry; times it acted]
     HANG = 3  # [task; releases missed]
     REJOINED = 4  # [task, -1: the clock itself; ticks it was away]
     DEMAND = 5  # [task whose loss demands it, -1: the emergency stop or nobody; Demand]
-    COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was given
-    # Rung by the clock: tasks that miss their cycles.
+    COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was issued
+    # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release
     PLAN_LATE = 11  # [task; releases missed]  a plan has not finished within its cycles (eq. 3.8)
     STARVED = 12  # [task; releases missed]  a task that could run does not get its core
-    # Rung by readers: mailboxes.
+    # Raised by readers: mailboxes.
     STALE = 20  # [mailbox; age, ticks]  its writer is dead or stopped
     MUTE = 21  # [mailbox; age, ticks]  its writer is running but not writing
     GAP = 22  # [mailbox; serials missing]
     HELD_BACK = 23  # [mailbox; ticks]  a message came after the end of its cycle
     DISORDER = 24  # [mailbox; ticks]  a later serial has an earlier tick
     DAMAGED = 25  # [mailbox; -]  a message failed its CRC
-    BABBLE = 26  # [mailbox; serials a cycle]
+    BABBLE = 26  # [mailbox; serials per cycle]
     MASQUERADE = 27  # [mailbox; process id that the message names]  not from the writer that holds the claim
     LOCKED = 28  # [mailbox; -]  a dead or stopped process holds the lock
-    # Rung by tasks: the clock.
+    # Raised by tasks: the clock.
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]
     CLOCK_LATE = 32  # [-1; lateness, ns]
-    # Rung by the servo level: the arm.
+    # Raised by the servo level: the arm.
     SENSOR_RANGE = 40  # [joint; value]  NaN, or beyond the joint's range
     SENSOR_STUCK = 41  # [joint; cycles]  no change while the arm is driven
     SENSOR_SILENT = 42  # [-1; age, ticks]  no new sample
     SENSOR_MODEL = 43  # [joint; residual]  the sensed position disagrees with the model's motion
     ACTUATOR = 44  # [joint; residual]  the arm does not follow its torques
-    COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is not a number
+    COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is NaN or infinite
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond its limit was cut
     BRAKES_CLOSED = 47  # [-1; ticks without torque, 0: demanded]
     BRAKES_OPENED = 48  # [-1; ticks they were engaged]
-    RE_REFERENCED = 49  # [joint; rad]  its sensor is trusted again; distance from its estimate
+    RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
-"""Alarms of missed cycles: counted, and no reason to act. All others are faults or reactions."""
+"""Alarms of missed cycles: counted, but no action follows. All others are faults or reactions."""
 
 
 class AlarmWriter:
     """The writing end of an alarm ring: a task's, or the clock's ("clock").
 
-    `attention` is an eventfd that wakes the Rack; None: nobody is woken.
+    `attention` is an eventfd that wakes the Rack; None: no process is woken.
     """
 
     def __init__(self, segment: Segment, task: str, attention: int | None = None) -> None:
@@ -90,13 +90,13 @@ class AlarmWriter:
         self._attention = attention
 
     def ring(self, tick: int, code: Alarm, subject: int = -1, value: float = 0.0, since: int | None = None) -> None:
-        """Append an alarm, and wake the Rack if the alarm asks for action."""
+        """Append an alarm, and wake the Rack unless it is one of `MISSES`."""
         count = self._head[0] + 1
         found = tick if since is None else since
         self._slots[count % ALARM_DEPTH] = (tick, monotonic_ns(), code, subject, value, found, 0, 0)
         self._head[0] = count
         if self._attention is not None and code not in MISSES:
-            # This never waits: an eventfd counts further than any run can ring.
+            # This never waits: an eventfd can count more alarms than any run raises.
             eventfd_write(self._attention, 1)
 
 
@@ -108,11 +108,11 @@ def alarm_ring(segment: Segment, task: str) -> Ring:
 
 
 CLEAN_READS = 20
-"""Accesses, and cycles of the writer, without a finding before the next one begins a new episode."""
+"""Accesses, and cycles of the writer, without a finding after which the next one begins a new episode."""
 
 
 class Episodes:
-    """Alarms about one mailbox, rung once an episode, however long a fault lasts.
+    """Alarms about one mailbox, raised once per episode, however long a fault lasts.
 
     Keeps each finding with the access and the tick at which it was last made.
     """
@@ -124,13 +124,13 @@ class Episodes:
         self._last: dict[Alarm, tuple[int, int]] = {}
 
     def find(self, code: Alarm, access: int, tick: int, value: float = 0.0, since: int | None = None) -> None:
-        """Note a finding in an access, counted by the caller; ring if it begins an episode."""
+        """Note a finding in an access, counted by the caller; raise the alarm if it begins an episode."""
         if not self.is_open(code, access, tick):
             self.ring(code, tick, value, since)
         self._last[code] = access, tick
 
     def ring(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
-        """Ring at once, when the caller knows that an episode begins."""
+        """Raise the alarm at once, when the caller knows that an episode begins."""
         self._alarms.ring(tick, code, self._subject, value, since)
 
     def is_open(self, code: Alarm, access: int, tick: int) -> bool:

@@ -24,7 +24,7 @@ _CRC, _SERIAL, _TICK, _VISIBLE = (int(Slot[name]) for name in ("CRC", "SERIAL", 
 
 
 class ReadFindings:
-    """Rings for damaged and forged messages that a reader itself has found."""
+    """Raises alarms for the damaged and forged messages that a reader itself has found."""
 
     def __init__(self, reader: Reader, episodes: Episodes) -> None:
         self._statistics, self._episodes = reader.statistics, episodes
@@ -82,14 +82,14 @@ class MessageWatch:
             self._newest = self._slots.tick
 
     def _copies(self, serial: int) -> bool:
-        """Copy a message into the local record; False when it is missing or not to be trusted."""
+        """Copy a message into the local record; False when it is missing or cannot be trusted."""
         return self._slots.fetch(serial) and self._slots.keeps(serial)
 
     def _is_babble(self, found: int, tick: int) -> bool:
         """Say whether there are more messages than releases, by more than one."""
         slots = self._slots
         if not slots.keeps(found):
-            # Already overwritten: a writer of one message a cycle is not that fast.
+            # Already overwritten: a writer of one message per cycle is not that fast.
             found = slots.box[0]
         if not self._copies(found):
             return False

@@ -43,7 +43,7 @@ class ReadingTask:
         self._last = tick
 
     def is_gone(self, pid: int, tick: int) -> bool:
-        """Say whether a process is dead or stopped. The kernel is asked once a cycle for each process."""
+        """Say whether a process is dead or stopped. The kernel is asked once per cycle and process."""
         if tick != self._asked_at:
             self._asked_at = tick
             self._gone.clear()
@@ -53,7 +53,10 @@ class ReadingTask:
 
 
 class SilenceWatch:
-    """Judges the silence of one mailbox for one reader. `quiet` is the age in ticks from which it must be asked."""
+    """Judges the silence of one mailbox for one reader.
+
+    Ask `is_lost` once the newest message is `quiet` ticks old.
+    """
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes, task: ReadingTask) -> None:
         spec = reader.spec
@@ -68,7 +71,7 @@ class SilenceWatch:
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
-        """Say whether the writer is lost or has been silent for too long; ring an alarm if the cause is proven."""
+        """Say whether the writer is lost or has been silent for too long; raise an alarm if the cause is proven."""
         newest = self._reader.newest
         age = tick - newest
         if age >= self.quiet:
@@ -99,7 +102,7 @@ class SilenceWatch:
         return slots.copy(head) and slots.serial == head and slots.tick < finished
 
     def _report(self, code: Alarm, tick: int, age: int) -> None:
-        """Ring once for each last message: the next good message ends the episode."""
+        """Raise the alarm once for each last message: the next good message ends the episode."""
         serial = self._reader.serial
         if self._reported.get(code) != serial:
             self._reported[code] = serial

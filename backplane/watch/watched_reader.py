@@ -1,4 +1,4 @@
-"""Readers that watch their mailbox: every read also checks the messages that came, and those that did not."""
+"""Readers that watch their mailbox: every read also checks for damaged, late, forged and missing messages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def watched(segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask)
 
 
 class WatchedReader:
-    """Reads a mailbox for a task and rings the task's alarms about it. A clean read costs three comparisons more."""
+    """Reads a mailbox for a task and raises the task's alarms about it. This adds three comparisons to a clean read."""
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> None:
         self.reader = reader = open_reader(segment, name)
@@ -54,8 +54,8 @@ class WatchedReader:
 class SporadicReader:
     """Reads an operator's mailbox: silence there proves nothing, but messages must be whole, and the clock's.
 
-    A command may leave part of an earlier one in force, so none is left out: the newest comes with the unread ones
-    before it. The first read gives all that the slots hold, for a restarted board must know them.
+    A command may leave part of an earlier one in force, so none is skipped: the newest comes with the unread ones
+    before it. The first read returns all that the slots hold, since a restarted board must know them.
     """
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:

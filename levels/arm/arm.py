@@ -48,8 +48,7 @@ class Link(Protocol):
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques, (joints,), N m, and the gripper's force, N, for one torque cycle.
 
-        A command that no servo level gives (see `Arm.refused`) is not applied: the brakes engage, and the finding is
-        returned.
+        A torque that must not be applied (see `Arm.refused`) engages the brakes, and the finding is returned.
         """
 
 
@@ -67,15 +66,15 @@ class Arm(ABC):
         self.tick = 0  # tick of the arm's state
         self.waited = self.patience  # ticks since the last command
         self.braked = True  # the brakes are engaged
-        self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: as given to the motors last
-        self.grip_force = 0.0  # N: as given to the gripper last
-        self.fault = ""  # why the arm has stopped for good; empty: it has not
+        self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
+        self.grip_force = 0.0  # N: given to the gripper last
+        self.fault = ""  # why the arm has failed and moves no more; empty: it has not
         self.clipped = 0  # cycles in which a command was refused or cut
         self.contact: tuple[int, int] | None = None  # geoms of an unintended contact of arm or load in the last `step`
         self.touches = 0  # unintended contacts so far
         self.first_touch = ""  # the first of them, readable: which geoms, and when
-        self.violations = 0  # times that the drives broke a limit of position, velocity or torque
-        self.pushed = 0  # times that a blow pushed a joint beyond a limit of position or velocity
+        self.violations = 0  # steps in which the drives broke a limit of position, velocity or torque
+        self.pushed = 0  # steps in which a blow pushed a joint beyond a limit of position or velocity
         self.first_violation = ""  # the first violation, readable: which limit, by how much, and when
         self._data = cell.start()
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
@@ -94,9 +93,9 @@ class Arm(ABC):
 
     @abstractmethod
     def step(self, ticks: int) -> None:
-        """Let `ticks` ticks pass: advance `tick` and `waited` (hardware: no more), and keep to `patience`.
+        """Let `ticks` ticks pass: advance `tick` and `waited` (all that hardware does), and keep to `patience`.
 
-        `ticks` exceeds the level's cycle after missed cycles, and is 0 for none.
+        `ticks` exceeds the level's cycle after missed cycles, and may be 0.
         """
 
     def refused(self, torque: Array) -> Finding | None:
@@ -123,13 +122,13 @@ class Arm(ABC):
         return f"geom {contact[0]} touches geom {contact[1]}"
 
     def weaken(self, most: Array | None) -> None:
-        """Limit the motors to `most`, (joints,), N m, whatever they are given; None: they are sound.
+        """Limit the motors' torque to `most`, (joints,), N m, as if they were weak; None: they are sound.
 
         Injected faults of motors act through this. Default: they have no effect.
         """
 
     def look(self, scene: Message) -> None:
-        """Fill a `SCENE` with the poses of bodies and tool. Default: bodies as at the start, the tool as sensed."""
+        """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the tool as sensed."""
         self._data.qpos[self.cell.qpos] = self.sense().position
         self._show(scene)
 
@@ -144,7 +143,7 @@ class Arm(ABC):
         mujoco.mju_mat2Quat(scene.tool_quaternion, d.site_xmat[cell.tool])
 
     def save(self, state: Message) -> None:
-        """Fill an `ARM_STATE` with all that a restarted board must know. Default: the attributes.
+        """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
 
         A simulation adds its state: `state.state` has room for MuJoCo's integration state of the cell.
         """

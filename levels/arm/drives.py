@@ -12,7 +12,7 @@ from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
 STANDSTILL = 0.01
 """Joint speed, rad/s, below which a joint holds its position."""
 SPEED_PART = 0.99
-"""Part of a velocity limit that the gate lets a joint reach; what its model leaves out in a cycle fits in the rest."""
+"""Part of a velocity limit that the gate lets a joint reach; the rest covers model errors within a cycle."""
 RANGE_KEPT_RAD = 0.002
 """Distance that the gate keeps from the ends of a joint's range, for the same reason."""
 HARD, SOFT = 0, 8
@@ -20,7 +20,7 @@ HARD, SOFT = 0, 8
 
 
 class Brake:
-    """Stops the joints and holds them where they came to rest, also a joint whose motor is off."""
+    """Stops the joints and holds them where they came to rest, even with the motors off."""
 
     def __init__(self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0) -> None:
         """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of the hold."""
@@ -110,7 +110,7 @@ class CoarseSensors:
     """Samples positions and velocities of the joints: noise on the truth, then the nearest step of the encoder.
 
     Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as positions over
-    `EDGE_TIMING_S`. The noise of a tick is always the same, also for a restarted board and a second look.
+    `EDGE_TIMING_S`. The noise of a tick is always the same, even on a restarted board or when sampled twice.
     """
 
     def __init__(self, encoders: Encoders, seed: int) -> None:

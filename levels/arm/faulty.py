@@ -1,6 +1,6 @@
-"""The link between the servo level and its arm while it has faults: samples on their way up, torques down, motors.
+"""The link between the servo level and its arm, with faults injected into samples, torques and motors.
 
-The steps that act are in `rack.levels.faults`.
+The steps that act the faults are in `rack.levels.faults`.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART,
 STEPS = (SensorStep, MotorStep, CommandStep)
 """Classes of steps that act on an arm, as `Executor.faults` names them."""
 SLIGHT = 0.02
-"""Part of its torque limit that a motor must lack to count, besides what dry friction and a contact may hide."""
+"""Part of its torque limit that a motor must lack to count, in addition to what friction and a contact may hide."""
 TURNS_FROM = 5.0 * FRICTION_SPEED
-"""Velocity, rad/s, from which on the dry friction of a joint is known."""
+"""Velocity, rad/s, above which the dry friction of a joint is known."""
 
 
 class FaultyLink:
-    """Implements `Link` with faults in it. `acted` collects the places of the faults that act, for `Executor.acted`."""
+    """Implements `Link` with injected faults. `acted` collects the indices of those that act, for `Executor.acted`."""
 
     def __init__(self, arm: Arm, cell: Cell, every: int, acted: list[int]) -> None:
         """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell."""
@@ -35,7 +35,7 @@ class FaultyLink:
         self._limits = limits = cell.bounds.torque
         # Friction that helped may now resist: it hides twice its value.
         self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
-        # A push that carried may now press.
+        # A contact that pushed along may now push back.
         self._pressed = 2.0 * MAX_CONTACT_PART * limits
         self._sensors: list[tuple[SensorStep, ActiveFault]] = []
         self._motors: list[tuple[float, ActiveFault]] = []  # with the part of its torque limit that a motor still gives
@@ -44,7 +44,7 @@ class FaultyLink:
         self._torque = np.zeros(len(limits))
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Take over all faults that are active from now on; one of a joint that the arm lacks strikes nothing."""
+        """Replace the active faults; one of a joint that the arm lacks has no effect."""
         active = [
             ActiveFault(place, fault, self._joints(fault), self._every, self._kept)
             for place, fault in enumerate(faults)
@@ -68,7 +68,7 @@ class FaultyLink:
         return most
 
     def sense(self) -> Sensed:
-        """Return the newest sample as the faults leave it."""
+        """Return the newest sample with the faults applied."""
         sample = self._arm.sense()
         for step, active in self._sensors:
             sample, acts = step.act(sample, active)
@@ -77,7 +77,7 @@ class FaultyLink:
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Pass on torques as the faults leave them."""
+        """Pass on torques with the faults applied."""
         if self._commands:
             torque = self._corrupt(torque)
         found = self._arm.drive(torque, grip_force)

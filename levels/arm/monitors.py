@@ -13,9 +13,9 @@ QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
 
 
 class LimitMonitor:
-    """Records position, velocity and torque, of motor and brake together, in every step; judges once a tick.
+    """Records position, velocity and torque, of motor and brake together, in every step; judges once per tick.
 
-    It shares nothing with the limit gate, which keeps the limits.
+    It shares no code with the limit gate, which enforces the limits.
     """
 
     def __init__(self, cell: Cell, data: mujoco.MjData, substeps: int) -> None:
@@ -32,7 +32,7 @@ class LimitMonitor:
         self._low[self._columns] = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
         self._high[self._columns] = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
         self.count = 0  # steps in which the drives broke a limit
-        self.pushed = 0  # steps in which a blow did, of position or velocity, and no torque: no drive can prevent it
+        self.pushed = 0  # steps in which a blow broke a limit of position or velocity: no drive can prevent it
         self.first = ""  # the first broken limit, readable
 
     def look(self, substep: int) -> None:
@@ -44,9 +44,9 @@ class LimitMonitor:
         np.add(motors, brakes, out=torque)
 
     def judge(self, time_s: float, struck: bool) -> bool:
-        """Judge the steps of one tick that began at simulated `time_s`; return whether one broke a limit.
+        """Judge the steps of the tick that began at simulated `time_s`; return whether one broke a limit.
 
-        `struck`: the motion is still that of a blow.
+        `struck`: a blow still moves the arm.
         """
         # NaN is not within limits either. (Counting is five times as fast as `all`.)
         within = np.count_nonzero(self._seen >= self._low) + np.count_nonzero(self._seen <= self._high)
@@ -87,7 +87,7 @@ class ContactMonitor:
         self._root = cell.model.body_rootid[cell.model.geom_bodyid]
         self.count = 0  # unintended contacts, summed over the steps
         self.first = ""  # the first one, readable: which geoms, and when
-        self.struck: tuple[int, int] | None = None  # geoms of the newest one of arm or load since this was set to None
+        self.struck: tuple[int, int] | None = None  # geoms of the newest one of arm or load since last cleared
 
     def look(self, data: mujoco.MjData, time_s: float) -> None:
         """Count the unintended contacts of one step at simulated `time_s`."""

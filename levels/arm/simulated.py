@@ -19,14 +19,14 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import MotionConfig, SceneConfig
 
 STRUCK_TICKS = 40
-"""Ticks after a contact, or after the last limit broken since, for which the arm's motion is that of the blow."""
+"""Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the blow."""
 
 
 class SimulatedArm(Arm):
     """Implements `Arm`: `substeps` MuJoCo steps a tick; simulated time is tick times period, always.
 
     Samples are as coarse and noisy as the cell's encoders; brakes and limit gate belong to the drives and see the
-    truth. A command is for one torque cycle. It passes the limit gate in every tick, also in those that the servo level
+    truth. A command is for one torque cycle. It passes the limit gate in every tick, even in those that the servo level
     missed.
     """
 
@@ -48,7 +48,7 @@ class SimulatedArm(Arm):
         joints = len(cell.qpos)
         self._true = (np.zeros(joints), np.zeros(joints))  # position and velocity
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
-        self._struck = 0  # ticks for which the motion is still that of a blow
+        self._struck = 0  # ticks for which the motion is still blamed on a blow
         self._sound = np.zeros(mujoco.mj_stateSize(cell.model, STATE))  # MuJoCo's state before the tick
         self._command: Array = np.zeros(joints)  # N m
         self._given = False  # the command for the coming tick has passed the gate
@@ -179,7 +179,7 @@ class SimulatedArm(Arm):
         self._given = True
 
     def _simulate(self) -> None:
-        """Simulate one tick; if that ends in a fault, the state before it stays."""
+        """Simulate one tick; on a fault, restore the state before it."""
         m, d = self._model, self._data
         mujoco.mj_getState(m, d, self._sound, STATE)
         for mocap, motion in self._motions:
@@ -210,7 +210,7 @@ class SimulatedArm(Arm):
 
 
 class ObstacleMotion:
-    """The moves of one obstacle; a move that starts before the last has ended cuts that short."""
+    """The moves of one obstacle; a move that starts before the last one has ended cuts it short."""
 
     def __init__(self, start: Array, moves: tuple[MotionConfig, ...]) -> None:
         """Start at the place `start`, (3,), m."""

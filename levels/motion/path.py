@@ -13,7 +13,7 @@ from rack.levels.algebra import Array, norm
 COINCIDENT_RAD = 1e-7
 """Waypoints closer than this count as one, and a shorter blend counts as none."""
 MAX_STRAIGHT_BEND = 1e-9
-"""Two unit directions that differ less than this are one direction: the corner between them needs no stop."""
+"""Two unit directions that differ by less than this count as equal: the corner between them needs no stop."""
 OVERLAP_ROUNDING = 1e-9
 """Blends may overlap by this part of the line between them, from rounding."""
 
@@ -141,7 +141,7 @@ class BlendedPath:
         self.breaks = np.array(self._breaks)  # (pieces + 1,), rad: s where each piece begins, and the end
 
     def _add_piece(self, piece: tuple[int, int], end: float) -> None:
-        """Append a piece up to `end`, unless blends that meet leave no line between them."""
+        """Append a piece up to `end`, unless adjacent blends leave no line between them."""
         if end - self._breaks[-1] > COINCIDENT_RAD:
             self._pieces.append(piece)
             self._breaks.append(end)

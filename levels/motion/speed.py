@@ -4,43 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.motion.path import PathBounds
+from rack.levels.robot.limits import Limits
 
 REACHABLE_PART = 1.0 - 1e-7
-"""Part of a reachable change of speed that is used: at the edge itself, rounding decides whether it is reachable."""
+"""Part of a reachable change of speed that is used: at the exact limit, rounding decides whether it is reachable."""
 MIN_ACCELERATION_PART = 1e-6
 """Acceleration or jerk below this part of the speed, in 1/s or 1/s2, counts as none."""
 SMALLEST_LINEAR_TERM = 1e-12
 """A cubic with a smaller linear coefficient is solved without it."""
 
 
-class JointLimits(Protocol):
-    """Limits of planned motion, symmetric, (joints,) each: rad/s, rad/s2, rad/s3."""
-
-    @property
-    def velocity(self) -> Array: ...
-    @property
-    def acceleration(self) -> Array: ...
-    @property
-    def jerk(self) -> Array: ...
-
-
-class BrakingLimits(NamedTuple):
-    """`JointLimits` of a hold: (joints,) each, rad/s, rad/s2, rad/s3."""
-
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-
-
-def braking_limits(limits: JointLimits, factor: float) -> BrakingLimits:
-    """Return limits with `factor` times the acceleration and jerk: on a curve, planned motion may use all there is."""
-    return BrakingLimits(limits.velocity, factor * limits.acceleration, factor * limits.jerk)
+def braking_limits(limits: Limits, factor: float) -> Limits:
+    """Return the limits of a hold, `factor` times the acceleration and jerk: planned motion on a curve may use all."""
+    return replace(limits, acceleration=factor * limits.acceleration, jerk=factor * limits.jerk)
 
 
 class SpeedLimits(NamedTuple):
@@ -51,7 +34,7 @@ class SpeedLimits(NamedTuple):
     jerk: float
 
 
-def speed_limits(piece: PathBounds, limits: JointLimits, share: float) -> SpeedLimits:
+def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits:
     """Return limits of s that keep every joint within `limits` on a piece with the given bounds, (joints,) each.
 
     The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds. `share` (0 to 1) is the
@@ -74,7 +57,7 @@ def speed_limits(piece: PathBounds, limits: JointLimits, share: float) -> SpeedL
     return SpeedLimits(speed, most, change)
 
 
-def acceleration_room(first: Array, limits: JointLimits) -> tuple[float, float]:
+def acceleration_room(first: Array, limits: Limits) -> tuple[float, float]:
     """Return the acceleration and jerk of s that the joints have on a straight line with |q'| = `first`."""
     return _least(limits.acceleration, first), _least(limits.jerk, first)
 

@@ -14,7 +14,8 @@ import ruckig
 from rack.levels.algebra import Array
 from rack.levels.messages import SECTIONS_A_LINE
 from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath, PathBounds
-from rack.levels.motion.speed import JointLimits, SpeedLimits, acceleration_room, boundary_speeds, speed_limits
+from rack.levels.motion.speed import SpeedLimits, acceleration_room, boundary_speeds, speed_limits
+from rack.levels.robot.limits import Limits
 
 SHARES = (1.0, 0.9, 0.75, 0.6)
 """Parts of a curve's highest speed that are tried; the fastest trajectory is taken."""
@@ -75,7 +76,7 @@ class Trajectory:
         return Trajectory(self.sections * powers, self.duration * factor)
 
 
-def make_trajectory(path: BlendedPath, limits: JointLimits, begin: float = 0.0) -> Trajectory:
+def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Trajectory:
     """Make the fastest motion found from rest at `begin`, in rad, to rest at the end of `path`.
 
     It rests at the path's stops too. The path's analytic bounds, not samples, ensure that joint velocity, acceleration
@@ -90,21 +91,16 @@ def make_trajectory(path: BlendedPath, limits: JointLimits, begin: float = 0.0) 
     return _joined(rows, marks[0])
 
 
-def duration(path: BlendedPath, limits: JointLimits) -> float:
-    """Return the time of the fastest motion found along `path`, rest to rest, in s."""
-    return make_trajectory(path, limits).duration
-
-
-def make_stop(path: BlendedPath, limits: JointLimits, state: PathState) -> Trajectory | None:
+def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory | None:
     """Make the shortest ramp found to rest along `path` from `state` that keeps the joint limits.
 
     None: every ramp would exceed a limit or overrun the path. Motion may then follow its trajectory, which itself ends
-    at rest, and ask again a cycle later. Bounded time, whatever the path.
+    at rest, and try again a cycle later. The time taken is bounded for every path.
     """
     if state.ds < MAX_REST_RAD_S:
         return _joined([], state.s)
     most, jerk = acceleration_room(path.bounds.first[path.piece_at(state.s)], limits)
-    # After a stop the path continues in another direction: only rest may be there.
+    # After a stop the path continues in another direction: the motion must rest there.
     end = next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
     for part, part_of_jerk in STOP_EFFORTS:
         stop = _ramp(state, max(part * most, abs(state.dds)), part_of_jerk * jerk)
@@ -132,7 +128,7 @@ class _Run:
         return [alone, ([self.marks[0], self.marks[-1]], together)] if len(self.marks) > 2 else [alone]
 
 
-def _fastest(run: _Run, limits: JointLimits) -> list[Section]:
+def _fastest(run: _Run, limits: Limits) -> list[Section]:
     """Return the fastest of a few candidates that fit into a message."""
     best: list[Section] = []
     least = np.inf
@@ -192,7 +188,7 @@ def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
     return Trajectory(sections, float(ends[-1]))
 
 
-def _keeps(stop: Trajectory, path: BlendedPath, limits: JointLimits) -> bool:
+def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
     """Return whether every joint keeps its limits, by bounds of motion and path over each interval of time."""
     switches = stop.sections[:, 0]
     times = _checked_times(stop)

@@ -16,7 +16,7 @@ from ompl import base, geometric, util
 from rack.levels.algebra import Array, norm
 from rack.levels.messages import WAYPOINTS
 from rack.levels.motion.path import BlendedPath, Path
-from rack.levels.motion.trajectory import duration
+from rack.levels.motion.trajectory import make_trajectory
 from rack.levels.planning.ik import sampling_range
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geoms_of
@@ -93,7 +93,7 @@ class PathPlanner:
 
     def duration(self, path: Path) -> float:
         """Return the time of `path`, rest to rest, in s."""
-        return duration(BlendedPath(*path), self._limits)
+        return make_trajectory(BlendedPath(*path), self._limits).duration
 
     def _sampled(self, query: Query, attempt: int, searches: int) -> list[Path]:
         paths: list[Path] = []

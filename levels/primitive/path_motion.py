@@ -8,8 +8,8 @@ import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath
-from rack.levels.motion.speed import BrakingLimits
 from rack.levels.motion.trajectory import Trajectory, make_stop
+from rack.levels.robot.limits import Limits
 
 NEAREST_STEP_RAD = 0.01
 """Spacing of the points among which the one nearest to the arm is searched."""
@@ -29,7 +29,7 @@ class PathMotion:
     The arm may begin slightly off the path: the motion removes the distance over its first `bridging_s`.
     """
 
-    def __init__(self, path: BlendedPath, braking: BrakingLimits, bridging_s: float) -> None:
+    def __init__(self, path: BlendedPath, braking: Limits, bridging_s: float) -> None:
         self.path = path
         self.s = 0.0  # path parameter of the set point, rad
         self.trajectory: Trajectory | None = None  # None: at rest

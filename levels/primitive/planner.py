@@ -20,10 +20,7 @@ from rack.levels.tables import read_params
 class PrimitivePlanner(Planner):
     """Makes the trajectory that the executor's status wants: of the next segment, or from where a path was held."""
 
-    inputs = {
-        "command": Input(MOVE_COMMAND, "above.command"),
-        "status": Input(PRIMITIVE_STATUS, "own.status"),
-    }
+    inputs = {"command": Input(MOVE_COMMAND, "above.command"), "status": Input(PRIMITIVE_STATUS, "own.status")}
     output = TRAJECTORY
     params = PrimitiveParams
 

@@ -16,12 +16,13 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.motion.path import BlendedPath
-from rack.levels.motion.speed import BrakingLimits, JointLimits, braking_limits
+from rack.levels.motion.speed import braking_limits
 from rack.levels.motion.trajectory import Trajectory
 from rack.levels.primitive.guard import Guard
 from rack.levels.primitive.path_motion import PathMotion
 from rack.levels.primitive.segment import MotionSegment, SegmentFault
 from rack.levels.primitive.tracking import HANDOVER_CYCLES
+from rack.levels.robot.limits import Limits
 from rack.levels.tables import GripperConfig, Positive, Table
 
 ANSWER_CYCLES = 3
@@ -55,12 +56,12 @@ class WorkRules:
     """The bounds by which segments are done."""
 
     joints: tuple[str, ...]
-    limits: JointLimits
+    limits: Limits
     params: PrimitiveParams
     period_s: float  # the level's cycle
 
     @property
-    def braking(self) -> BrakingLimits:
+    def braking(self) -> Limits:
         """Limits of a hold."""
         return braking_limits(self.limits, self.params.braking)
 

@@ -38,7 +38,7 @@ class Cell:
     gripper_dof: int | None
     gripper_actuator: int | None
     gripper_open: float | None  # joint position, m or rad
-    gripper_closed: float | None  # joint position when closed on nothing, m or rad
+    gripper_closed: float | None  # joint position when closed without a part, m or rad
     gripper_stiffness: float | None  # of the gripper's position loop, N/m or N m/rad
     linkage: Linkage | None  # positions of all joints of the gripper, by its opening
     arm_geoms: NDArray[np.int_]  # geoms that the arm moves, gripper included
@@ -48,7 +48,7 @@ class Cell:
     mocap: NDArray[np.int_]  # (obstacles,), mocap ids
     supports: NDArray[np.int_]  # geoms
     touch: NDArray[np.bool_]  # (ngeom, ngeom), True where a contact is unintended
-    bounds: Bounds  # never exceeded by the arm
+    bounds: Bounds  # that the arm never exceeds
     limits: Limits  # of planned motion
     encoders: Encoders  # resolution and noise of its sensors
 
@@ -161,7 +161,7 @@ def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArra
 
 
 def start_qpos(cell: Cell) -> NDArray[np.float64]:
-    """Return qpos of the start: arm at home, gripper and all that follows it open, the rest as in the model."""
+    """Return qpos of the start: arm at home, gripper and its linkage open, the rest as in the model."""
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = cell.home
     if cell.linkage is not None and cell.gripper_open is not None:

@@ -17,7 +17,7 @@ from rack.levels.algebra import Array, each, gram, mat_vec, transposed_mat_vec
 from rack.levels.robot.cell import Cell
 
 FRICTION_SPEED = 0.01
-"""Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at rest would excite the arm."""
+"""Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at zero speed would excite the arm."""
 
 OFF = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR
 

@@ -19,14 +19,14 @@ EDGE_TIMING_S = 0.1
 """A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
 the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no filter's lag."""
 MAX_CONTACT_PART = 0.2
-"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a third more than seen in
-tasks."""
+"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a third more than observed
+in tasks."""
 MAX_RESTING_CONTACT_PART = 0.1
 """The same for an arm that holds a part and hardly moves: dry friction may hide the push at all joints but one."""
 MIN_TURNING_JOINTS = 2
 """Fewest turning joints at which an arm moves enough for a push to show."""
 SIGMAS = 6.0
-"""Standard deviations of noise that a monitor allows for: fewer than one sample in a billion is farther off."""
+"""Standard deviations of noise that a monitor allows for: less than one sample in a billion exceeds them."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Encoders:
 def joint_bounds(
     model: mujoco.MjModel, joints: NDArray[np.int_], robot: RobotConfig, torque: NDArray[np.float64]
 ) -> Bounds:
-    """Return the bounds; of a position range in both config and model the tighter end applies.
+    """Return the bounds; where config and model both limit a position, the tighter limit applies.
 
     Raises `RobotError` for an empty range.
     """

@@ -29,7 +29,7 @@ SPRING_PART = 1e-6
 DAMPING = 1e-9
 """Weight of staying in place, for joints that nothing determines."""
 FREE_PART = 0.01
-"""Share of staying in place, among all that holds a joint, above which the joint is free."""
+"""Share of `DAMPING` in all that holds a joint, above which the joint counts as free."""
 RESIDUAL = 1e-3
 """An equality that stays open by more than this, in m or rad, is not solved."""
 NOT_POSED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
@@ -123,7 +123,6 @@ class _Solver:
 
     def check(self, opening: float) -> None:
         """Raise `RobotError` where the last pose leaves an equality open."""
-        self._evaluate()
         data, jacobian = self._data, self._jacobian()
         ours = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
         ours &= data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
@@ -150,16 +149,14 @@ class _Solver:
 
     def _rows(self) -> tuple[Array, Array]:
         """Return residuals (rows,) and their Jacobian (rows, joints): equalities, and joint stops that are exceeded."""
-        self._evaluate()
         data, jacobian = self._data, self._jacobian()[:, self._dof]
         counts = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) | (data.efc_pos < 0.0)
         rows = np.flatnonzero(counts & np.any(jacobian != 0.0, axis=1))
         return np.array(data.efc_pos[rows]), np.ascontiguousarray(jacobian[rows])
 
-    def _evaluate(self) -> None:
-        mujoco.mj_fwdPosition(self._model, self._data)
-
     def _jacobian(self) -> Array:
+        """Return the Jacobian (rows, nv) of all constraints at the present pose."""
+        mujoco.mj_fwdPosition(self._model, self._data)
         return np.asarray(self._data.efc_J).reshape(-1, self._model.nv)
 
 

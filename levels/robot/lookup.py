@@ -1,4 +1,4 @@
-"""Look up in a compiled model what a config names. Every mistake is one `RobotError` that lists what the model has."""
+"""Look up the names of a config in a compiled model. Every mistake is one `RobotError` that lists the valid names."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Read an MJCF file and fit it to the servo level: torque motors, integrator, time step, tool, keyframe.
 
-The file may come from a stranger: every mistake is one `RobotError`, in bounded time and memory.
+The file is not trusted: every mistake is one `RobotError`, in bounded time and memory.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GRID_CELLS = 4_000_000
 MODEL_BYTES = 16_000_000
 """Size of one XML file, at most."""
 LONGEST_STEP_S = 0.1
-"""A longer time step in an MJCF file is a slip, ms for s."""
+"""A longer time step in an MJCF file is a mistake, such as ms for s."""
 GRIDS = (("nrow", "ncol"), ("width", "height"))
 JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -171,7 +171,7 @@ def drive_limit(actuator: mujoco.MjsActuator) -> float:
 
 
 def reach(limited: mujoco.mjtLimited, span: NDArray[np.float64]) -> float:
-    """Return how far a range goes both ways; 0: there is no range."""
+    """Return the largest symmetric range within `span`; 0: there is none."""
     if limited == mujoco.mjtLimited.mjLIMITED_FALSE or not span[0] < span[1]:
         return 0.0
     return max(0.0, min(-float(span[0]), float(span[1])))

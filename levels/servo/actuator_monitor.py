@@ -1,4 +1,4 @@
-"""Judges from the arm's motion whether its motors give the torques commanded."""
+"""Judges from the arm's motion whether its motors give the commanded torques."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
 NOISE_PART = 0.005
-"""Part of a torque limit that the equation of motion may leave unexplained; ten times that of faultless runs."""
+"""Part of a torque limit that the equation of motion may leave unexplained: ten times that of faultless runs."""
 LACKING_PART = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
 SURE_CYCLES = 4
-"""Cycles needed to tell a motor that does not give more when commanded more from a load on the arm."""
+"""Cycles needed to distinguish a motor whose torque does not rise with its command from a load on the arm."""
 RISE_PART = 0.3
 """Least part of a rise in torque that a sound motor gives."""
 DEAD_PART = 0.5
-"""Part of its torque that a motor must lack to be dead where dry friction hides how much it gives."""
+"""Part of its torque that a motor must lack to count as dead where dry friction hides its torque."""
 URGENT_SPEED_PART = 0.99
-"""Part of a velocity limit; a joint that may reach it while motors lack torque leaves no time to be sure."""
+"""Part of a velocity limit: if a joint may reach it while motors lack torque, there is no time to be certain."""
 TURNING = np.array([[-2.0], [2.0]])
 """Velocities, in `FRICTION_SPEED`, between which dry friction may be anything up to its full value."""
 
@@ -32,10 +32,10 @@ TURNING = np.array([[-2.0], [2.0]])
 class ActuatorMonitor:
     """Compares the torques that a motion took with the torques commanded for it.
 
-    A difference is explained by motors that gave less than commanded, or by something outside that pushes: then, until
-    the difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` has failed. A pulling load looks like a
-    motor that lacks torque for a cycle or two; but under load, a motor commanded more gives more. A motor has failed,
-    too, when the arm strays from its set points by more than `following`, rad.
+    A difference comes from motors that gave less than commanded, or from an external push: in that case, until the
+    difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` has failed. For a cycle or two, a pulling
+    load looks like a motor that lacks torque; but under load, a motor commanded more gives more. A motor has also
+    failed when the arm strays from its set points by more than `following`, rad.
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
@@ -54,13 +54,13 @@ class ActuatorMonitor:
         self._bias, self._velocity, self._torque = np.zeros((3, joints))
         self._friction = np.zeros((2, joints))
         self._begun = False
-        self._pushed = False  # motors do not explain the difference
-        self._cycles, self._joint = 0, -1  # for which a motor has lacked torque, and which
+        self._pushed = False  # weak motors do not explain the difference
+        self._cycles, self._joint = 0, -1  # cycles for which a motor has lacked torque, and its joint
         self._commanded = self._given = self._most = 0.0  # N m: commanded and given at first, most given since
         self._alone = True  # it is the only motor that lacks torque
 
     def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
-        """Take the arm's state, rad/s, N m, at the beginning of a cycle, and the torques that it was given."""
+        """Record velocity, rad/s, terms and commanded torques, N m, at the beginning of a cycle."""
         np.copyto(self._velocity, velocity)
         np.copyto(self._inertia, terms.inertia)
         np.copyto(self._bias, terms.bias)
@@ -73,7 +73,7 @@ class ActuatorMonitor:
         self._cycles = 0
 
     def look(self, velocity: Array, terms: Terms, astray: Array, holds: bool) -> Finding | None:
-        """Judge the cycle that ends now, at `velocity`, rad/s, and `astray`, rad, from the set points.
+        """Judge the cycle that ends now, at `velocity`, rad/s; `astray` is the distance from the set points, rad.
 
         `holds`: the gripper holds a part, which may touch something.
         """
@@ -85,7 +85,7 @@ class ActuatorMonitor:
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
         left = self._left_over(velocity, terms)
         if not self._exact:
-            # A change in velocity that encoders may show without one.
+            # The change in velocity that the encoders' errors may simulate.
             self._noise = self._least + mat_vec(np.abs(terms.inertia), 2.0 * self._speed_off / self._period_s)
         if not np.count_nonzero(np.abs(left) > self._noise):
             self._cycles, self._pushed = 0, False
@@ -142,9 +142,10 @@ class ActuatorMonitor:
         return None
 
     def _sure(self, joint: int, commanded: float, lacks: float) -> bool:
-        """Return whether the motor surely gives nothing, or no more when commanded more, or less than a push may take.
+        """Return whether it is certain that the motor has failed.
 
-        A dead motor may seem to give what dry friction does: twice its value, where that changes sign.
+        It gives nothing, or no more when commanded more, or it lacks more than a push may take. Dry friction that
+        changes sign may look like torque of a dead motor, up to twice its value.
         """
         if self._cycles < SURE_CYCLES:
             return False

@@ -52,7 +52,7 @@ class ServoParams(Table):
 class ComputedTorque:
     """torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction; M is the planner's.
 
-    Every joint's error is that of a damped oscillator, whatever the arm's state. Torques stay within the torque limits.
+    Every joint's error is that of a damped oscillator in every state of the arm. Torques stay within their limits.
     """
 
     def __init__(self, cell: Cell, params: ServoParams) -> None:
@@ -60,15 +60,15 @@ class ComputedTorque:
         self._limits = cell.bounds.torque
         self._stiffness = params.bandwidth**2
         self._damping = 2.0 * params.damping * params.bandwidth
-        self.cut = 0  # cycles in which a torque limit cut the torque wanted
+        self.cut = 0  # cycles in which a torque limit cut a torque
 
     def terms(self, position: Array, velocity: Array, plan: Message | None) -> Terms:
-        """Return the equation of motion at rad, rad/s, with the object held. Valid until the next call."""
+        """Return the equation of motion at rad, rad/s, with the held object. Valid until the next call."""
         payload = None if plan is None else Payload(plan.payload_mass, plan.payload_offset)
         return self._dynamics.terms(position, velocity, payload)
 
     def torque(self, wanted: Motion, position: Array, velocity: Array, terms: Terms, plan: Message | None) -> Array:
-        """Return the torques, (joints,), N m, that lead to the motion wanted."""
+        """Return the torques, (joints,), N m, for the wanted motion."""
         inertia = terms.inertia if plan is None else plan.inertia
         acceleration = (
             wanted.acceleration

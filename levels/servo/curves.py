@@ -80,7 +80,7 @@ class Decay:
         self._zero = np.zeros_like(position)
 
     def at(self, time_s: float) -> Motion:
-        """Return the rest of the difference at `time_s` from 0 on."""
+        """Return the remaining difference at `time_s` from 0 on."""
         if time_s >= self.duration_s:
             return Motion(self._zero, self._zero, self._zero)
         c0, c1, c3, c4, c5 = self._coefficients

@@ -24,11 +24,11 @@ from rack.levels.tables import read_params
 
 
 class ServoExecutor(Executor):
-    """Follows joint set points with torques, and lets the arm's time pass.
+    """Follows joint set points with torques, and advances the arm's time.
 
-    A cycle first lets the ticks since the last one pass: the arm's time is the clock's, even if cycles were missed.
-    Safety comes first: on a demand, and while sensors or motors are at fault, the arm holds, stops or is braked, and
-    motion resumes afterwards from where it stands. An operator's command comes second, the level above third.
+    A cycle first advances the arm by the ticks since the last one: its time is the clock's, even if cycles were missed.
+    Safety comes first: on a demand, and while sensors or motors are at fault, the arm holds, stops or is braked;
+    afterwards motion resumes from where it is. An operator's command comes second, the level above third.
     """
 
     inputs = {
@@ -58,9 +58,9 @@ class ServoExecutor(Executor):
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._rest = np.zeros(len(cell.home))  # (joints,), always zero: velocity and acceleration at rest
-        self._wanted = Motion(cell.home, self._rest, self._rest)  # of the last cycle: rad, rad/s, rad/s2
+        self._wanted = Motion(cell.home, self._rest, self._rest)  # motion wanted in the last cycle: rad, rad/s, rad/s2
         self._started = False  # the first cycle has begun
-        self._abandoned = False  # set points were given up in the last cycle: the arm was braked
+        self._abandoned = False  # set points were abandoned in the last cycle: the arm was braked
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
@@ -68,7 +68,7 @@ class ServoExecutor(Executor):
         self._link = self._faulty if faults else self.arm
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Let time pass up to `tick`, sense, interpolate, drive; report."""
+        """Advance the arm to `tick`, sense, interpolate, drive, report."""
         missed = self._catch_up(read.before.value if read.before.is_there else None, tick)
         sensed, sensors = self._link.sense(), self.sensors
         contact = self.arm.contact
@@ -93,7 +93,7 @@ class ServoExecutor(Executor):
         self.arm.look(write.scene)
 
     def _catch_up(self, before: Message | None, tick: int) -> bool:
-        """Let time pass up to `tick`; return whether cycles were missed. A restarted board first restores the arm."""
+        """Advance the arm to `tick`; return whether cycles were missed. A restarted board first restores the arm."""
         if not self._started:
             self._start(before, tick)
             return False
@@ -132,7 +132,7 @@ class ServoExecutor(Executor):
         self._abandoned = True
 
     def _drive(self, read: Ports, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
-        """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop has come to rest."""
+        """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is complete."""
         command: Message = read.command.value
         plan: Message | None = read.plan.value if read.plan.is_there else None
         position, velocity = self.sensors.position, self.sensors.velocity
@@ -153,7 +153,7 @@ class ServoExecutor(Executor):
         return self.motors.begin(velocity, terms, self.arm.torque)
 
     def _next_motion(self, command: Message, reaction: Reaction, missed: bool, tick: int) -> Motion:
-        """Return the motion wanted; after braking it begins where the arm stands."""
+        """Return the wanted motion; after braking it begins where the arm is."""
         sensors, reference = self.sensors, self.reference
         if self._abandoned:
             reference.start(sensors.position, sensors.velocity, tick)
@@ -169,7 +169,7 @@ class ServoExecutor(Executor):
         return self.stopping.motor_fails(finding.subject, finding.value, tick)
 
     def _refuse(self, finding: Finding, tick: int) -> None:
-        """React to an arm that refused a torque and engaged its brakes."""
+        """React to a torque that the arm refused, engaging its brakes."""
         refused = self.stopping.refused
         if refused is None or finding.alarm is not refused.alarm:
             self.findings.append(finding)

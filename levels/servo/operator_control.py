@@ -1,4 +1,4 @@
-"""An operator's commands to the servo level: hold, or bring the joints to a set point; then back the same way."""
+"""An operator's commands to the servo level: hold, or move the joints to a set point, and later return the same way."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rack.levels.servo.reference import Reference
 class OperatorControl:
     """Follows the operator.
 
-    To resume, the arm returns through the places from which it set out: the level above finds it on its path, and the
-    way out was free. A restarted board has forgotten the way: the level above then continues from where the arm is.
+    To resume, the arm returns through the places from which it set out: that way was free, and the level above finds
+    the arm on its path. A restarted board has lost these places: the level above then continues from where the arm is.
     """
 
     def __init__(self, commands: Commands, joints: Sequence[str], ranges: Array) -> None:
@@ -30,7 +30,7 @@ class OperatorControl:
         self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
 
     def take(self, operator: Reading) -> None:
-        """Take up new commands."""
+        """Accept new commands."""
         if not self.orders.take(operator, self._judge):
             return
         if self.orders.standing is Operation.NONE and self._way:
@@ -69,13 +69,13 @@ class OperatorControl:
         return motion
 
     def _aim(self) -> Array | None:
-        """Return where the joints are to go, (joints,), rad; None: nowhere."""
+        """Return the goal of the joints, (joints,), rad; None: they stay."""
         if self.orders.standing is Operation.SETPOINT:
             return self._goal
         return self._way[-1] if self.orders.standing is Operation.NONE and self._way else None
 
     def _arrive(self) -> None:
-        """React to the arm resting where it should."""
+        """React to the arm's arrival at its goal."""
         if self.orders.standing is Operation.NONE and self._way:
             self._way.pop()
         if self.orders.standing is not Operation.NONE or not self._way:

@@ -35,7 +35,7 @@ class ServoPlanner(Planner):
         self._rest = np.zeros(len(cell.home))
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Return True: the arm is always somewhere else."""
+        """Return True: the arm keeps moving, so its inertia keeps changing."""
         return True
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:

@@ -1,8 +1,8 @@
-"""The set point of every servo cycle, between the set points that come from above.
+"""The set point of every servo cycle, interpolated between the set points of the level above.
 
-A set point is to be reached at its `due` tick; the next one has arrived by then. In between the motion is the cubic
-Hermite curve through positions and velocities, so it is C1. When none comes in time the motion ramps to rest; when set
-points resume it joins them smoothly.
+A set point is to be reached at its `due` tick; the next one has arrived by then. In between, the motion is the cubic
+Hermite curve through positions and velocities, so it is C1. If none arrives in time, the motion ramps to rest; when set
+points resume, it joins them smoothly.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ MAX_ACCELERATION = 2.0
 """Multiple of the acceleration limits that the curve between two set points may need: planned motion, interpolated,
 needs a little more than 1."""
 JOINING_SPEED_PART = 0.25
-"""Part of the velocity limits that joining may add to a motion."""
+"""Part of the velocity limits that joining the set points may add to a motion."""
 ASTRAY_RAD = 0.005
-"""Distance from the reference beyond which an arm is not pulled back at once after missed cycles."""
+"""Distance from the reference beyond which an arm is led back gradually after missed cycles."""
 MAX_AHEAD_S = 2.0
 """Time ahead at which a set point may be due: beyond that it is a broken command, not a slow level."""
 
@@ -43,7 +43,7 @@ class Reference:
         joints = len(limits.velocity)
         self._nothing = Decay(np.zeros(joints), np.zeros(joints), limits.velocity, limits.acceleration)
         self._due = 0  # tick at which the present curve ends
-        self._next: SetPoint | None = None  # waits until then
+        self._next: SetPoint | None = None  # the set point to follow after that
         self.goal: Array | None = None  # (joints,), rad: goal of `to`, until another motion begins; None: none
         self.holding = True  # no fresh set point
         self.refused = 0  # set points cut at the bounds, and cycles that saw one that is NaN or too far ahead

@@ -16,33 +16,33 @@ from rack.levels.servo.control import ServoParams
 Mask = NDArray[np.bool_]
 
 FIT_RAD = 5e-5
-"""Difference between a position and where the velocities lead: 20 times that of faultless runs, contacts included."""
+"""Permitted difference between a position and the integrated velocities: 20 times that of faultless runs."""
 BEYOND_RAD, BEYOND_SPEED = 0.05, 1.2
-"""Distance beyond its range, and multiple of its velocity limit, that no joint can reach."""
+"""Distance beyond its range, rad, and multiple of its velocity limit, that no joint can reach."""
 STILL_CYCLES = 10
-"""Cycles without the least change, while the set point moves, after which a sensor is stuck."""
+"""Cycles without any change, while the set point moves, after which a sensor is stuck."""
 STILL_RAD = 5e-5
-"""Least way of the set point in that time: however slow, a joint driven with a stuck sensor soon runs away."""
+"""Least distance that the set point moves in that time: even a slow joint soon runs away with a stuck sensor."""
 PLAUSIBLE_RAD = 1e-3
-"""Offset that came with a fault of a joint's sensor and is accepted at rest: a millimetre at the arm's reach."""
+"""Offset after a fault of a joint's sensor that is accepted at rest: a millimetre at the arm's reach."""
 STUCK_RAD = 0.01
 """Distance that a joint may have moved before its stuck sensor is noticed."""
 STUCK_STEPS = 3.0
-"""Way, in multiples of twice a good sample's largest error, after which an encoder that shows none is stuck."""
+"""Motion, in multiples of twice a good sample's largest error, after which an encoder that shows none is stuck."""
 UNSEEN_S = 0.05
-"""Time for which a joint may have moved off while its sensor, unnoticed, was stuck."""
+"""Time for which a joint may have accelerated while its stuck sensor was not yet noticed."""
 BRAKE_TAIL_S2 = 1e-3
-"""Way of a braked joint beyond v^2 / 2 a, per rad/s2 of its braking."""
+"""Braking distance of a joint beyond v^2 / 2 a, per rad/s2 of its braking."""
 STRUCK_SPEED = 5.0
-"""Multiple of the fastest velocity that a blow may give a joint, within a cycle and without any model."""
+"""Multiple of the fastest velocity that a blow may give a joint within a cycle."""
 SILENT_CYCLES = 2
 """Cycles without a new sample after which the sensors are silent."""
 
 
 class SensorMonitor:
-    """Checks every sample against the one before: the position must be where the velocities lead.
+    """Checks every sample against the one before: positions must agree with the integrated velocities.
 
-    A joint is good again when its samples agree with the estimate, and with each other, `good_cycles` in a row: an
+    A joint is good again when its samples agree with the estimate, and with each other, for `good_cycles` in a row: an
     offset greater than `doubt` is never accepted.
     """
 
@@ -59,28 +59,24 @@ class SensorMonitor:
         self._braking, self._tick_s, self._every = cell.limits.acceleration, tick_s, every
         joints = len(home)
         self.position = home.copy()  # (joints,), rad: as sensed; estimated for joints whose sensor is suspect
-        self.velocity = np.zeros(joints)  # (joints,), rad/s, likewise; unknown ones as the brakes stop the arm
+        self.velocity = np.zeros(joints)  # (joints,), rad/s, likewise; unknown ones are estimated as braked
         self.doubt = np.zeros(joints)  # (joints,), rad: largest error of `position`
         self.fresh = True  # there is a sample of this cycle
         self.faulty = False  # a sensor is, or was until fewer than `good_cycles` ago, at fault
         self.drivable = True  # velocities are known, so the arm could still be driven
-        self.blamed = (
-            -1,
-            0.0,
-            0.0,
-        )  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
-        self.findings: list[Finding] = []  # new ones, one an episode; the executor takes them out
+        self.blamed = (-1, 0.0, 0.0)  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
+        self.findings: list[Finding] = []  # new ones, one per episode; the executor removes them
         self._raw = (home.copy(), np.zeros(joints))  # position and velocity of the last sample
         self._unchanged = np.zeros(joints, dtype=bool)  # the last sample trusted showed the position before it
         self._still = np.zeros(joints, dtype=int)  # cycles without a change while the set point moves
-        self._still_way = np.zeros(joints)  # rad: way of the set point in that time
-        self._claimed = np.zeros(joints)  # rad: way by the sensed velocity while the sample does not change
+        self._still_way = np.zeros(joints)  # rad: motion of the set point in that time
+        self._claimed = np.zeros(joints)  # rad: integrated sensed velocity while the sample does not change
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
         self._sent = self._everyone  # its set point moves, or may have moved
         self._tick: int | None = None
         self._streak = 0  # good samples in a row
-        self._rung: set[Alarm] = set()  # found in this episode
+        self._rung: set[Alarm] = set()  # alarms raised in this episode
 
     def recall(self, state: Message) -> None:
         """Continue from the estimate in an `ARM_STATE`."""
@@ -92,7 +88,7 @@ class SensorMonitor:
         state.position, state.velocity, state.doubt = self.position, self.velocity, self.doubt
 
     def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
-        """Check a sample at `tick`, and add faults to `findings`, once an episode.
+        """Check a sample at `tick`, and add faults to `findings`, once per episode.
 
         `wanted` are the velocities, (joints,), rad/s, at which the arm was driven; None: it was not. `struck`:
         something has touched the arm since the last cycle.
@@ -108,7 +104,7 @@ class SensorMonitor:
         way = (0.5 * passed_s) * (qd + self.velocity)
         room = self._room + passed_s * (np.abs(change) + self._speed_room)
         if passed > self._every:
-            # Driven for a while, then braked: faster in between than at both ends.
+            # Driven for a while, then braked: in between it was faster than at both ends.
             room += passed_s * 4.0 * self._every * self._tick_s * self._braking
         fastest = self._fastest
         if struck:
@@ -142,7 +138,7 @@ class SensorMonitor:
         np.copyto(self._raw[1], qd)
 
     def _stirs(self, q: Array, qd: Array, change: Array, wanted: Array | None, passed_s: float) -> bool:
-        """Return whether no joint has been still for too long while its set point moved."""
+        """Return whether every joint has moved, or its set point has not, in the last `STILL_CYCLES`."""
         if wanted is None or np.count_nonzero(change) == change.size:
             if np.count_nonzero(self._still):
                 self._still[:] = 0
@@ -156,7 +152,7 @@ class SensorMonitor:
         return not self._is_still().any()
 
     def _claim(self, q: Array, qd: Array, passed_s: float) -> None:
-        """Add up the least way that a joint must have gone by its sensed velocity while its sample does not change."""
+        """Integrate the least motion that a joint's sensed velocity implies while its sample does not change."""
         self._claimed += passed_s * np.maximum(np.abs(qd) - self._speed_room, 0.0)
         self._claimed *= (q == self._raw[0]) & (qd == self._raw[1])
 
@@ -183,9 +179,9 @@ class SensorMonitor:
         self._unproven |= still
         self._unproven &= unchanged
         if begins:
-            # A sensor that showed no change may have been stuck while its joint crept: by that it may be off now.
+            # A sensor that showed no change may have been stuck while its joint crept: it may be off by that distance.
             np.maximum(self.doubt, np.where(self._unchanged, STUCK_RAD, PLAUSIBLE_RAD), out=self.doubt)
-            # One that shows no change now, though its joint was moved, may be stuck as well, and for longer.
+            # One that shows no change now, although its joint was driven, may have been stuck for longer.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
         self._still[still] = 0
@@ -208,7 +204,7 @@ class SensorMonitor:
     def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
         """Estimate suspect joints from their velocity, or as braked where that is unknown; take the others as sensed.
 
-        A suspect's sample that happens to fit is not taken: noise would lead the estimate away step by step.
+        A suspect's sample that happens to fit is not used: with noise the estimate would drift.
         """
         coasting = self._suspect & known
         self.doubt[coasting] += 0.5 * passed_s * np.abs(qd - self.velocity)[coasting]

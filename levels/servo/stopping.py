@@ -32,7 +32,7 @@ class Cause(NamedTuple):
     """A fault that keeps the arm from its set points."""
 
     error: Error
-    text: str  # what is wrong, readable
+    text: str  # the fault, readable
     joint: int = -1
     value: float = 0.0  # measured: rad, N m or ticks, by error
     then: str = ""  # the next step, readable
@@ -41,12 +41,12 @@ class Cause(NamedTuple):
 class Stopping:
     """Weighs the rack's demands, faults of sensors, motors and torques, and blows: the strongest reaction wins.
 
-    A failed motor is retried after a while: the arm holds with it, and follows once that went well for `good_cycles`.
-    If it fails while the arm ramps or holds with it, the brakes engage. A struck arm stays braked until nothing has
-    touched it for as long.
+    A failed motor is retried after a while: the arm holds with it, and follows set points after `good_cycles` without a
+    fault. If it fails while the arm ramps or holds with it, the brakes engage. A struck arm stays braked until nothing
+    has touched it for the same time.
 
-    Faults may keep the arm from its set points for `patience`. That time runs up during faults and down while the arm
-    follows, so recurring faults use it up as well. Then the fault is latched: the brakes stay engaged.
+    Faults may keep the arm from its set points for `patience`. That time counts up during faults and down while the arm
+    follows, so recurring faults use it up too. Then the fault is latched: the brakes stay engaged.
     """
 
     def __init__(self, params: ServoParams, joints: Sequence[str], tick_s: float, every: int) -> None:
@@ -58,7 +58,7 @@ class Stopping:
         self.refused: Finding | None = None  # the last cycle's torque, if the arm refused it
         self.error = Error.NONE  # latched fault
         self.reason = ""  # why the arm does not follow its set points, in one line; empty: it does
-        self.findings: list[Finding] = []  # new ones, one an episode; the executor takes them out
+        self.findings: list[Finding] = []  # new ones, one per episode; the executor removes them
         self._kept = 0  # ticks for which faults have kept the arm from its set points
         self._tick: int | None = None
         self._retry_at: int | None = None  # tick at which a failed motor is retried; None: none has failed
@@ -125,11 +125,11 @@ class Stopping:
         return max(reaction, DEMANDED[demand])
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
-        """Set `reason`: what must be over, and by when."""
+        """Set `reason`: the fault that must end, and the tick at which it is latched."""
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
     def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
-        """Return the reaction to faults, and the fault to name."""
+        """Return the reaction to faults, and the fault to report."""
         reaction, cause = Reaction.NONE, None if self.refused is None else self._about_torque(self.refused)
         if sensors.faulty:
             reaction = self._on_sensors if sensors.drivable else Reaction.BRAKE
@@ -162,7 +162,7 @@ class Stopping:
         return self._on_failure if tick < retry_at else Reaction.HOLD
 
     def _latch(self, cause: Cause) -> Reaction:
-        """Latch the fault: brake for good."""
+        """Latch the fault: the brakes stay engaged."""
         self.error, self.reason = cause.error, f"{cause.text}; not over within {self._params.patience:g} s"
         self.findings.append(Finding(Alarm.LATCHED, cause.joint, cause.value))
         return Reaction.BRAKE
@@ -180,7 +180,7 @@ class BrakeLog:
         self._engaged_at = tick
 
     def after_waiting(self, tick: int, findings: list[Finding]) -> None:
-        """Report brakes that engaged, up to `tick`, because torques did not come."""
+        """Report brakes that engaged, up to `tick`, because no torques came."""
         if self._arm.braked and self._engaged_at is None:
             missed = self._arm.waited - self._every
             self._engaged_at = tick

@@ -222,8 +222,7 @@ class RackTiming:
             core=board.planner_core,
             priority=board.planner_priority,
             parts=_nonzero(
-                Part(Unit.PLAN, budget.plan_ns),
-                Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical),
+                Part(Unit.PLAN, budget.plan_ns), Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical)
             ),
             within_cycles=board.within_cycles,
             ceiling=board.priority if board.is_critical else 0,

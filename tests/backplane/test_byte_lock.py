@@ -19,7 +19,7 @@ def test_two_holders_in_one_process_exclude_each_other(make_bus: MakeBus) -> Non
     first, second = ByteLock(segment, ADDRESS), ByteLock(segment, ADDRESS)
     assert first.take()
     assert not second.take()
-    first.give_back()
+    first.release()
     assert second.take()
 
 

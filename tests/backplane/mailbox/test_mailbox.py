@@ -7,7 +7,7 @@ import pytest
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
 from rack.backplane.mailbox.protocols import open_reader, open_writer
-from rack.backplane.mailbox.slots import Slots
+from rack.backplane.mailbox.slots import Slots, epoch_of
 from rack.backplane.segment import Segment
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
@@ -192,7 +192,7 @@ def test_a_new_writer_continues_after_the_last_message_in_a_new_epoch(make_bus: 
     assert second.serial == 1
     write(second, 1)
     assert [seen(reader, tick) for tick in (1, 2)] == [(1, NEW), (2, NEW)]
-    epochs = [slots.epoch for serial in (1, 2) if slots.fetch(serial)]
+    epochs = [epoch_of(slots.signature) for serial in (1, 2) if slots.fetch(serial)]
     assert epochs == [1, 2]
 
 
@@ -208,7 +208,7 @@ def test_the_chain_does_not_show_where_a_writer_was_replaced(make_bus: MakeBus) 
     chains = {name: open_reader(segment, name) for name in (NAME, "writer.other")}
     for reader in chains.values():
         reader.peek()
-    assert len({reader.chain for reader in chains.values()}) == 1
+    assert len({reader.slots.chain for reader in chains.values()}) == 1
 
 
 def test_the_chain_depends_on_every_earlier_message(make_bus: MakeBus) -> None:
@@ -221,7 +221,7 @@ def test_the_chain_depends_on_every_earlier_message(make_bus: MakeBus) -> None:
         writer.write(1)
     readers = [open_reader(segment, name) for name in (NAME, "writer.other")]
     assert {reader.peek().value.id for reader in readers} == {9}
-    assert readers[0].chain != readers[1].chain
+    assert readers[0].slots.chain != readers[1].slots.chain
 
 
 def test_an_unknown_mailbox_is_no_mailbox(make_bus: MakeBus) -> None:

@@ -13,7 +13,7 @@ from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.layout import PROTOCOLS, Protocol
 from rack.backplane.mailbox.mailbox import Reader, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
-from rack.backplane.mailbox.slots import CHAIN_AT, CHAIN_FROM, Slots
+from rack.backplane.mailbox.slots import CHAIN_AT, CHAIN_FROM, Slots, epoch_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import lock_semaphore
 from tests.backplane.bus import NAME, mailbox
@@ -118,4 +118,4 @@ def test_a_writer_killed_anywhere_leaves_its_last_whole_message(make_bus: MakeBu
     # A hammering writer may overtake a reader: a bus error. It never shows a damaged message.
     assert reader.statistics.corrupt == 0
     assert slots.fetch(reader.serial)
-    assert slots.epoch == 2 * KILLS
+    assert epoch_of(slots.signature) == 2 * KILLS

@@ -119,9 +119,7 @@ def test_a_corrupted_command_never_reaches_the_motors(kind: str, parameters: dic
 
 def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:
     link, arm, acted = linked(
-        fault("sensor-bias", size=0.1, joint=0),
-        fault("command-nan", joint=0),
-        fault("sensor-bias", size=0.2, joint=0),
+        fault("sensor-bias", size=0.1, joint=0), fault("command-nan", joint=0), fault("sensor-bias", size=0.2, joint=0)
     )
     assert (link.sense().position - arm.sense().position)[0] == pytest.approx(0.3)
     link.drive(HOLDING, 0.0)

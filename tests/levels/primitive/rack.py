@@ -27,10 +27,7 @@ class PrimitiveRack(Lockstep):
     """The primitive level above the real servo and the simulated cell; `seen` and `set_points`: what it wrote."""
 
     def __init__(
-        self,
-        name: str = "puma560",
-        motion: Sequence[MotionConfig] = (),
-        params: Mapping[str, Any] | None = None,
+        self, name: str = "puma560", motion: Sequence[MotionConfig] = (), params: Mapping[str, Any] | None = None
     ) -> None:
         robot, scene = config(name)
         places = {"above": "em", "below": "servo"}

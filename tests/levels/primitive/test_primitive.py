@@ -35,9 +35,7 @@ def test_arm_goes_along_both_paths_and_settles_at_their_end(finished: PrimitiveR
     assert finished.servo.clipped == finished.servo.touches == 0
 
 
-def test_set_points_keep_their_limits_and_agree_with_their_derivatives(
-    finished: PrimitiveRack,
-) -> None:
+def test_set_points_keep_their_limits_and_agree_with_their_derivatives(finished: PrimitiveRack) -> None:
     limits = cell("puma560").limits
     made = [p for p in finished.set_points if p["due"]]
     q, qd, qdd = (np.array([p[name] for p in made]) for name in ("position", "velocity", "acceleration"))

@@ -67,16 +67,12 @@ def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(resoluti
 
 
 @pytest.mark.timeout(200)
-def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.levels import whole_rack
 
     load = whole_rack.load
     monkeypatch.setattr(
-        whole_rack,
-        "load",
-        lambda name: (lambda c: c.model_copy(update={"robot": coarse(c.robot, 1e-3)}))(load(name)),
+        whole_rack, "load", lambda name: (lambda c: c.model_copy(update={"robot": coarse(c.robot, 1e-3)}))(load(name))
     )
     rack = WholeRack("nasrem")
     servo = rack.tasks["servo"].level

@@ -12,10 +12,7 @@ import pytest
 
 from rack.backplane.message import REASON_BYTES, State
 from rack.levels.errors import Refused
-from rack.levels.messages import (
-    Error,
-    Verb,
-)
+from rack.levels.messages import Error, Verb
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose

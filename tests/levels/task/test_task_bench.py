@@ -10,15 +10,7 @@ import pytest
 
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, Ports
-from rack.levels.messages import (
-    MOVE_STATUS,
-    SERVO_STATUS,
-    TASK_COMMAND,
-    TASK_PLAN,
-    WINDOW,
-    WORLD_MODEL,
-    Error,
-)
+from rack.levels.messages import MOVE_STATUS, SERVO_STATUS, TASK_COMMAND, TASK_PLAN, WINDOW, WORLD_MODEL, Error
 from rack.levels.task import TaskExecutor, TaskPlanner
 from tests.levels.arms import cell, config
 from tests.levels.box import lose_some

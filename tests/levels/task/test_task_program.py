@@ -69,10 +69,7 @@ def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> Non
             "task.action[0].by = 0: should be greater than 0; simulated time by which the action must be done, s",
         ),
         ({"do": "home", "speed": 2}, "task.action[0].speed = 2: unknown key; known: by, do"),
-        (
-            {"do": "goto"},
-            "task.action[0]: a goto has either position or joints",
-        ),
+        ({"do": "goto"}, "task.action[0]: a goto has either position or joints"),
         ({"do": "goto", "joints": [0, 0]}, "task.action[0].joints = [0.0, 0.0]: 2 values; permitted: 6, one per joint"),
         (
             {"do": "goto", "position": [0, 0, 1], "direction": [0, 0, 0]},

@@ -128,11 +128,7 @@ def test_full_load_with_jitter_ends_the_analysis() -> None:
 
 @pytest.mark.parametrize(
     ("above", "period"),
-    [
-        ([(2, 4, 0), (3, 6, 0)], None),
-        ([(2, 4, 0), (4, 6, 0)], None),
-        ([(2, 4, 0)], 3),
-    ],
+    [([(2, 4, 0), (3, 6, 0)], None), ([(2, 4, 0), (4, 6, 0)], None), ([(2, 4, 0)], 3)],
     ids=["full above", "overloaded above", "overloaded with its own"],
 )
 def test_overload_has_no_bound(above: list[tuple[int, int, int]], period: int | None) -> None:
