@@ -4,9 +4,9 @@ A lockstep run repeats bit for bit, on another machine too. Numpy does not promi
 `np.linalg`) sums in an order that depends on the processor's vector unit, and many of its functions (`tanh`, `exp`,
 `arctan2`, `arccos`, `**` with exponents other than 2) have a variant for each. Levels use these instead:
 
-- products, solutions and lengths from MuJoCo: compiled once, no choice at run time, and about as fast as BLAS for a
-  handful of joints;
-- transcendental functions from `math`, that is from the C library, whose variant the crate fixes for all boards.
+- products, solutions and lengths from MuJoCo: compiled once, without choices at run time, and about as fast as BLAS for
+  a few joints;
+- transcendental functions from `math`: the C library's, of which the crate fixes the variant for all boards.
 
 Numpy's + - * / and sqrt, element by element, are exact by IEEE 754; its sums, norms over an axis, and sorting of values
 have one order on all x86-64 processors. Alternatives considered: `np.einsum`, fixed too, but twice the time.

@@ -1,7 +1,7 @@
 """Faults of what a level drives: the steps that spoil its samples, its motors and its commands.
 
-A level names in `Executor.faults` the classes of steps that it lets act. Any kind of fault whose step is of such a
-class can then strike it: a new kind needs no change of the level. The steps here are the project's own.
+A level lists in `Executor.faults` the classes of steps that it implements. Every kind of fault with a step of such a
+class can then strike it: a new kind needs no change in the level. The steps here are the project's own.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from rack.levels.level import Fault
 Array = NDArray[np.float64]
 Key = tuple[str, int, int, int]
 Sample = Any
-"""A `rack.levels.arm.Sensed`; the arm's room, which loads MuJoCo, is not imported here."""
+"""A `rack.levels.arm.Sensed`: not imported, since that loads MuJoCo."""
 
 APART = np.array([[1e-2], [1e-2]])
-"""Distance from the truth, rad and rad/s, from which a stuck sensor counts as wrong: while a joint only creeps, that
-need not be noticed before the joint has moved so far."""
+"""Error of a stuck sensor, rad and rad/s, from which it counts as wrong: while a joint creeps, nobody need notice it
+earlier."""
 
 
 @dataclass(frozen=True)
 class ActiveFault:
-    """An injected fault. `place` is its place among those injected; `joints` (joints,) is True where it strikes.
+    """An injected fault. `place` is its index among those injected; `joints` (joints,) is True where it strikes.
 
     `every` is the level's cycle in ticks; `kept` holds the first sample of each fault, by key.
     """
@@ -41,7 +41,7 @@ class ActiveFault:
 
     @cached_property
     def key(self) -> Key:
-        """Identify the fault, also after the set of injected faults has changed."""
+        """Identity of the fault, which stays the same when the set of injected faults changes."""
         return (self.fault.kind, self.fault.seed, self.fault.since, int(self.joints.argmax()))
 
     def __getitem__(self, parameter: str) -> float:
@@ -49,7 +49,7 @@ class ActiveFault:
         return self.fault.parameters[parameter]
 
     def draw(self, tick: int) -> np.random.Generator:
-        """Return the random numbers of one tick: a restarted board draws the same."""
+        """Return the random generator of one tick: a restarted board draws the same numbers."""
         return np.random.default_rng((self.fault.seed, tick))
 
     def first(self, sample: Sample) -> Sample:
@@ -76,7 +76,7 @@ class MotorStep:
 
 @dataclass(frozen=True)
 class CommandStep:
-    """Corrupts torques on their way to the arm. `act` takes torques and limits, N m, and returns torques (joints,)."""
+    """Corrupts the torques commanded. `act` takes torques and limits, N m, and returns torques (joints,)."""
 
     act: Callable[[Array, Array, ActiveFault], Array]
 
@@ -120,5 +120,5 @@ def torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:
 
 
 def torque_excessive(torque: Array, limits: Array, fault: ActiveFault) -> Array:
-    """Ask for `factor` times the limit, in the direction of the torque."""
+    """Command `factor` times the limit, in the direction of the torque."""
     return fault["factor"] * np.copysign(limits, torque)

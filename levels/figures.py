@@ -1,4 +1,4 @@
-"""The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only computes, for given times."""
+"""The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only consumes processor time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FigureParams(Table):
 
     @property
     def process_ns(self) -> tuple[int, ...]:
-        """X by cycle, ns; after the last the first comes again."""
+        """X by cycle, ns, repeated from the first after the last."""
         times = self.process_ms if isinstance(self.process_ms, tuple) else (self.process_ms,)
         return tuple(round(ms * NS_PER_MS) for ms in times)
 
@@ -64,7 +64,7 @@ class FigureExecutor(Executor):
         self._times_ns = read_params(FigureParams, context.params).process_ns
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Report, and compute; time in which another process has the processor does not count."""
+        """Report, then compute; time spent preempted does not count."""
         end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
         status, plan = write.status, read.plan
         status.state = State.EXECUTING
@@ -90,7 +90,7 @@ class FigurePlanner(Planner):
         return True
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Report, and compute; time in which the executor has the processor does not count."""
+        """Report, then compute; time spent preempted does not count."""
         end = process_time_ns() + self._time_ns
         write.made_at = tick
         write.cycle = read.status.value.cycle if read.status.is_there else -1

@@ -1,32 +1,32 @@
-"""A level: an executor every cycle and a planner in the background (fig. 1), and what its author must know.
+"""A level: an executor every cycle and a planner in the background (fig. 1), and the duties of its author.
 
 The author writes `process` and `plan`. Pinning, timing, tracing, mailboxes and injected faults belong to the board that
 runs the level. The other duties, each with its reason:
 
 Every level
 - `process` takes bounded time: it never waits, logs or prints. The cycle has a deadline.
-- An exception ends the board, which is restarted as a new process with a new object. Whatever must outlive that, read
-  back from your own mailboxes (`Input(STATUS, "own.status")`): they survive.
+- An exception ends the board, which is restarted as a new process with a new object. State that must survive this is
+  read back from your own mailboxes (`Input(STATUS, "own.status")`).
 - `tick` may advance by more than `context.every`: cycles are skipped after a miss. Compute elapsed time from it; never
   read a clock, and take randomness from `context.seed` and `tick`. Otherwise lockstep runs differ.
 - Use `rack.levels.algebra` in place of `@`, `np.linalg`, `exp`, `arctan2` and the like: those differ in the last bit
   between processors.
-- Every output is written at the end of every cycle, with the values that it holds then, the last cycle's if unchanged.
+- Every output is written at the end of every cycle, unchanged fields with the values of the cycle before.
 - A `Reading` before the first message is all zeros (`is_there` is False); later it repeats the newest (`is_new` is
-  False). `is_lost`: its writer is dead or silent. A level that moves the arm then holds, and gives the reason.
+  False). `is_lost`: its writer is dead or silent. A level that moves the arm then holds, and reports the reason.
 
 Messages
-- A command (`rack.backplane.message.command`) has an `id` that rises with every new command; 0: nothing is commanded.
+- A command (`rack.backplane.message.command`) has an `id` that rises with every new command; 0: no command.
 - A status (`status`), written to the port "status", echoes the command's `id` and shows `state` in every cycle: the
   board with `ends_run` ends the run by DONE or ERROR; HOLDING (kept from its work) and ERROR need a `reason` of one
-  line, for a user sees it as the reason of a stall. A status whose `error` is not 0 at the end fails the run.
+  line, which users see as the cause of a stall. A status whose `error` is not 0 at the end fails the run.
 - Symbolic sizes of fields ("joints", "bodies", "state") follow from `[robot]` and `[scene]`, see `context.sizes`.
   Reader and writer of a mailbox must name the same message type and version.
 
 Operator: a level that takes commands reads `Input(OPERATOR_COMMAND, "own.operator")`, lists them in `commands`, follows
 with `rack.levels.operator.Orders`, has `*ANSWER` in its status (`orders.report`) and `RESTS_ON` in its command
 (`command.operator = orders.rests_on(...)`). A level that takes none passes `operator` on, down and into its status:
-without it the response of the system to an operator cannot be measured.
+without it the system's response to an operator cannot be measured.
 
 Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check` then reports every
 mistake before the launch. Executor and planner of a board share one table. A level that reads a program from `[task]`
@@ -39,12 +39,13 @@ A servo level of your own
 - reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the primitive level waits.
 - writes a status in every primitive cycle, with `position` near `target`: the primitive level holds motion when
   statuses are missing, or when a joint is farther off than its `following`.
-- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm through nothing else.
-- lets the arm's time pass, saves its state, and shows its scene, without which the world model is stale and motion
-  holds: `rack.levels.arm.arm` says how.
+- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm only through it.
+- advances the arm's time, saves its state, and publishes its scene, without which the world model is stale and motion
+  holds: see `rack.levels.arm.arm`.
 
-A primitive level of your own writes set points due two of its cycles later (`due = tick + 2 * every`): one brings them
-to the servo, over the second the servo interpolates. It reports `done`, `current`, `resting` and `blocked` of segments.
+A primitive level of your own writes set points due two of its cycles later (`due = tick + 2 * every`): the first
+brings them to the servo, which interpolates over the second. It reports `done`, `current`, `resting` and `blocked` of
+segments.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class Program(Table):
     """Base of the record of a level that reads a program from `[task]`."""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
-        """Yield key, value and reason of all that does not fit the arm or the scene, as in "action[0].object"."""
+        """Yield key, as in "action[0].object", value and reason of each entry that does not suit arm or scene."""
         return ()
 
 
@@ -98,13 +99,13 @@ class Pace(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """A fault injected into the arm, or whatever else a level drives."""
+    """A fault injected into the arm, or another device that a level drives."""
 
     kind: str  # as in "sensor-nan"
     parameters: Mapping[str, float]  # of the kind, by name
-    seed: int  # makes everything random in it repeatable
+    seed: int  # of its random numbers
     since: int  # tick at which it began
-    step: object  # acts the fault; of one of the classes that the level names in `faults`
+    step: object  # acts the fault; of a class that the level lists in `faults`
 
 
 class Finding(NamedTuple):
@@ -123,7 +124,7 @@ class LevelContext:
     every: int  # ticks from cycle to cycle
     within_cycles: int  # cycles that one plan may take
     clock_ns: int  # one tick, ns of simulated time
-    seed: int  # of everything random
+    seed: int  # of all random numbers
     robot: RobotConfig  # a rack without an arm has levels that do not ask for it
     scene: SceneConfig
     task: Mapping[str, Any]  # `[task]`
@@ -165,11 +166,11 @@ class Executor(ABC):
         # In addition to the ports, these pass between board and level. The board sets `demand` before each `process`,
         # and reports and clears `findings` and `acted` after it. It calls `inject` when the active faults change.
         self.demand = Demand.NONE  # stop that the rack's safety demands of the arm in this cycle
-        self.findings: list[Finding] = []  # faults found in this cycle, once an episode: the board raises an alarm each
+        self.findings: list[Finding] = []  # faults found in this cycle, once per episode: the board raises alarms
         self.acted: list[int] = []  # indices, in the injected sequence, of the faults that acted in this cycle
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the injected faults by `faults`, all that are active from now on."""
+        """Replace the injected faults by `faults`, all those active from now on."""
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""

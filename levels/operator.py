@@ -1,9 +1,9 @@
-"""An operator's commands to any level: words, messages, and how a level follows them.
+"""An operator's commands to any level: operations, messages, and how a level follows them.
 
 An operator may command every level that reads "own.operator" and declares `commands`, in addition to the level above it
-or in its place. The level follows with `Orders` and has `ANSWER` among the fields of its status. `RESTS_ON` goes down
-with every command, so the lowest status says which command its torque rests on: the response of the system is measured,
-not guessed.
+or in its place. The level follows with `Orders` and has `ANSWER` among the fields of its status. `RESTS_ON` is passed
+down with every command, so the lowest status shows on which command its torque is based: the system's response can be
+measured.
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ Commands = Mapping[Operation, Sequence[Goal]]
 EFFECTS = {Operation.HOLD: "held", Operation.SETPOINT: "kept at a set point", Operation.GOTO: "diverted"}
 """Effects of a standing command on a level, in words."""
 HELD_FROM_ABOVE = "held by the level above"
-"""Reason of a level that is held from above. The level above knows, and does not pass it on."""
+"""Reason of a level that is held from above; the level above does not pass it on."""
 ABOVE_LOST = "no command from the level above: held until its board is back"
 BELOW_LOST = "no status from the level below: waiting for its board"
 
 
 def listed(commands: Commands) -> str:
-    """Return a level's commands for people: "hold, resume, goto joints|pose"."""
+    """Return a level's commands as text: "hold, resume, goto joints|pose"."""
     return ", ".join(f"{what.name.lower()} {goal_names(goals)}".rstrip() for what, goals in commands.items())
 
 
@@ -93,7 +93,7 @@ def goal_names(goals: Sequence[Goal]) -> str:
 
 
 def described(what: int, goal: int) -> str:
-    """Return a command in words, whatever its numbers: "goto pose"."""
+    """Return a command, valid or not, as text: "goto pose"."""
     names = [
         kind(number).name.lower() if number in set(kind) else str(number)
         for kind, number in ((Operation, what), (Goal, goal))
@@ -104,8 +104,8 @@ def described(what: int, goal: int) -> str:
 class Orders:
     """The operator's commands to one level.
 
-    A refused command leaves the one before it in force, also on a restarted board: that takes up every command again,
-    in their order.
+    A refused command leaves the one before it in force, even on a restarted board, which processes all commands again,
+    in order.
     """
 
     def __init__(self, commands: Commands) -> None:
@@ -119,9 +119,9 @@ class Orders:
         self._is_reported = False
 
     def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
-        """Read the mailbox; return True in the cycle that takes up a command.
+        """Read the mailbox; return True in the cycle that accepts a command.
 
-        `judge` is called with each command taken up: a level with objections of its own refuses the command there.
+        `judge` is called with each command accepted: there a level may refuse it for its own reasons.
         """
         if not operator.is_new:
             return False
@@ -150,12 +150,12 @@ class Orders:
         return True
 
     def refuse(self, why: str) -> None:
-        """Refuse the command just taken up: the one before it is in force again."""
+        """Refuse the command just accepted: the one before it is in force again."""
         self.basis, self.standing = self._before
         self._answer(Answer.REFUSED, why)
 
     def fail(self, why: str) -> None:
-        """Give up the command taken up: the level holds instead."""
+        """Abandon the command in force: the level holds instead."""
         self.standing = Operation.HOLD
         self._answer(Answer.REFUSED, why)
 

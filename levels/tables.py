@@ -1,6 +1,6 @@
 """Config tables that levels read: `[robot]`, `[scene]`, and the base of `[board.<name>.params]`.
 
-An arm is data: an MJCF file, and in `[robot]` what the file does not say. `rack.levels.robot` builds the cell from it.
+An arm is data: an MJCF file, and in `[robot]` the rest. `rack.levels.robot` builds the cell from both.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from rack.levels.errors import LevelError
 
 # No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them stay finite.
-# pydantic keeps one bound of each kind, so a narrower field says so with `le` and `ge`.
+# pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
 Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 LAST_TICK = 10**15
-"""Ticks are 64-bit words: this many of the shortest last 300 years."""
+"""Ticks are 64-bit words: this many of the shortest ones last 300 years."""
 
 
 class Table(BaseModel):
@@ -55,7 +55,7 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
 class SensorConfig(Table):
     """Resolution and noise of the joints' encoders: one value for all joints, or a list with one per joint; 0: exact.
 
-    Velocities have ten times as much of both, in rad/s: see `rack.levels.robot.limits.Encoders`.
+    Velocities have ten times as much of both, in rad/s; see `rack.levels.robot.limits.Encoders`.
     """
 
     resolution: NotNegative | tuple[NotNegative, ...] = Field(
@@ -79,7 +79,7 @@ class GripperConfig(Table):
 
 
 class RobotConfig(Table):
-    """`[robot]`: an arm, its MJCF file and what the file does not say. Lists have one value per joint."""
+    """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per joint."""
 
     model: Path = Field(strict=False, description="MJCF file of the arm and its cell; relative to the config")
     joints: tuple[str, ...] = Field(min_length=1, max_length=16, description="MJCF joints of the arm, base to tool")
@@ -103,7 +103,7 @@ class RobotConfig(Table):
 
 
 class MotionConfig(Table):
-    """A move of an obstacle, made by the simulated cell at a fixed time: a mocap body goes to a place."""
+    """A move of an obstacle, a mocap body, which the simulated cell makes at a fixed time."""
 
     body: str = Field(description="obstacle that moves")
     at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it starts, s")

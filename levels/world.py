@@ -26,8 +26,8 @@ class WorldParams(Table):
 class WorldModel(Executor):
     """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body starts or stops moving.
 
-    The revision is the tick after the last such change, so it also rises across a restart of this board. Until it has
-    seen a scene, a restarted board shows its last model, with its age.
+    The revision is the tick after the last such change, so it also rises across a restart of this board. Until it
+    receives a scene, a restarted board publishes its last model, with its age.
     """
 
     inputs = {"scene": Input(SCENE, "servo.scene"), "last": Input(WORLD_MODEL, "own.model")}
@@ -46,7 +46,7 @@ class WorldModel(Executor):
         self._started = False
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Update from a new scene; without one, poses stay and velocities are zero."""
+        """Update from a new scene; without one, keep poses and set velocities to zero."""
         if not self._started:
             self._started = True
             write.model.copy_from(read.last.value)
@@ -65,7 +65,7 @@ class WorldModel(Executor):
         write.model.sensed = self._seen_tick = tick
 
     def _follow(self, scene: Message, model: Message, elapsed_s: float, tick: int) -> None:
-        """Estimate velocities, and find the bodies that start and stop."""
+        """Estimate velocities, and find the bodies that start or stop moving."""
         params = self._params
         velocity = (scene.position - self._position) / elapsed_s
         slow = np.linalg.norm(velocity, axis=1) < params.slow

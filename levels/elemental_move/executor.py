@@ -1,4 +1,4 @@
-"""The executor of the elemental move level: keeps the primitive level supplied with segments."""
+"""The executor of the elemental move level: supplies the primitive level with segments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlansAtHand, SegmentWindow, joins
+from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
 from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
 from rack.levels.messages import (
     MOVE_COMMAND,
@@ -24,9 +24,9 @@ from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
-    """Hands segments down as soon as their plans are there, and asks for another path where the arm is blocked.
+    """Hands segments down as soon as they are planned, and requests another path where the arm is blocked.
 
-    It reads its own last messages, so that it continues where it was when its board is restarted. The arm is held on
+    After a restart of its board it continues from its own last messages. The arm is held on
     its path while the board above is lost, and on `hold` from above or from an operator.
     """
 
@@ -38,7 +38,7 @@ class ElementalMoveExecutor(Executor):
         "last_status": Input(MOVE_STATUS, "own.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    # The status first: a board killed between the two finds a window whose done moves it only removes again.
+    # The status first: a board killed between the two finds done moves still in its window, and removes them again.
     outputs = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = ElementalMoveParams
@@ -47,15 +47,15 @@ class ElementalMoveExecutor(Executor):
         super().__init__(context)
         self._params = read_params(ElementalMoveParams, context.params)
         self._gripper = context.robot.gripper
-        self._plans = PlansAtHand()
+        self._plans = PlanStore()
         self._orders = Orders(self.commands)
         self._started = False
         self._done = 0  # newest move done
         self._handed_down = 0  # newest move handed down
         self._request = 0  # open request for another path; 0: none
-        self._replans = 0  # other paths taken, by all moves
-        self._replans_of_move = 0  # and by the present one
-        self._waiting_since: int | None = None  # tick of the first refusal of the path that is awaited
+        self._replans = 0  # other paths taken, in total
+        self._replans_of_move = 0  # and by the present move
+        self._waiting_since: int | None = None  # tick of the first refusal of the awaited path
         self._error = Error.NONE
         self._reason = ""
 
@@ -82,7 +82,7 @@ class ElementalMoveExecutor(Executor):
         self._answer(read, write)
 
     def _recall(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
-        """Continue from the last command and status in the mailboxes; plans that were at hand are lost."""
+        """Continue from the last command and status in the mailboxes; the stock of plans is lost."""
         self._started = True
         write.status.end = read.status.value.position
         if read.last_command.is_there and read.last_status.is_there:
@@ -110,7 +110,7 @@ class ElementalMoveExecutor(Executor):
             self._error, self._reason = Error.NONE, ""
 
     def _take_done(self, status: Message, segments: SegmentWindow) -> None:
-        """Count segments that are done; a grasp must have found something."""
+        """Count segments that are done; fail on a grasp that holds nothing."""
         while (taken := segments.take_done(status.done)) is not None:
             self._done, self._replans_of_move = int(taken["move"]), 0
             gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
@@ -120,7 +120,7 @@ class ElementalMoveExecutor(Executor):
                 )
 
     def _check_below(self, status: Message, segments: SegmentWindow) -> None:
-        """Fail with the level below, and when the held object is gone."""
+        """Fail when the level below has failed, or the held object is lost."""
         if status.state == State.ERROR:
             self._fail(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
@@ -130,7 +130,7 @@ class ElementalMoveExecutor(Executor):
             )
 
     def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
-        """Ask for another path where the arm rests because something is in its way; cancel when the way is free."""
+        """Request another path where the arm rests in front of an obstacle; cancel the request when the way is free."""
         blocked = bool(
             segments.count
             and status.blocked
@@ -147,7 +147,7 @@ class ElementalMoveExecutor(Executor):
         elif (plan := self._plans.answer(self._request)) is not None:
             if plan.error:
                 self._wait(plan, tick)
-            elif not joins(plan, status.position):  # the arm has been moved meanwhile
+            elif not joins(plan, status.position):  # the arm has moved since
                 self._open_request(tick)
             else:
                 segments.replace_first(plan)
@@ -157,7 +157,7 @@ class ElementalMoveExecutor(Executor):
                 self._replans_of_move += 1
 
     def _open_request(self, tick: int) -> None:
-        # The number of the cycle: no request made before a restart has the same.
+        # The cycle's number is unique, even across a restart.
         self._request = tick // self.context.every
 
     def _close_request(self) -> None:
@@ -165,7 +165,7 @@ class ElementalMoveExecutor(Executor):
             self._request, self._waiting_since, self._reason = 0, None, ""
 
     def _fill(self, command: Message, segments: SegmentWindow, tick: int) -> None:
-        """Hand down the moves after the last one, as far as their plans are there and the window has room."""
+        """Hand down the next moves, as far as they are planned and the window has room."""
         while not (self._request or self._error or segments.is_full):
             at = np.flatnonzero(command.moves["id"][: command.count] == self._handed_down + 1)
             if not at.size or not self._hand_down(command.moves[at[0]], segments, tick):
@@ -196,7 +196,7 @@ class ElementalMoveExecutor(Executor):
         return True
 
     def _wait(self, refusal: Message, tick: int) -> None:
-        """Wait for a free path as long as patience lasts; waiting does not help against any other refusal."""
+        """Wait for a free path within `patience`; fail at once on any other refusal."""
         if self._waiting_since is None:
             self._waiting_since = tick
         self._reason = refusal.reason
@@ -208,7 +208,7 @@ class ElementalMoveExecutor(Executor):
         """Return the time by which the level below must be done for this level to report it by `by_s`."""
         if by_s <= 0.0:
             return 0.0
-        # A status from below waits up to a cycle to be read, and this level's takes another to be seen.
+        # A status from below waits up to a cycle to be read, and this level's becomes visible another cycle later.
         return by_s - 2.0 * self.context.period_s - self._params.answer
 
     def _is_shut(self, status: Message) -> bool:
@@ -244,11 +244,11 @@ class ElementalMoveExecutor(Executor):
         report.verb = int(command.moves["verb"][under_way_at[0]]) if report.current and under_way_at.size else Verb.NONE
 
     def _report_plans(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
-        """Report how far plans are at hand: the planner continues from there."""
+        """Report how far moves are planned: the planner continues from there."""
         report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
         end = self._plans.end(report.planned)
         if end is None:
-            # Handed down before a restart of this board, or has replaced such a path since.
+            # That path was handed down before a restart of this board, or has replaced such a path.
             end = segments.end()
         if report.planned <= self._done and status.resting:
             report.end = status.position
@@ -256,7 +256,7 @@ class ElementalMoveExecutor(Executor):
             report.end = end
 
     def _answer(self, read: Ports, write: Ports) -> None:
-        """Answer the operator, and hand down the newest command that this cycle is based on."""
+        """Answer the operator, and pass down the newest command on which this cycle is based."""
         above, below = read.command.value.operator, read.status.value
         write.command.operator = self._orders.rests_on(above)
         # Rest counts only once the level below has received the command.
@@ -266,7 +266,7 @@ class ElementalMoveExecutor(Executor):
         self._orders.report(write.status, above)
 
     def _reason_to_wait(self, command: Reading, below: Reading) -> str:
-        """Return what keeps the level from its work, and what ends that; empty: nothing does."""
+        """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
         if self._orders.standing is not Operation.NONE:
             return self._orders.keeps(self.context.board)
         if command.is_lost:

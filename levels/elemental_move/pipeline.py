@@ -1,4 +1,4 @@
-"""The executor's stock: plans that wait until their move is due, and segments handed down. The level's parameters."""
+"""The executor's plans, which wait until their moves are due, and its segments handed down. The level's parameters."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rack.levels.messages import SEGMENTS, WINDOW, Error, SegmentKind, Verb
 from rack.levels.tables import Positive, Table
 
 MAX_GAP_RAD = 0.005
-"""Paths join if no joint is farther than this between the end of one and the start of the next."""
+"""Paths join if no joint moves by more than this from the end of one to the start of the next."""
 MAX_PLANS = 2 * WINDOW
-"""Plans kept: the planner is never farther ahead than its window, and moves just done leave with the next plan."""
+"""Plans kept: the planner is never farther ahead than its window, and done moves are dropped with the next plan."""
 
 
 class ElementalMoveParams(Table):
@@ -31,7 +31,7 @@ class ElementalMoveParams(Table):
     answer: Positive = Field(0.3, description="time that settling and the report from below may take, s")
 
 
-class PlansAtHand:
+class PlanStore:
     """The newest plan of every move from the one under way on, and the answer to the open request for another path."""
 
     def __init__(self) -> None:
@@ -41,9 +41,9 @@ class PlansAtHand:
     def take(self, plan: Reading, done: int, handed_down: int, end: Array) -> None:
         """Keep a new plan of a move after `handed_down`, if it begins where the path before it ends.
 
-        `end` (joints,), rad, is where the moves end whose plans are no longer at hand. A plan that does not join is
-        based on one that has been lost or replaced; the planner will make it anew. Plans of moves before `done` are
-        dropped. After a refusal, or a path with another end than before, all later plans are dropped.
+        `end` (joints,), rad, is the end of the moves whose plans have been dropped. A plan that does not join is based
+        on one that was lost or replaced; the planner will make it again. Plans of moves before `done` are dropped.
+        After a refusal, or a path that ends elsewhere than before, all later plans are dropped.
         """
         if not plan.is_new:
             return
@@ -65,11 +65,11 @@ class PlansAtHand:
             self._by_move[message.move] = message
 
     def of(self, move: int) -> Message | None:
-        """Return the plan of a move, which may be a refusal; None: not there yet."""
+        """Return the plan of a move, which may be a refusal; None: none yet."""
         return self._by_move.get(move)
 
     def answer(self, request: int) -> Message | None:
-        """Return the answer to a request for another path; None: not there yet."""
+        """Return the answer to a request for another path; None: none yet."""
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
     def reach(self, window: Any, handed_down: int) -> int:
@@ -85,7 +85,7 @@ class PlansAtHand:
         return reached
 
     def end(self, move: int) -> Array | None:
-        """Return where the newest path up to that of `move` ends, (joints,) in rad; None: there is no such path."""
+        """Return the end of the newest path up to that of `move`, (joints,), rad; None: there is none."""
         paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
         return end_of(self._by_move[max(paths)]) if paths else None
 
@@ -96,12 +96,12 @@ def joins(plan: Message, place: Array) -> bool:
 
 
 def end_of(plan: Message) -> Array:
-    """Return where the path of a `MOVE_PLAN` ends, (joints,), rad."""
+    """Return the end of the path of a `MOVE_PLAN`, (joints,), rad."""
     return np.asarray(plan.waypoints[plan.count - 1])
 
 
 def is_same(a: Array, b: Array) -> bool:
-    """Return whether a path may end at one and the next begin at the other of two configurations (joints,), rad."""
+    """Return whether a path that ends at `a` and one that begins at `b`, (joints,), rad, join."""
     return float(np.abs(a - b).max()) <= MAX_GAP_RAD
 
 
@@ -158,7 +158,7 @@ class SegmentWindow:
         self._lay(segment, plan)
 
     def replace_first(self, plan: Message) -> None:
-        """Withdraw all and hand the oldest segment down again along another path, with a new serial."""
+        """Withdraw all segments; hand down the oldest again along another path, with a new serial."""
         self._command.count = 1
         self._blank()
         self._command.id = self.first["id"] = int(self._command.id) + 1
@@ -188,5 +188,5 @@ class SegmentWindow:
         segment["waypoints"], segment["blend"] = plan.waypoints, plan.blend
 
     def _blank(self) -> None:
-        """Zero the rest of the array, so that equal windows have equal bytes."""
+        """Clear the unused segments, so that equal windows have equal bytes."""
         self._segments[self.count :] = np.zeros((), self._segments.dtype)

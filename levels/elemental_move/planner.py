@@ -31,7 +31,7 @@ from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
 
 ACKNOWLEDGED_CYCLES = 2
-"""Cycles until the executor's status must show a plan that it has seen; else the plan is lost and made again."""
+"""Cycles until the executor's status must acknowledge a plan; otherwise the plan is lost and made again."""
 MAX_HANDED_DOWN = 1
 """Moves after the one under way that the executor may have handed down already."""
 
@@ -41,8 +41,8 @@ class PlanningJob(NamedTuple):
 
     move: Move
     start: Array  # (joints,), rad
-    goal: Array | None = None  # the end to keep, (joints,), rad
-    request: int = 0  # of the executor, that it answers
+    goal: Array | None = None  # required end, (joints,), rad
+    request: int = 0  # of the executor, answered by this job; 0: none
 
 
 class Published(NamedTuple):
@@ -60,13 +60,13 @@ class Refusal(NamedTuple):
     request: int
     error: int
     revision: int  # of the world in which it was tried
-    again_at: int  # tick from which it is tried again even if the world has not changed
+    again_at: int  # tick from which it is retried even in an unchanged world
 
 
 class ElementalMovePlanner(Planner):
-    """Plans one move at a time: the next one without a path, from where the one before it will end.
+    """Plans one move at a time: the next one without a path, from the end of the one before.
 
-    The executor's status holds all that it needs to continue after a restart.
+    After a restart it continues from the executor's status.
     """
 
     inputs = {
@@ -99,9 +99,9 @@ class ElementalMovePlanner(Planner):
         self._answer_due = 0  # tick by which the executor must have used the answer
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Return whether a path is requested, has been blocked, or is not there yet."""
+        """Return whether a path is requested, blocked or missing."""
         ports = (read.command, read.status, read.primitive, read.scene, read.world)
-        # A plan for a lost executor would rest on an old status; when the executor is back, it reports again.
+        # A plan for a lost executor would be based on an old status; wait until it reports again.
         if not all(port.is_there for port in ports) or read.status.is_lost:
             return False
         self._window = read_window(read.command.value)
@@ -131,7 +131,7 @@ class ElementalMovePlanner(Planner):
         self._note_path(job, path, visible_at)
 
     def _requested(self, read: Ports, tick: int) -> PlanningJob | None:
-        """Return the job that the executor requests where the arm is blocked; it keeps its end, for later moves."""
+        """Return the job that the executor requests where the arm is blocked; its end stays, for the moves after it."""
         status = read.status.value
         if not status.replan or (status.replan == self._answered and tick < self._answer_due):
             return None
@@ -142,7 +142,7 @@ class ElementalMovePlanner(Planner):
         return None
 
     def _blocked(self, read: Ports) -> PlanningJob | None:
-        """Return the first path ahead that a change of the world has blocked; it keeps its end."""
+        """Return the first path ahead that a change of the world has blocked; its end stays."""
         status, revision = read.status.value, read.world.value.revision
         if revision == self._revision:
             return None
@@ -160,7 +160,7 @@ class ElementalMovePlanner(Planner):
         move = next_motion(self._window, newest)
         if move is None:
             return None
-        # Where a path ends, the executor knows best; it may not have received the newest one yet.
+        # The executor's report of a path's end is exact, but it may not have received the newest path yet.
         if self._published and self._published[-1].move.id > status.planned:
             return PlanningJob(move, self._published[-1].path.end)
         if status.planned > status.done:
@@ -174,21 +174,21 @@ class ElementalMovePlanner(Planner):
         if held >= 0:
             situation = situation.holding(held, self._grip[1] if self._grip is not None else None)
         for earlier in self._window:
-            # The report of a grasp may arrive after what it has changed: it must not count twice.
+            # A grasp may be reported done only after the object is reported held: it must not count twice.
             known = earlier.verb is Verb.GRASP and earlier.object == situation.held
             if done < earlier.id < move.id and not known:
                 situation = situation.after(earlier)
         return situation
 
     def _forget(self, status: Message, tick: int) -> None:
-        """Forget paths that are done, and those that the executor should have received but has not."""
+        """Drop paths that are done, and those that the executor should have acknowledged but has not."""
         late = tick - ACKNOWLEDGED_CYCLES * self.context.every
         kept = [p for p in self._published if p.move.id > status.done]
         lost = [p.move.id for p in kept if p.move.id > status.planned and p.visible_at <= late]
         self._published = [p for p in kept if not lost or p.move.id < lost[0]]
 
     def _note_grip(self, read: Ports) -> None:
-        """Note how the next object will be grasped while it still rests; after a restart, how it is held."""
+        """Store how the next object, still at rest, will be grasped; after a restart, how it is held."""
         world, held, done = read.world.value, read.primitive.value.held, read.status.value.done
         if held < 0:
             ahead = [(m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done]
@@ -199,7 +199,7 @@ class ElementalMovePlanner(Planner):
             self._grip = (held, grip_of(held, tool, scene))
 
     def _may_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
-        """Return whether a job may be tried: at once, or again when the world has changed or time has passed."""
+        """Return whether a job may be tried: a refused one only after a change of the world, or after `retry`."""
         refusal = self._refusal
         if refusal is None or (refusal.move, refusal.request) != (job.move.id, job.request):
             self._tries = 0
@@ -237,7 +237,7 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 
 def end_handed_down(command: Message, move: Move) -> Array | None:
-    """Return where the path of `move` in a `MOVE_COMMAND` ends, (joints,), rad; None: it is not in there."""
+    """Return the end of the path of `move` in a `MOVE_COMMAND`, (joints,), rad; None: it has none there."""
     for segment in command.segments[: command.count]:
         if segment["move"] == move.id and segment["kind"] == SegmentKind.PATH:
             return np.array(segment["waypoints"][segment["count"] - 1])

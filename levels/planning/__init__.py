@@ -1,3 +1,1 @@
-"""Planning for an arm: inverse kinematics, collisions, payloads, paths. Equal questions give equal answers, in any
-process.
-"""
+"""Planning for an arm: inverse kinematics, collisions, payloads, paths. Deterministic, in any process."""

@@ -40,7 +40,7 @@ def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions:
 class CollisionChecker:
     """Decides whether a configuration of the arm is free, on its own copy of the cell.
 
-    The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links may come close to
+    The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links may be close to
     each other and to the body that carries the arm, but must not touch. One instance serves one task; a check takes
     some microseconds.
     """
@@ -86,7 +86,7 @@ class CollisionChecker:
         self._apply()
 
     def permit(self, row: int | None, touch: bool = True) -> None:
-        """Let object `row` touch supports and gripper, and the gripper come close to supports; or forbid it again."""
+        """Permit or forbid contact of object `row` with supports and gripper, and a gripper close to supports."""
         self._touched = row if touch else None
         self._apply()
 
@@ -109,7 +109,7 @@ class CollisionChecker:
         return self.nearest()
 
     def nearest(self) -> str:
-        """Name that pair for the configuration checked last."""
+        """Name that pair for the last configuration checked."""
         short = self._short
         if not np.any(short > 0):
             return ""
@@ -174,7 +174,7 @@ class CollisionChecker:
         return required
 
     def _carriers(self) -> NDArray[np.int_]:
-        """Return the geoms of the fixed bodies that carry the arm: its links are near them at every joint angle."""
+        """Return the geoms of the fixed bodies that carry the arm: some links are always near them."""
         m = self.cell.model
         body = m.body_parentid[m.dof_bodyid[self.cell.dof[0]]]
         chain = []

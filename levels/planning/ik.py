@@ -40,7 +40,7 @@ LIMIT_PART = 0.95
 
 
 class InverseKinematics:
-    """Solves for the tool of one arm. Pure: equal arguments give equal answers."""
+    """Solves for the tool of one arm. Pure: equal arguments give equal results."""
 
     def __init__(self, cell: Cell, seed: int) -> None:
         self._cell = cell

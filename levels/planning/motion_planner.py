@@ -18,15 +18,15 @@ from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
 CLOSE_PART = 0.9
-"""Where the arm rests too close to something, the way out keeps this part of the remaining clearance."""
+"""Part of the remaining clearance that a path keeps where the arm starts too close to something."""
 LOAD_STEP_RAD = 0.25
 """Spacing of the configurations at which the motors must carry the load."""
 AHEAD_PART = 0.5
-"""Part of the clearance that an earlier path must still have: sensed and predicted poses differ a little."""
+"""Part of the clearance that an earlier path must keep: sensed and predicted poses differ slightly."""
 MAX_STRAY_M = 1e-3
 """Largest distance of the tool from a straight line that it follows."""
 LINES = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-"""Numbers of joint-space lines that are tried: the fewest that stay on the tool's line make the quickest path."""
+"""Numbers of joint-space lines that are tried: the fewest that keep to the tool's line give the quickest path."""
 STRAY_SAMPLES = 5
 """Points of every joint-space line at which the tool's distance from its line is measured."""
 
@@ -109,7 +109,7 @@ class MotionPlanner:
         return path
 
     def _why_no_path(self, start: Array, goal: Array, clearance: float) -> str:
-        """Return why a free motion has no path: start or goal is blocked, or what stands on the straight way."""
+        """Return why a free motion has no path: start or goal is blocked, or the obstacle on the straight line."""
         why = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
         if why:
             return why
@@ -175,7 +175,7 @@ def _points_on(ik: InverseKinematics, points: list[Array], way: tuple[Pose, Pose
 
 
 def _smooth(points: Array) -> Path:
-    """Round every corner by half of the shorter adjacent line: neighbours meet, nothing stops."""
+    """Round every corner by half of the shorter adjacent line, so that the motion never stops."""
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     blend = np.zeros(len(points))
     blend[1:-1] = 0.5 * np.minimum(lengths[:-1], lengths[1:])
@@ -197,5 +197,5 @@ def _stray(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> floa
 
 
 def in_metres(tool: Pose) -> str:
-    """Return a position as a user writes it, in m."""
+    """Return a position as text, in m."""
     return "[{:.3f}, {:.3f}, {:.3f}]".format(*tool.position)

@@ -1,4 +1,4 @@
-"""Elemental moves as planning sees them, and the situations before and after them."""
+"""Elemental moves for planning, and the situations before and after them."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def read_window(command: Any) -> list[Move]:
 
 @dataclass(frozen=True)
 class Situation:
-    """Where the bodies are and what the gripper holds: now, or once the moves ahead are done."""
+    """The poses of bodies and the object in the gripper: now, or once the moves ahead are done."""
 
     positions: Array  # (bodies, 3), m: the rows of the world model
     quaternions: Array  # (bodies, 4), as w, x, y, z

@@ -1,7 +1,7 @@
 """Collision-free paths between two configurations: straight where that is free, else sampled, with rounded corners.
 
 The search is OMPL's RRTConnect, then short cuts. It ends by the number of configurations checked, never by time, and
-every call seeds the random numbers anew: equal questions give equal answers, in every process.
+every call seeds the random numbers anew: equal arguments give equal paths, in every process.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_SEED = 2**31 - 1
 STEP_PART = 0.5
 """No point of the arm moves farther between two checks than this part of the clearance."""
 MIN_LEVER_M = 0.05
-"""Joints that hardly move any geom still count this much in the metric."""
+"""Least weight of a joint in the metric, for joints that hardly move any geom."""
 LEVER_SAMPLES = 64
 """Random configurations over which the longest lever is taken."""
 BLENDS = (1.0, 0.6, 0.35, 0.2, 0.1)
@@ -43,7 +43,7 @@ BRANCH_PART = 0.2
 ENDLESS_RAD = 2.0 * np.pi
 """Range beyond start and goal of a joint without limits."""
 BOUND_ROUNDING = 1e-9
-"""The bounds of the space are this much wider, in scaled length, so that rounding leaves start and goal inside."""
+"""Margin of the space's bounds, in scaled length, so that start and goal are inside in spite of rounding."""
 
 util.setLogLevel(util.LOG_NONE)
 
@@ -77,7 +77,7 @@ class PathPlanner:
         return min(paths, key=self.duration, default=None)
 
     def rounded(self, waypoints: Array, free: Free) -> Path:
-        """Return the path along `waypoints` with each corner rounded as far as that is free."""
+        """Return the path along `waypoints`, with each corner rounded as far as it stays free."""
         blend = _largest_blends(waypoints)
         for corner in range(1, len(waypoints) - 1):
             blend[corner] = self._free_blend(waypoints, corner, float(blend[corner]), free)

@@ -1,8 +1,8 @@
 """Whether the arm can carry an object: its weight against the friction of the grip and the torques of the motors.
 
-The grip is known if a straight line through the tool's origin, along its y axis, meets the object and a finger on
-either side, as in every grasp that the task level plans. Virtual work over the linkage, whatever its kind, gives the
-force there from the actuator's. If the line misses, the grip is unknown and only the motors are checked.
+The grip is known if a straight line through the tool's origin, along its y axis, hits the object and a finger on
+either side, as in every grasp that the task level plans. Virtual work over the linkage, of any kind, gives the force
+there from the actuator's. If the line misses, the grip is unknown and only the motors are checked.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class Payloads:
         return jaws
 
     def _nearest(self, geoms: NDArray[np.int_], start: float, way: float) -> tuple[float, int]:
-        """Return distance, m, and geom that the tool's y axis meets first from `start`, m; inf: none."""
+        """Return distance, m, and id of the first geom on the tool's y axis from `start`, m; inf: none."""
         model, data, tool = self._cell.model, self._data, self._cell.tool
         axis = data.site_xmat[tool].reshape(3, 3)[:, 1].copy()
         begin, along = data.site_xpos[tool] + start * axis, way * axis

@@ -29,15 +29,15 @@ from rack.levels.tables import read_params
 Work = PathWork | GripperWork
 
 DELAY_CYCLES = SEEN_CYCLES + LEAD_CYCLES - 1
-"""Cycles from the sensing of the world model to the set point commanded last: bodies move on in that time."""
+"""Cycles from the sensing of the world model to the set point commanded last: bodies keep moving in that time."""
 
 
 class PrimitiveExecutor(Executor):
-    """Does the segments of the window, oldest first; each from rest to rest, while the next one is planned.
+    """Executes the segments of the window, oldest first, each from rest to rest, while the next one is planned.
 
-    The set point written at tick T is due `LEAD_CYCLES` later. After a restart the level's own last messages hold
-    everything that it must remember. It rests on its path while the board above is lost, and on `hold` from above or
-    from an operator; while the servo does not follow, it waits.
+    The set point written at tick T is due `LEAD_CYCLES` later. After a restart the level restores its state from its
+    own last messages. It rests on its path while the board above is lost, and on `hold` from above or from an operator;
+    while the servo does not follow, it waits.
     """
 
     inputs = {
@@ -66,14 +66,14 @@ class PrimitiveExecutor(Executor):
         self._silent_cycles = self._rules.cycles(params.silent)
         self._plans = Plans()
         self._orders = Orders(self.commands)
-        self._memory: Memory | None = None  # None until this level, in this life or before, first came into step
+        self._memory: Memory | None = None  # None until this level, restarts included, was first in step with the servo
         self._work: Work | None = None
         self._fault: SegmentFault | None = None
-        self._begun = 0  # serial of the segment begun last
-        self._position = cell.home.copy()  # commanded last, (joints,), rad
+        self._begun = 0  # serial of the last segment begun
+        self._position = cell.home.copy()  # (joints,), rad: the last one commanded
         self._rest = JointSetPoint(self._position, *np.zeros((2, len(cell.home))))
-        self._tick: int | None = None  # of the cycle before
-        self._displaced = False  # the servo has been away since the last path: the arm may not be where that ended
+        self._tick: int | None = None  # of the last cycle
+        self._displaced = False  # the servo was out of step since the last path: the arm may not be at its end
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read command, status, plan and world model; write the next set point and this level's status."""
@@ -100,7 +100,7 @@ class PrimitiveExecutor(Executor):
         self._answer(write, read.command.value.operator)
 
     def _resume(self, servo: Message, tick: int) -> None:
-        """Continue from where the servo holds the arm."""
+        """Continue from the position at which the servo holds the arm."""
         work = self._work
         self._displaced = self._memory is not None
         if self._memory is None:
@@ -120,7 +120,7 @@ class PrimitiveExecutor(Executor):
         self._sight.carry(row, tick - SEEN_CYCLES * self.context.every)
 
     def _do_segments(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
-        """Do one cycle of the work: finish it, drop it, begin it, step it."""
+        """Do one cycle of the work: finish, drop, begin or advance it."""
         hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.standing is Operation.HOLD
         if read.status.is_new:
             self._finish(read.status.value, tick)
@@ -150,14 +150,14 @@ class PrimitiveExecutor(Executor):
         memory.done, self._work = work.segment.id, None
 
     def _withdraw(self, serials: list[int]) -> bool:
-        """Drop work and fault that have left the window; return whether the work must come to rest first."""
+        """Drop work and fault that have left the window; return whether the work must first ramp to rest."""
         serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
             return False
         if isinstance(self._work, PathWork) and not self._work.motion.resting:
             return True
         if isinstance(self._work, PathWork) and self._memory is not None:
-            # Messages may arrive out of order: a withdrawn segment may come back, and then continues.
+            # Messages may arrive out of order: a withdrawn segment may return, and then continues.
             self._memory.interrupted, self._memory.progress = serial, self._work.progress
         self._work, self._fault = None, None
         return False
@@ -219,7 +219,7 @@ class PrimitiveExecutor(Executor):
     def _write_set_point(self, command: Message, tick: int) -> None:
         work, memory, in_step = self._work, self._memory, self._tracking.in_step
         command.id = tick // self.context.every + 1 if memory is not None else 0
-        # Out of step, no set point is better than one from where the arm may not be.
+        # Out of step the arm's position is not certain: no set point is better than a wrong one.
         command.due = self._due(tick) if in_step else 0
         set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
@@ -250,7 +250,7 @@ class PrimitiveExecutor(Executor):
         status.wants, status.begin = self._wanted(read, serials)
 
     def _reason_to_wait(self, read: Ports) -> str:
-        """Return what keeps the level from its work, and what ends that; empty: nothing does."""
+        """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
         work, command = self._work, read.command
         if not self._tracking.in_step:
             return self._tracking.awaited(read.status.value)
@@ -270,7 +270,7 @@ class PrimitiveExecutor(Executor):
         return f"segment {work.segment.id} waits for its trajectory from the planner" if work and unplanned else ""
 
     def _answer(self, write: Ports, above: int) -> None:
-        """Answer the operator, and hand down the newest command that this cycle is based on."""
+        """Answer the operator, and pass down the newest command on which this cycle is based."""
         if write.status.resting:
             self._orders.done()
         write.command.operator = self._orders.rests_on(above)

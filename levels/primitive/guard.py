@@ -1,4 +1,4 @@
-"""The guard checks the remaining path in every cycle; sight is whether the world model is fresh enough to move by."""
+"""The guard checks the remaining path in every cycle; sight checks that the world model is recent enough for motion."""
 
 from __future__ import annotations
 
@@ -32,10 +32,9 @@ MAX_REST_M_S = 0.01
 class Guard:
     """Watches one path at a time against the world model.
 
-    In every cycle it checks the near way, as far as `lookahead_s` reaches, with every obstacle put where its velocity
-    will have taken it when the arm arrives; and a few configurations of the whole remaining path against all bodies as
-    they are. The latter count only while no obstacle moves: a moving one may be gone by then. At most 13 checks per
-    cycle.
+    In every cycle it checks the path over the next `lookahead_s`, with every obstacle extrapolated by its velocity to
+    the time at which the arm arrives, and a few configurations of the whole remaining path against all bodies as they
+    are. The latter count only while no obstacle moves: a moving one may be gone by then. At most 13 checks per cycle.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
@@ -51,7 +50,7 @@ class Guard:
         self._obstructed: float | None = None
         self._least = self._clearance
         self._ahead = np.zeros((self._rows, 3))
-        self.obstacle = ""  # the pair of geoms found too close last, with distance and bound
+        self.obstacle = ""  # the last pair of geoms found too close, with distance and bound
 
     def carry(self, row: int, q: Array, world: Message) -> None:
         """Carry object `row` with the tool, from its pose in `world` while the arm is at `q` (joints,), rad."""
@@ -67,7 +66,7 @@ class Guard:
         self._checker.open_gripper(opening)
         self._checker.permit(segment.object, segment.touch and segment.object is not None)
         self._place(world)
-        # Motion may leave a place that is too close, but must not come closer.
+        # Motion may start too close to something, but must not get closer.
         room = self._checker.room(path.evaluate(0.0).q)
         self._least = min(self._clearance, max(room, 0.0) * CLEARANCE_PART)
         self._obstructed = None
@@ -75,7 +74,7 @@ class Guard:
         self.obstacle = ""
 
     def is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message) -> bool:
-        """Return, within a cycle's share of the checks, whether the way is clear for an arm at `time_s`."""
+        """Return, by this cycle's share of the checks, whether the path is clear from `time_s` on."""
         begin = trajectory.at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
         still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
@@ -85,7 +84,7 @@ class Guard:
         return near_clear and (far_clear or not still)
 
     def _near_is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: Message | None) -> bool:
-        """Check the way within the look-ahead; `moving` is the world model while an obstacle moves."""
+        """Check the path within the look-ahead; `moving` is the world model while an obstacle moves."""
         self._phase = (self._phase + 1) % PHASES
         for k in range(NEAR_CHECKS):
             ahead_s = (k + (self._phase + 1) / PHASES) * self._spacing_s
@@ -101,7 +100,7 @@ class Guard:
         return True
 
     def _far_is_clear(self, path: BlendedPath, begin: float) -> bool:
-        """Check the next few configurations; before them, the one found obstructed last."""
+        """Check the last configuration found obstructed, then the next few."""
         if self._obstructed is not None and self._obstructed >= begin:
             if not self._free(path, self._obstructed):
                 return False
@@ -126,10 +125,10 @@ class Guard:
 
 
 class Sight:
-    """Holds motion while the world model is stale, and shows the guard how an object sits in the gripper.
+    """Holds motion while the world model is stale, and gives the guard the pose of an object in the gripper.
 
-    The model may be stale because its board is lost, or because it receives no scene: only the time at which the scene
-    was sensed counts.
+    The model may be stale because its board is lost, or because it receives no scene: what counts is the time at which
+    the scene was sensed.
     """
 
     def __init__(self, guard: Guard, blind_ticks: int, has_bodies: bool) -> None:

@@ -24,9 +24,9 @@ class JointSetPoint(NamedTuple):
 
 
 class PathMotion:
-    """One path under way.
+    """The motion along one path.
 
-    The arm may begin slightly off the path: the motion removes the distance over its first `bridging_s`.
+    The arm may begin slightly off the path: the motion removes the offset over its first `bridging_s`.
     """
 
     def __init__(self, path: BlendedPath, braking: Limits, bridging_s: float) -> None:
@@ -39,7 +39,7 @@ class PathMotion:
         self._bridging_s = bridging_s
         self._offset = np.zeros(path.joints)
         self._bridged_s = bridging_s
-        # Where the arm is to be after the last `advance`.
+        # Commanded by the last `advance`.
         self.set_point = JointSetPoint(path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints))
         self._scratch = np.zeros(path.joints)
 
@@ -55,7 +55,7 @@ class PathMotion:
 
     @property
     def remaining_s(self) -> float:
-        """Time until the trajectory under way ends, in s."""
+        """Time until the present trajectory ends, in s."""
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
     def rest_at(self, position: Array) -> float:
@@ -71,7 +71,7 @@ class PathMotion:
         away = np.linalg.norm(points - position, axis=1)
         before, after = np.append(np.inf, away[:-1]), np.append(away[1:], np.inf)
         near = np.flatnonzero((away <= before) & (away <= after) & (away <= away.min() + NEAREST_STEP_RAD))
-        # `linspace` has an exact end: rounding must not go beyond it, where no trajectory begins.
+        # `linspace` ends exactly: rounding must not lead beyond the end, where no trajectory begins.
         places = np.linspace(0.0, self.path.length, len(points))[near]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
         return self._rest(float(places[nearest]), position)
@@ -123,7 +123,7 @@ class PathMotion:
     def _come_to_rest(self) -> None:
         if self._bridged_s < self._bridging_s:
             return
-        # Trajectories end with rounding errors; the end of the path is met exactly.
+        # Trajectories end with rounding errors; set the exact end of the path.
         if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
             self.s = self.path.length
             self.set_point.position[:] = self.path.evaluate(self.s).q

@@ -18,7 +18,7 @@ from rack.levels.tables import read_params
 
 
 class PrimitivePlanner(Planner):
-    """Makes the trajectory that the executor's status wants: of the next segment, or from where a path was held."""
+    """Makes the trajectory that the executor's status requests: of the next segment, or from where a path was held."""
 
     inputs = {"command": Input(MOVE_COMMAND, "above.command"), "status": Input(PRIMITIVE_STATUS, "own.status")}
     output = TRAJECTORY
@@ -38,11 +38,11 @@ class PrimitivePlanner(Planner):
         status = read.status.value
         if status.wants not in window(read.command.value):
             return False
-        # A plan takes a cycle to show in the status. If it is still wanted later, it was lost with the board.
+        # The status shows a plan one cycle later. If it is still wanted after that, it was lost with the board.
         return (status.wants, status.begin) != self._made or tick > self._answered_at
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Time the wanted segment from where it is to begin, or give the reason why not."""
+        """Time the wanted segment from its point of departure, or give the reason why not."""
         status, context = read.status.value, self.context
         serial, begin = status.wants, status.begin
         published = tick + context.within_cycles * context.every
@@ -104,7 +104,7 @@ class Plans:
             self._refusals.pop(serial, None)
 
     def trajectory(self, serial: int, begin: float) -> Trajectory | None:
-        """Return the trajectory of a segment from path parameter `begin`; None: not there yet."""
+        """Return the trajectory of a segment from path parameter `begin`; None: none yet."""
         trajectory = self._trajectories.get(serial)
         return trajectory if trajectory is not None and trajectory.begin == begin else None
 

@@ -43,7 +43,7 @@ class MotionSegment:
 
     def too_late(self, earliest_s: float) -> SegmentFault:
         """Return the fault of a segment that cannot be done before `earliest_s`."""
-        earliest_s = ceil(earliest_s * 1e3) / 1e3  # a user who asks for the time printed here must get it
+        earliest_s = ceil(earliest_s * 1e3) / 1e3  # rounded up: the time printed here can be met
         reason = f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s"
         return SegmentFault(Error.TOO_LATE, reason, earliest_s)
 
@@ -96,7 +96,7 @@ class Memory:
 
 
 def recall(read: Ports) -> Memory | None:
-    """Return what the level's own last messages hold; None when it has never had anything to remember."""
+    """Return the state in the level's own last messages; None before the first ones."""
     status, command = read.last_status, read.last_command
     if not (status.is_there and command.is_there and command.value.id):
         return None

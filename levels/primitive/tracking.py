@@ -1,4 +1,4 @@
-"""How set points reach the servo, and whether it follows them: motion continues only while it does."""
+"""Whether the servo receives and follows set points: motion continues only while it does."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ LEAD_CYCLES = 2
 
 One cycle of logical execution time brings it to the servo, which then interpolates to it over a second one."""
 SEEN_CYCLES = 2
-"""Cycles by which the world model lags behind the servo: a body that rests now has been seen at rest since then."""
+"""Cycles by which the world model lags the servo."""
 HANDOVER_CYCLES = 4
-"""Cycles from the first set point until a status must show that the servo follows it."""
+"""Cycles from the first set point until the servo's status must show that it follows."""
 MAX_MISSED_STATUSES = 3
 """Consecutive cycles without a new status after which the servo is silent."""
 MAX_REST_RAD_S = 1e-3
 """A joint whose interpolated set point is slower than this rests."""
 MAX_UNEXPLAINED_CYCLES = 50
-"""A wait longer than this gets a reason of its own; shorter ones are normal after a restart."""
+"""A longer wait is reported with its reason; shorter ones are normal after a restart."""
 
 
 class Tracking:
     """Decides from the servo's status whether it is in step with this level.
 
-    The two fall out of step when one of them restarts or misses so many cycles that the servo holds by itself. They
-    come into step where the servo holds the arm at rest and is not stopped, and motion continues from there.
+    They fall out of step when either restarts, or misses so many cycles that the servo holds by itself. They get back
+    into step when the servo holds the arm at rest and is not stopped; motion continues from there.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Tracking:
         self._unexplained_cycles = 0
 
     def update(self, status: Reading) -> bool:
-        """Process one status; True in the cycle in which servo and level come into step."""
+        """Process one status; True in the cycle in which servo and level get into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
@@ -74,14 +74,14 @@ class Tracking:
 
 
 class Straying:
-    """Counts cycles in which the arm is away from its set point: a few are permitted, and motion holds meanwhile."""
+    """Counts cycles in which the arm is off its set point: a few are permitted, and motion holds meanwhile."""
 
     def __init__(self, joints: Sequence[str], permitted_rad: float, permitted_cycles: int) -> None:
         self._joints = joints
         self._permitted_rad = permitted_rad
         self._permitted_cycles = permitted_cycles
         self._cycles = 0
-        self.place = ""  # which joint is how far away; empty: none is
+        self.place = ""  # the joint and its distance, readable; empty: none is off
         self.fault: SegmentFault | None = None
 
     @property

@@ -1,7 +1,7 @@
-"""Segments under way.
+"""Execution of segments.
 
-A path starts when planned and clear, holds on command or for the guard, and is done when settled. A gripper segment is
-done when the gripper rests.
+A path starts when it is planned and clear, holds on command or for the guard, and is done when the arm has settled. A
+gripper segment is done when the gripper rests.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from rack.levels.robot.limits import Limits
 from rack.levels.tables import GripperConfig, Positive, Table
 
 ANSWER_CYCLES = 3
-"""Cycles from the end of a trajectory until its segment is reported done, besides those in which the arm settles.
+"""Cycles from the end of a trajectory until its segment is reported done, in addition to those of settling.
 
-They pass until the last set point is due, the servo's status shows it, and this level's status is visible."""
+In these the last set point becomes due, the servo's status shows it, and this level's status becomes visible."""
 
 
 class PrimitiveParams(Table):
@@ -53,7 +53,7 @@ class PrimitiveParams(Table):
 
 @dataclass(frozen=True)
 class WorkRules:
-    """The bounds by which segments are done."""
+    """The bounds within which segments are executed."""
 
     joints: tuple[str, ...]
     limits: Limits
@@ -80,7 +80,7 @@ class WorkRules:
 
 
 class Quiet:
-    """Counts cycles: enough consecutive quiet ones mean settled, too many altogether mean it will never settle."""
+    """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it will never settle."""
 
     def __init__(self, wanted_cycles: int, most_cycles: int) -> None:
         self._wanted_cycles = wanted_cycles
@@ -111,7 +111,7 @@ class WorkCycle(NamedTuple):
 
 
 class PathWork:
-    """One PATH segment under way."""
+    """One PATH segment."""
 
     def __init__(self, segment: MotionSegment, path: BlendedPath, guard: Guard, rules: WorkRules) -> None:
         self.segment = segment
@@ -136,7 +136,7 @@ class PathWork:
             self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
 
     def begin_near(self, position: Array, progress: float) -> None:
-        """Prepare to continue from `position` (joints,), rad; blocked when that is off the path.
+        """Prepare to continue from `position` (joints,), rad; blocked if that is off the path.
 
         `progress`, 0 to 1, is about the part of the path that is done.
         """
@@ -185,7 +185,7 @@ class PathWork:
         return self.motion.s / length if length > 0.0 else 1.0
 
     def ends_s(self, due_s: float) -> float:
-        """Return when the segment should be done, in simulated time, if the set point is due at `due_s`; 0: unknown."""
+        """Return the simulated time at which the segment should be done if the set point is due at `due_s`, or 0."""
         if self.motion.stopping or (self.motion.resting and not self.motion.finished):
             return 0.0
         return due_s + self.motion.remaining_s + self._rules.latency_s
@@ -209,7 +209,7 @@ class PathWork:
         self.blocked = blocked
 
     def _timed(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
-        """Stretch the trajectory to end just in time; refuse one that is too late before anything has moved."""
+        """Stretch the trajectory to end just in time; before the start, refuse one that is too late."""
         if not self.segment.by or not trajectory.duration:
             return trajectory
         available = self.segment.by - self._rules.latency_s - due_s
@@ -220,7 +220,7 @@ class PathWork:
 
 
 class GripperWork:
-    """One GRIPPER segment under way: the gripper moves as far as its force takes it, and is done when it rests."""
+    """One GRIPPER segment: the gripper moves as far as its force permits; done when it rests."""
 
     def __init__(self, segment: MotionSegment, gripper: GripperConfig, rules: WorkRules) -> None:
         self.segment = segment
@@ -230,7 +230,7 @@ class GripperWork:
         self.begin()
 
     def begin(self) -> None:
-        """Wait anew until the gripper rests: at the start, and after the servo has been away."""
+        """Start waiting until the gripper rests: at the start, and when the servo is back in step."""
         self._cycles = 0
         self._quiet = self._rules.quiet()
 
@@ -242,7 +242,7 @@ class GripperWork:
     def done(self, status: Message) -> bool:
         """Return whether the gripper rests."""
         self._cycles += 1
-        # The gripper rests too before the command has reached it.
+        # Before the command reaches it, the gripper rests too.
         if self._cycles <= HANDOVER_CYCLES:
             return False
         speed, permitted = abs(status.opening_velocity), self._rules.params.settled_opening

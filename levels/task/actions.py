@@ -1,4 +1,4 @@
-"""Actions as elemental moves: of the ways to do an action, the quickest that succeeds to its end."""
+"""Actions as elemental moves: of the ways to do an action, the quickest that succeeds."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Option = TypeVar("Option")
 TURNS = 8
 """Turns about the tool's z axis that are tried where only its direction is given."""
 MAX_WAYS = 16
-"""Ways to do an action that are tried to their end."""
+"""Ways to do an action that are planned completely."""
 HALVINGS = 7
-"""Halvings in the search for a reachable place on the way to one that is not."""
+"""Bisections in the search for a reachable place on the way to one that is not."""
 
 
 class Spot(NamedTuple):
@@ -44,7 +44,7 @@ class Way(NamedTuple):
 
 
 def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehearsal:
-    """Return the whole program as moves, rehearsed. Raises `Refused` that names action, place and what is possible."""
+    """Return the whole program as moves, rehearsed. Raises `Refused` with action, place and a possible alternative."""
     rehearsal = start
     for k, action in enumerate(program.action):
         if isinstance(action, Transfer):
@@ -60,7 +60,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 @contextmanager
 def _naming(step: str) -> Iterator[None]:
-    """Begin the reason of a refusal with the step that was refused."""
+    """Prefix the reason of a refusal with the refused step."""
     try:
         yield
     except Refused as refused:
@@ -118,7 +118,7 @@ class Handling(NamedTuple):
     lift: float  # height of the straight motions, m
 
     def takes(self) -> list[Spot]:
-        """Return where the object can be taken and held, at the lowest height at which it can. Raises `Refused`."""
+        """Return the spots to take and hold the object, at the lowest possible height. Raises `Refused`."""
         start = self.start
         refusal: Refused | None = None
         for tools in grasps(start.motion.cell, start.situation, self.row):
@@ -186,7 +186,7 @@ class Handling(NamedTuple):
         return held
 
     def _nothing_at(self, tools: list[Pose]) -> Refused:
-        """Return the refusal for poses of which the arm reaches none, from above, or none freely."""
+        """Return the refusal for poses that the arm cannot reach from above, or only in collision."""
         places = [place for tool in tools for place in (tool, tool.raised(self.lift))]
         return _nothing_at(self.start.motion, places, self.start.q)
 
@@ -203,7 +203,7 @@ def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehe
 
 
 def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refused:
-    """Return the refusal for poses of which the arm reaches none, or none freely."""
+    """Return the refusal for poses that the arm cannot reach, or only in collision."""
     beyond: Pose | None = None
     for tool in tools:
         reachable = motion.ik.reachable(tool, here)

@@ -1,4 +1,4 @@
-"""The executor of the task level: hands down a window of the plan and follows it to its end."""
+"""The executor of the task level: hands down a window of the plan and tracks its execution."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rack.levels.task.program import TaskConfig, TaskParams, read_program
 from rack.levels.task.window import Detour, ShownWindow
 
 ROUNDING_S = 1e-9
-"""Ticks times the clock's period are not exact: a time just reached is not late."""
+"""Margin of times against deadlines: ticks times the clock's period are not exact."""
 
 
 class TaskExecutor(Executor):
@@ -44,14 +44,14 @@ class TaskExecutor(Executor):
         self._window = ShownWindow()
         self._detour = Detour(context.robot, self._orders, self._window)
         self._started = False
-        self._done = 0  # moves of the plan
+        self._done = 0  # moves of the plan done
         self._error = Error.NONE
         self._reason = ""
-        self._progress: tuple[float, ...] = ()  # all that changes while anything moves
+        self._progress: tuple[float, ...] = ()  # all values that change while anything moves
         self._moved_at = 0  # tick of the last such change
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Read what is done below, and the operator's commands; hand down what comes next."""
+        """Read the progress below, and the operator's commands; hand down the next moves."""
         if not self._started:
             self._recall(read)
         self._orders.take(read.operator, lambda command: self._judge(command, read.last_status.value.order))
@@ -79,7 +79,7 @@ class TaskExecutor(Executor):
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
     def _judge(self, command: Message, answered: int) -> None:
-        """Accept or refuse a goto; one that this board had answered before it died is not new."""
+        """Accept or refuse a goto; one already answered before a restart of this board is not new."""
         if self._orders.standing is Operation.GOTO:
             self._detour.begin(command, command.id > answered)
 
@@ -94,7 +94,7 @@ class TaskExecutor(Executor):
             self._error, self._reason = Error(below.error), f"action {action}: {below.reason}"
 
     def _check_times(self, plan: Message, tick: int) -> None:
-        """Fail when an action with a time is not done by it."""
+        """Fail when an action is not done by its time."""
         now_s, done = tick * self.context.tick_s, self._actions_done(plan)
         for k in range(done, len(self._actions)):
             by_s = self._actions[k].by
@@ -103,7 +103,7 @@ class TaskExecutor(Executor):
                 self._error, self._reason = Error.TOO_LATE, reason
 
     def _reason_to_wait(self, below: Reading) -> str:
-        """Return what keeps the level from its work, and what ends that; empty: nothing does."""
+        """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
         orders = self._orders
         if orders.standing is Operation.GOTO:
             return self._detour.reason()
@@ -131,7 +131,7 @@ class TaskExecutor(Executor):
         return len(self._actions) if self._done == plan.count else int(plan.moves["action"][self._done])
 
     def _hand_down(self, plan: Message, command: Message) -> None:
-        """Show the program's next moves, or the one that an operator wants."""
+        """Show the program's next moves, or the operator's goto."""
         detour, window = self._detour, self._window
         if self._error or not (detour.is_known if detour.move else plan.count):
             window.show_none(command)
@@ -152,7 +152,7 @@ class TaskExecutor(Executor):
         status.first, status.detour = self._window.first, self._detour.move
 
     def _answer(self, below: Message, write: Ports) -> None:
-        """Hold on the operator's command, answer it, and hand down the newest command that this cycle is based on."""
+        """Obey and answer the operator, and pass down the newest command on which this cycle is based."""
         orders = self._orders
         write.command.hold = orders.standing is Operation.HOLD or self._detour.holds
         write.command.operator = orders.rests_on(0)
@@ -169,7 +169,7 @@ class TaskExecutor(Executor):
 
 
 def _awaited(plan: Message, below: Message) -> str:
-    """Return what a task waits for while nothing holds it."""
+    """Return the event for which a task waits while nothing holds it."""
     if not plan.id:
         return "no plan yet: the objects must be at rest and the position of the arm known"
     return f"move {below.current} is under way" if below.current else f"no path yet for move {below.done + 1}"

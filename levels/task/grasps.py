@@ -1,4 +1,4 @@
-"""Where the gripper may take an object, and where an object can stand."""
+"""Grasps of an object, and the poses in which it can stand."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SET_DOWN_M = 0.0005
 MAX_DISTANCE_M = 10.0
 """Range in which distances between geoms are measured."""
 SKIN_M = 1e-6
-"""A ray that has met the arm continues this far inside the surface."""
+"""A ray that has hit the arm continues this far inside the surface."""
 MAX_STANDING_GAP_M = 0.02
 """A goal farther than this above or below a standing height is a mistake in the program."""
 

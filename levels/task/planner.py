@@ -1,4 +1,4 @@
-"""The planner of the task level: the whole program as elemental moves, or why it cannot be done."""
+"""The planner of the task level: the whole program as elemental moves, or the reason why it cannot be done."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_REST_M_S = 0.01
 class TaskPlanner(Planner):
     """Plans the program once, as soon as the position of the arm is known and the objects are at rest.
 
-    Whatever cannot be done is refused before anything moves, with what could be done instead.
+    A program that cannot be done is refused before anything moves, with a possible alternative.
     """
 
     inputs = {
@@ -86,9 +86,9 @@ class TaskPlanner(Planner):
     def _is_on_its_way(self, read: Ports, tick: int, since: int) -> bool:
         """Return whether the executor may still report a plan: of this process, or of one before it."""
         if self._plan is not None:
-            # Once visible, it takes a cycle to be read and to be seen in the status.
+            # Once visible, the status acknowledges it a cycle later.
             return tick <= self._visible_at + self.context.every
-        # A planner that died just after publishing: its plan is not seen at once.
+        # A plan published just before a restart of this planner becomes visible later.
         return read.made.is_there or 0 < since <= tick < since + self._slice
 
     def _decompose(self, read: Ports, write: Message, tick: int) -> None:

@@ -1,4 +1,4 @@
-"""A program played through before anything moves: every move planned as the level below will plan it, and timed."""
+"""Rehearsal of a program before anything moves: every move is planned as the level below will plan it, and timed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.pose import Pose
 from rack.levels.task.program import TaskParams
 
-if TYPE_CHECKING:  # it brings OMPL, which only a planner's process needs
+if TYPE_CHECKING:  # it imports OMPL, which only a planner's process needs
     from rack.levels.planning.motion_planner import MotionPlanner
 
 
@@ -27,7 +27,7 @@ class Rehearsed(NamedTuple):
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """The result of a sequence of moves. Immutable: `then` returns a new one, so other ways can be tried from here."""
+    """The result of a sequence of moves. Immutable: `then` returns a new one, so alternatives can start from here."""
 
     motion: MotionPlanner
     q: Array  # configuration at the end, (joints,), rad
@@ -79,7 +79,7 @@ def pipeline_periods(context: LevelContext) -> PipelinePeriods:
 def finish_times(
     moves: Sequence[Rehearsed], visible_s: float, periods: PipelinePeriods, needs: TaskParams
 ) -> list[float]:
-    """Return for every move the latest simulated time, in s, at which the task level knows that it is done.
+    """Return for every move the latest simulated time, in s, at which the task level reads that it is done.
 
     `visible_s` is when the first window of moves becomes visible below. A move begins when the one before it is done,
     its path is planned, and the window of segments has room for it; each message waits at most one cycle to be read

@@ -1,7 +1,7 @@
-"""The moves that the task level shows to the level below: a window on the plan, or an operator's goto in its place.
+"""The moves that the task level shows to the level below: a window on the plan, or an operator's goto instead.
 
-A goto leaves the program during a free motion or right after one; that motion is done again afterwards, from wherever
-the arm then is. Work on an object is completed first: approach, grasp, depart.
+A goto interrupts the program during a free motion or right after one; that motion is repeated afterwards, from the
+arm's position at that time. Work on an object is completed first: approach, grasp, depart.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from rack.levels.planning.pose import pointing, pose
 from rack.levels.tables import RobotConfig
 
 JUMP = 2
-"""From the newest id shown to the next, so that the level below starts anew: a gap of more than one."""
+"""Step from the newest id shown to the next: a gap makes the level below start anew."""
 FIRST_ID = 1
 """Id of the plan's first move, until an operator has intervened."""
 FREE = (Verb.MOVE, Verb.MOVE_JOINTS)
-"""Moves that may be interrupted and done again later, from wherever the arm then is."""
+"""Moves that may be interrupted and repeated later from another position."""
 MAX_JOINT_RAD = 1e3
-"""No joint is sent farther; the level below knows what it can reach."""
+"""Joint goals beyond this are refused; narrower limits are those of the level below."""
 
 
 class ShownWindow:
-    """Numbers the moves on the bus: ids always rise, whatever an operator inserts."""
+    """Numbers the moves on the bus: ids always rise, even if an operator inserts moves."""
 
     def __init__(self, first: int = FIRST_ID, newest: int = 0, before: int = 0) -> None:
         self.first = first  # id of the plan's first move: its k-th is `first` + k
@@ -89,23 +89,23 @@ def next_free(plan: Message, done: int) -> int:
 
 
 class Detour:
-    """An operator's goto: one move in place of the program's, and then the rest of the program."""
+    """An operator's goto: one move instead of the program's, then the rest of the program."""
 
     def __init__(self, robot: RobotConfig, orders: Orders, window: ShownWindow, move: int = 0) -> None:
         self._robot, self._orders, self._window = robot, orders, window
         self._goal: Message | None = None
         self._is_new = False
-        self.move = move  # id of the goto on the bus; 0: the program has not been left
-        self.holds = False  # the arm must rest before the program can be left
+        self.move = move  # id of the goto on the bus; 0: the program is not interrupted
+        self.holds = False  # the arm must rest before the program can be interrupted
         self.until: int | None = None  # the first move of the program that must not begin
 
     @property
     def is_known(self) -> bool:
-        """True unless this board has died and a hold came after the goto: then the goal is lost."""
+        """False if this board was restarted and a hold came after the goto: the goal is then lost."""
         return self._goal is not None
 
     def reason(self) -> str:
-        """Return the state of the goto, and what ends it."""
+        """Return the state of the goto, and the command that ends it."""
         goal = described(Operation.GOTO, self._goal.goal) if self._goal is not None else "goto"
         stage = "done" if self._orders.answer is Answer.DONE else "under way"
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
@@ -141,14 +141,14 @@ class Detour:
         return done
 
     def _leave(self, plan: Message, done: int, below: Message) -> int:
-        """Leave the program where possible; until then show only the moves that must be done first."""
+        """Interrupt the program where possible; until then show only the moves that must be done first."""
         after_free = is_free(plan, done - 1)
         is_begun = below.current == self._window.first + done
         if not is_free(plan, done) and (is_begun or not after_free):
             self.until = next_free(plan, done)
             return done
         self.until, self.holds = done, True
-        # At rest, the program can be left once the level below has received that nothing more is to begin.
+        # At rest, the program can be interrupted once the level below has received the window without further moves.
         if below.resting and below.operator >= self._orders.basis:
             self.move, self.holds = self._window.jump(), False
             return done if is_free(plan, done) else done - 1

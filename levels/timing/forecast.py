@@ -1,4 +1,4 @@
-"""Everything that the timing model predicts of a rack before it is launched."""
+"""All predictions of the timing model for a rack before it is launched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rack as the timing model sees it, as plain data, and the times of its levels in the paper's terms."""
+"""The data of a rack for the timing model, and the times of its levels in the paper's terms."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class LevelTiming:
 
 @dataclass(frozen=True)
 class RackTiming:
-    """Everything that the timing model needs to know of a rack.
+    """The data of a rack for the timing model.
 
     `clock_ns` is one tick of simulated time. `clock` is the task of the system clock, released every tick of the wall
     clock; its cost is 0 if unknown. `context_switch_ns` is t_cs, `small_share` the limit of eq. 3.10.

@@ -50,7 +50,7 @@ def response_time(
 
     Without a `period`, releases do not queue, as in a rack: a late task takes up the newest release and skips the
     others, so the job finds its task free, and a response longer than the period is a miss. With a `period`, releases
-    queue, and the result is the longest of all jobs in the busy time (Lehoczky 1990), whatever the deadline.
+    queue, and the result is the longest of all jobs in the busy time (Lehoczky 1990), for any deadline.
 
     `sharing` are tasks under ordinary scheduling that take turns with this one: while it waits, none of them computes
     more than it does, plus one `turn`. That bound assumes fair turns, which Linux does not guarantee. The default

@@ -1,4 +1,4 @@
-"""Budgets of levels, and tasks as the timing model sees them: unit functions of known length, released on a grid."""
+"""Budgets of levels, and tasks of the timing model: unit functions of known length, released on a grid."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class TimedTask:
     job is released after those. `parts` are computed in order. `priority` is SCHED_FIFO's: a higher one preempts; tasks
     of equal priority run in the order of their releases, then of `name`. Ordinary scheduling is 0, below all. `ceiling`
     is the priority of parts that are not preemptible: a plan update blocks its own executor and every task that is not
-    above the executor (eq. 3.10). `jitter_ns` bounds the delay from a release until the task knows of it.
+    above the executor (eq. 3.10). `jitter_ns` bounds the delay from a release until the task is ready.
     """
 
     name: str

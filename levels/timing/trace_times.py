@@ -18,7 +18,7 @@ from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.levels.timing.tasks import Unit
 
 STAMPS = ("start_ns", "plan_ns", "read_ns", "process_ns", "end_ns")
-"""The moments of a record, in order."""
+"""The time stamps of a record, in order."""
 UNITS = {
     "executor": (
         (Unit.EXCHANGE, "start_ns", "plan_ns"),
@@ -28,7 +28,7 @@ UNITS = {
     ),
     "planner": ((Unit.PLAN, "start_ns", "process_ns"), (Unit.UPDATE, "process_ns", "end_ns")),
 }
-"""The unit functions of a record, by role, with their first and last moment. A planner's reading is part of P."""
+"""The unit functions of a record, by role, with their first and last time stamp. A planner's reading is part of P."""
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9}
 Distribution = dict[str, float]
 
@@ -93,7 +93,7 @@ def newest_visible(ticks: np.ndarray, visible_at: np.ndarray) -> np.ndarray:
 
     `visible_at` holds the ticks from which messages are visible, in the order of their writing.
     """
-    # A late message must not hide behind an earlier tick of a later one.
+    # A message that becomes visible late delays those after it.
     return np.asarray(np.searchsorted(np.maximum.accumulate(visible_at), ticks, side="right") - 1)
 
 
@@ -117,13 +117,13 @@ def distribution(values: np.ndarray) -> Distribution | None:
 
 
 class Occupation:
-    """When a core was occupied: a union of stretches of time, ns, which may overlap."""
+    """When a core was occupied: a union of intervals, ns, which may overlap."""
 
     def __init__(self, starts: np.ndarray, ends: np.ndarray) -> None:
-        """Take stretches from `starts` to `ends`, each of shape (n,), in any order."""
+        """Take intervals from `starts` to `ends`, each of shape (n,), in any order."""
         order = np.argsort(starts, kind="stable")
         starts, ends = starts[order], np.maximum.accumulate(np.maximum(starts, ends)[order])
-        # A stretch that begins after the end of all before it begins a new block.
+        # An interval that begins after the end of all before it begins a new block.
         first = np.ones(len(starts), bool)
         first[1:] = starts[1:] > ends[:-1]
         self._starts = starts[first]
@@ -132,7 +132,7 @@ class Occupation:
 
     @classmethod
     def of(cls, rows: np.ndarray) -> Occupation:
-        """Return when a task had its core, or would have had it: waking up and closing a cycle included."""
+        """Return when a task needed its core: from waking up to closing the cycle."""
         half = overhead_ns(rows) // 2
         return cls(rows["start_ns"] - half, rows["end_ns"] + half)
 
@@ -146,7 +146,7 @@ class Occupation:
         )
 
     def within(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Return the occupied time in each stretch from `starts` to `ends`, shape as given."""
+        """Return the occupied time in each interval from `starts` to `ends`, shape as given."""
         return np.asarray(self._until(ends) - self._until(starts))
 
     def _until(self, times: np.ndarray) -> np.ndarray:

@@ -59,7 +59,7 @@ class EquationVerdict:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """What was judged, the same before and after a change of the rack."""
+        """Identity of the judgement, the same before and after a change of the rack."""
         return self.equation, self.subject, self.meaning
 
     def document(self) -> dict[str, Any]:
