@@ -1,4 +1,4 @@
-"""The kernel's lock on a byte: exclusive, at once or not at all, gone with its process."""
+"""The kernel's lock on a byte: exclusive, non-blocking, released with its process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fault table: entries are filled whole, by whoever comes, and found by the task that they concern."""
+"""The fault table: any process fills whole entries, and each task finds its own."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_lost_rows_are_counted_exactly(bus: Segment, written: int) -> None:
     ring.drain()
     write(writer, written)
     found, lost = serials(ring)
-    # One slot is the writer's: what lies in it may be half a message.
+    # One slot is the writer's: it may hold half a message.
     assert found == list(range(3 + written - len(found) + 1, 3 + written + 1))
     assert len(found) == min(written, DEPTH - 1)
     assert lost == written - len(found)

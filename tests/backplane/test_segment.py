@@ -73,9 +73,9 @@ def test_a_name_in_use_is_refused_and_the_first_segment_stays(make_bus: MakeBus)
 
 def test_attaching_to_an_unknown_rack_names_the_racks(make_bus: MakeBus) -> None:
     there = make_bus().rack
-    told = refusal(lambda: Segment.attach("nobody-s"))
-    assert "rack 'nobody-s' does not exist" in told
-    assert there in told
+    message = refusal(lambda: Segment.attach("nobody-s"))
+    assert "rack 'nobody-s' does not exist" in message
+    assert there in message
 
 
 @pytest.mark.parametrize("name", ["a/b", "x" * 300])
@@ -86,8 +86,8 @@ def test_a_name_that_none_can_have_is_not_there(name: str) -> None:
 def test_another_layout_version_is_refused(make_bus: MakeBus) -> None:
     segment = make_bus()
     segment.words[Head.VERSION] = VERSION + 1
-    told = refusal(lambda: Segment.attach(segment.rack))
-    assert f"layout version {VERSION + 1}; this program attaches to {VERSION}" in told
+    message = refusal(lambda: Segment.attach(segment.rack))
+    assert f"layout version {VERSION + 1}; this program attaches to {VERSION}" in message
 
 
 def test_a_segment_of_another_kind_is_refused(make_bus: MakeBus) -> None:
@@ -100,8 +100,8 @@ def test_a_size_other_than_the_heads_is_refused(make_bus: MakeBus) -> None:
     segment = make_bus()
     size = len(segment.bytes)
     os.truncate(shm_path(segment.rack), size + 4096)
-    told = refusal(lambda: Segment.attach(segment.rack))
-    assert f"{size + 4096} bytes; its head says {size}" in told
+    message = refusal(lambda: Segment.attach(segment.rack))
+    assert f"{size + 4096} bytes; its head says {size}" in message
 
 
 def test_a_segment_without_room_for_a_head_is_refused(rack_name: str) -> None:
@@ -121,7 +121,7 @@ def test_another_users_segment_is_refused(make_bus: MakeBus) -> None:
         return why in refusal(lambda: Segment.attach(segment.rack))
 
     assert exit_status(fork(lambda: attach("belongs to another user"))) == 0
-    # Open to everybody and made by somebody: what it holds is not to be trusted.
+    # World-writable and another user's: its contents must not be trusted.
     shm_path(segment.rack).chmod(0o666)
     os.chown(shm_path(segment.rack), ANOTHER, ANOTHER)
     assert exit_status(fork(lambda: attach(f"owner {ANOTHER}"))) == 0
@@ -151,9 +151,9 @@ def too_large(rack: str) -> Layout:
 
 
 def test_a_lack_of_shared_memory_is_reported_at_creation(rack_name: str) -> None:
-    told = refusal(lambda: Segment.create(too_large(rack_name), ""))
-    assert f"rack '{rack_name}'" in told
-    assert "bytes of shared memory" in told
+    message = refusal(lambda: Segment.create(too_large(rack_name), ""))
+    assert f"rack '{rack_name}'" in message
+    assert "bytes of shared memory" in message
     assert rack_name not in racks()
 
 

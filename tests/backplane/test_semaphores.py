@@ -97,7 +97,7 @@ def wait_for_tasks(segment: Segment) -> None:
 
 
 def futex_call(pid: int) -> int:
-    """Return the operation of the futex call in which a process waits, as the kernel tells it; 0: it is in no such."""
+    """Return the operation of the futex call in which a process waits, from /proc; 0: it is in none."""
     call = Path(f"/proc/{pid}/syscall").read_text().split()
     operation = int(call[2], 16) if len(call) > 2 else 0
     return operation if operation & ~FUTEX_CLOCK_REALTIME == FUTEX_WAIT_BITSET else 0
@@ -106,7 +106,7 @@ def futex_call(pid: int) -> int:
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("wait", [wait_for_release, wait_for_lock, wait_for_tasks])
 def test_no_step_of_the_wall_clock_moves_the_bound_of_a_wait(bus: Segment, wait: Callable[[Segment], None]) -> None:
-    # Nobody sets this machine's clock for a test. The kernel says by which clock a process waits.
+    # A test cannot set the machine's clock. The kernel shows by which clock a process waits.
     seen = [0]
     with forked(lambda: wait(bus)) as pid:
         try:

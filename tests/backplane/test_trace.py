@@ -1,4 +1,4 @@
-"""Trace rings: one record a cycle, as its task wrote it."""
+"""Trace rings: one record per cycle, as its task wrote it."""
 
 from __future__ import annotations
 

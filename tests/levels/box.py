@@ -1,4 +1,4 @@
-"""A mailbox of a rack in one process, and what faulty writers make of its messages."""
+"""A mailbox of a rack in one process, and faults of its writers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rack.backplane.message import Message, MessageType
 SILENT_CYCLES = 4
 """Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the one it waits."""
 Disturbance = Callable[[int, bytes], "Sequence[tuple[int, bytes | None]]"]
-"""What a faulty writer makes of a message, visible at a tick: what becomes visible, and when; None: a damaged one."""
+"""A writer's fault: of a message visible at a tick, the messages that become visible, and when; None: a damaged one."""
 
 
 class Box:
@@ -34,13 +34,13 @@ class Box:
         self._good_since = 0
 
     def publish(self, message: Message, visible_at: int) -> None:
-        """Let `message` be seen from tick `visible_at` on, if nothing disturbs that."""
+        """Make `message` visible from tick `visible_at` on, unless a fault interferes."""
         data = bytes(message.raw)
         for one in ((visible_at, data),) if self.disturbance is None else self.disturbance(visible_at, data):
             insort(self._waiting, one, key=lambda waiting: waiting[0])
 
     def withdraw(self, tick: int) -> None:
-        """Undo what is not yet visible at `tick`: its writer died before it was finished."""
+        """Undo messages not yet visible at `tick`: their writer died before they were finished."""
         self._waiting = [one for one in self._waiting if one[0] <= tick]
 
     def at(self, tick: int) -> tuple[int, bytes | None]:
@@ -58,7 +58,7 @@ class Box:
         return self._good
 
     def is_lost(self, tick: int) -> bool:
-        """Say whether readers are told that the writer is lost or silent."""
+        """Say whether the writer is lost or silent for its readers."""
         if self.lost or self._every is None or not self._serial:
             return self.lost and self._serial > 0
         return tick - (self._good_since - self._every) >= SILENT_CYCLES * self._every
@@ -73,13 +73,13 @@ def mute(visible_at: int, data: bytes) -> Shown:
 
 
 def lose_some(probability: float, seed: int) -> Disturbance:
-    """Damage messages with that probability; a dropped one is the same to a reader: a serial without a message."""
+    """Damage messages with that probability; to a reader, a dropped one is the same: a serial without a message."""
     chance = np.random.default_rng(seed)
     return lambda visible_at, data: ((visible_at, None if chance.random() < probability else data),)
 
 
 def hold_back(ticks: int) -> Disturbance:
-    """Show every message so much later, the last ones behind those that come when the fault is over."""
+    """Show every message `ticks` later, the last ones after those that follow the fault."""
     return lambda visible_at, data: ((visible_at + ticks, data),)
 
 

@@ -152,7 +152,7 @@ class Lockstep:
         self.tasks[name].rejoin(self.tick)
 
     def lose(self, name: str, ticks: int, finished: bool = True) -> None:
-        """Let a task die now and start anew `ticks` later; without `finished`, a plan under way is never made."""
+        """Kill a task now and restart it `ticks` later; without `finished`, its present plan is never made."""
         self.tasks[name].lose(self.tick, finished)
         self.after(ticks, lambda: self.restart(name))
 
@@ -175,7 +175,7 @@ class Lockstep:
         return Message(self.boxes[mailbox].dtype)
 
     def write(self, mailbox: str, message: Message) -> None:
-        """Let `message` be seen in `mailbox` from now on."""
+        """Make `message` visible in `mailbox` from now on."""
         self.boxes[mailbox].publish(message, self.tick)
 
     def read(self, mailbox: str) -> Message:
@@ -215,7 +215,7 @@ def source(port: Input, board: BoardSpec) -> str:
 
 
 class Operator:
-    """Says things to levels; every command has the next serial."""
+    """Sends commands to levels; every command has the next serial."""
 
     def __init__(self, rack: Lockstep) -> None:
         self._rack, self.serial = rack, 0

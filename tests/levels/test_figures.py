@@ -1,4 +1,4 @@
-"""The level of the paper's figures 2 to 4: it computes for the times that it is given."""
+"""The level of the paper's figures 2 to 4: it computes for the given times."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
 
 
 @pytest.mark.parametrize(
-    ("params", "told"),
+    ("params", "message"),
     [
         ({"process_ms": -1.0}, "params.process_ms"),
         ({"process_ms": []}, "params.process_ms"),
@@ -79,6 +79,6 @@ def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
         ({"proces_ms": 1.0}, "keys: process_ms, plan_ms"),
     ],
 )
-def test_a_time_that_is_none_is_refused_by_name(params: dict[str, Any], told: str) -> None:
-    with pytest.raises(LevelError, match=told):
+def test_a_time_that_is_none_is_refused_by_name(params: dict[str, Any], message: str) -> None:
+    with pytest.raises(LevelError, match=message):
         FigureExecutor(context(**params))

@@ -15,7 +15,7 @@ from tests.levels.lockstep import Operator
 from tests.levels.whole_rack import WholeRack
 
 TAKES = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.JOINTS, Goal.HOME)}
-STATUS = status("told", 1, *ANSWER)
+STATUS = status("answering", 1, *ANSWER)
 RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])
 
 
@@ -26,7 +26,7 @@ def said(serial: int, what: Operation, goal: Goal = Goal.NONE, verdict: Verdict 
 
 
 def report(orders: Orders, above: int = 0, message: Message | None = None) -> Message:
-    """Return what the status says; `message` is that of the cycle before, whose values stay."""
+    """Return the status; `message` is that of the last cycle, whose values stay."""
     message = Message(STATUS.dtype({})) if message is None else message
     orders.report(message, above)
     return message
@@ -56,12 +56,12 @@ def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(w
     orders = Orders(TAKES)
     orders.take(said(1, Operation.HOLD))
     assert not orders.take(said(2, what, goal))
-    told = report(orders)
-    assert (told.order, told.answer, told.standing) == (2, Answer.REFUSED, Operation.HOLD)
+    shown = report(orders)
+    assert (shown.order, shown.answer, shown.standing) == (2, Answer.REFUSED, Operation.HOLD)
     name = f"{what.name} {goal.name}".lower()
-    assert told.objection == f"{name} is not a command of this level; permitted: hold, resume, goto joints|home"
+    assert shown.objection == f"{name} is not a command of this level; permitted: hold, resume, goto joints|home"
     # The torque still rests on the one before.
-    assert told.operator == 1
+    assert shown.operator == 1
 
 
 def test_an_unknown_number_is_refused() -> None:
@@ -84,11 +84,11 @@ def test_a_command_given_up_holds() -> None:
     orders = Orders(TAKES)
     orders.take(said(5, Operation.GOTO, Goal.HOME))
     orders.fail("out of reach")
-    told = report(orders)
-    assert (told.standing, told.answer, told.objection) == (Operation.HOLD, Answer.REFUSED, "out of reach")
-    assert told.operator == 5
+    shown = report(orders)
+    assert (shown.standing, shown.answer, shown.objection) == (Operation.HOLD, Answer.REFUSED, "out of reach")
+    assert shown.operator == 5
     orders.done()
-    assert report(orders, message=told).answer == Answer.REFUSED
+    assert report(orders, message=shown).answer == Answer.REFUSED
 
 
 def test_only_a_command_under_way_becomes_done() -> None:
@@ -156,10 +156,10 @@ def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> No
     held = rack.read("servo.status").position.copy()
     rack.run(2.0)
     assert np.abs(rack.read("servo.status").position - held).max() < 1e-3
-    # It has gone all the way down, and no level above knows of it.
+    # It has been passed down to the lowest level, and no level above knows of it.
     above = LEVELS.index(level)
     assert [rack.read(f"{name}.status").operator for name in LEVELS] == above * [0] + (4 - above) * [serial]
-    # But every one of them says that it is kept from its work, and by whom.
+    # But each of them reports that it is held, and by whom.
     statuses = [rack.read(f"{name}.status") for name in LEVELS[: min(above, 2) + 1]]
     for shown in [s for s in statuses if s.state != State.DONE]:
         assert shown.state == State.HOLDING

@@ -1,6 +1,6 @@
 """The whole rack when boards are lost and come back and mailboxes fail, at any time: the task is done all the same.
 
-Boards are lost as a rack loses them: what they had written stays, readers are told, the new process is on the grid.
+Boards are lost as in a rack: their messages stay, readers see the loss, the new process is on the grid.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAILBOXES = (
 
 
 def check(rack: WholeRack) -> None:
-    """The task is done, and nothing has happened to arm and cell on the way."""
+    """Assert that the task is done, without harm to arm or cell."""
     status = rack.run_to_end(40.0)
     assert (status.state, status.reason) == (State.DONE, "")
     servo = rack.read("servo.status")

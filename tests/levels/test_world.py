@@ -1,4 +1,4 @@
-"""The world model: poses, velocities, and a revision that says when something starts or stops moving."""
+"""The world model: poses, velocities, and a revision that rises when a body starts or stops moving."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class WorldRig:
 
     @property
     def model(self) -> Message:
-        """What the executor wrote last."""
+        """The executor's last message."""
         return cast(Message, self.rack.tasks["world"].write.model)
 
     def run(self, seconds: float, poses: Poses | None) -> list[int]:

@@ -71,8 +71,8 @@ def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> Non
 
     start(segment)
     numbers = [tick for tick, _ in given_out(segment, 30, hold_up)]
-    behind = numbers[numbers.index(held_up[0]) + 1]
-    assert behind - held_up[0] >= 6
+    following = numbers[numbers.index(held_up[0]) + 1]
+    assert following - held_up[0] >= 6
     left_out = sum(second - first - 1 for first, second in pairwise([-1, *numbers]))
     assert segment.words[System.CLOCK_SKIPPED] == left_out
 
@@ -94,7 +94,7 @@ class Lagging:
 def test_a_late_clock_makes_the_last_tick_of_a_run(make_bus: MakeBus) -> None:
     segment, controller = make_bus(), Lagging()
     start(segment)
-    # Known from the start: a machine that stalls before the first tick makes the last one all the same.
+    # Known from the start: a machine that stalls before the first tick still makes the last one.
     segment.words[System.STOP_TICK] = 5
     driver = RealtimeDriver(segment, lambda _: None)
     driver.controller = controller
@@ -116,7 +116,7 @@ def test_a_task_is_released_at_its_own_grid_points(make_bus: MakeBus) -> None:
     start(segment)
     fast, slow, seen = segment.block("fast"), segment.block("slow"), []
     ticks = given_out(segment, 40, lambda tick: seen.append((fast[Block.RELEASED], slow[Block.RELEASED])))
-    # What is seen at a tick is what the tick before it released, also where ticks were left out.
+    # A tick sees the releases of the tick before it, even across skipped ticks.
     before = [tick for tick, _ in ticks][:-1]
     assert seen == [(-1, -1), *((tick, tick - tick % 4) for tick in before)]
 
@@ -133,7 +133,7 @@ def test_nothing_is_released_to_a_planner_within_its_time_slice(make_bus: MakeBu
             block[Block.DEADLINE] = max(end_of_slice, block[Block.DEADLINE])
 
     ticks = [tick for tick, _ in given_out(segment, 40, plan)][-len(released) :]
-    # What is seen at a tick is what the tick before it released.
+    # A tick sees the releases of the tick before it.
     within = [seen for tick, seen in zip(ticks[1:], released, strict=False) if tick < end_of_slice]
     assert set(within) == {released[0]}
     assert released[-1] > end_of_slice

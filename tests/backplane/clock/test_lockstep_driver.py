@@ -23,7 +23,7 @@ HISTORY = 8
 
 
 def serve(segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, str, int]], work_s: float) -> None:
-    """Do a task's cycles, slowly, and tell the clock of each."""
+    """Run a task's cycles slowly, and report each to the clock."""
     block = segment.block(name)
     while (tick := cycle.wait()) is not None:
         log.append(("begin", name, tick))
@@ -46,7 +46,7 @@ def lockstep(
         return stop if tick >= stop else None
 
     segment.words[System.LOCKSTEP] = 1
-    # There before the first release: a task that comes later waits for the next one.
+    # Ready before the first release: a task that is late waits for the next one.
     cycles = {t.name: NextCycle(segment, t.name, poll) for t in segment.layout.tasks}
     threads = [
         threading.Thread(target=serve, args=(segment, t.name, cycles[t.name], log, 0.002 * t.slot), daemon=True)

@@ -90,7 +90,7 @@ def test_a_planner_takes_a_late_release_as_of_its_tick_within_its_slice(
     cycle.wait()
     release(segment, newest)
     assert (cycle.wait(), cycle.skipped) == (taken, skipped)
-    # The releases behind it come one by one.
+    # The releases after it come one by one.
     assert [cycle.wait() for _ in range((newest - taken) // EVERY)] == list(range(taken + EVERY, newest + 1, EVERY))
 
 
@@ -148,7 +148,7 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
     with forked(clock) as pid:
         bus.words[System.CLOCK_PID] = pid
         with in_thread(cycle.wait):
-            # The looks of a tenth of a second and more.
+            # The checks a tenth of a second apart or more.
             wait_until(lambda: len(looks) > 60)
             bus.words[System.STATE] = Run.STOPPED
             wake_semaphore(bus.rack, "level").release()

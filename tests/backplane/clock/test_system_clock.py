@@ -1,4 +1,4 @@
-"""The system clock as boards see it, and the rates that its grid permits."""
+"""The system clock as read by boards, and the rates that its grid permits."""
 
 from __future__ import annotations
 

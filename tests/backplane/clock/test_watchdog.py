@@ -1,4 +1,4 @@
-"""The watchdog: a missed release is a miss; only proof makes it a loss."""
+"""The watchdog: a missed release is only a miss; a loss needs proof."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PERIOD_NS = 2_500_000
 
 
 class Watched:
-    """A task that the test answers for, and what the watchdog rings."""
+    """A task played by the test, and the watchdog's alarms."""
 
     def __init__(self, segment: Segment, pid: int) -> None:
         self.task = ReleasedTask(segment, segment.layout.task("writer"))
@@ -31,7 +31,7 @@ class Watched:
         self.tick = -1
 
     def release(self, answered: bool) -> list[Alarm]:
-        """Release the task for the next tick; return what is rung."""
+        """Release the task for the next tick; return the alarms raised."""
         self.tick += 1
         if answered:
             self.task.block[Block.DONE] = self.task.block[Block.RELEASED]
@@ -68,7 +68,7 @@ def test_a_process_that_could_run_is_starved_and_not_lost(make_bus: MakeBus) -> 
 
 
 def silent(watched: Watched) -> list[Alarm]:
-    """Release a task for longer than any may be silent; return what the release behind that rings."""
+    """Release a task for longer than any may be silent; return the alarms of the next release."""
     watched.release(True)
     assert not any(Alarm.HANG in watched.release(False) for _ in range(LEAST_NS // PERIOD_NS))
     return watched.release(False)

@@ -17,8 +17,8 @@ from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, descriptors, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
-TOLD = 200
-"""Words in the free part of the segment's head by which workers tell how far they are."""
+REPORT = 200
+"""Words in the free part of the segment's head in which workers report their progress."""
 COUNT = 220
 WON, LOST = 1, 2
 
@@ -31,19 +31,19 @@ def bus(make_bus: MakeBus) -> Segment:
 def hold(segment: Segment) -> None:
     """Take the lock and keep it."""
     assert MailboxLock(segment, NAME, BOUND_S).acquire()
-    segment.words[TOLD] = WON
+    segment.words[REPORT] = WON
     time.sleep(60)
 
 
 def obtains(lock: MailboxLock) -> bool:
-    """Say whether a lock can be had within a few of its bounds."""
+    """Say whether a lock can be obtained within a few of its bounds."""
     return any(lock.acquire() for _ in range(3))
 
 
 def test_a_wait_for_a_living_holder_ends_at_its_bound(bus: Segment) -> None:
     lock = MailboxLock(bus, NAME)
     with forked(lambda: hold(bus)):
-        wait_until(lambda: bus.words[TOLD])
+        wait_until(lambda: bus.words[REPORT])
         assert [lock.acquire() for _ in range(5)] == [False] * 5
     assert obtains(lock)
 
@@ -54,7 +54,7 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
     assert writer.write(0, now=0)
     assert reader.read(0).is_new
     with forked(lambda: hold(bus)):
-        wait_until(lambda: bus.words[TOLD])
+        wait_until(lambda: bus.words[REPORT])
         cut_off = reader.read(1)
         assert (cut_off.value.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
         assert not writer.write(1, now=1)
@@ -66,16 +66,16 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
 def test_a_bus_error_before_the_first_message_gives_none(bus: Segment) -> None:
     reader = open_reader(bus, NAME)
     with forked(lambda: hold(bus)):
-        wait_until(lambda: bus.words[TOLD])
+        wait_until(lambda: bus.words[REPORT])
         assert reader.read(0).verdict is Verdict.NONE
     assert reader.statistics.bus_errors == 1
 
 
 def compete(segment: Segment, word: int) -> None:
-    """Wait for the holder's end, try once, tell how it went, and keep the lock where it was obtained."""
+    """Wait for the holder's end, try once, report the result, and keep the lock if obtained."""
     lock = MailboxLock(segment, NAME)
     segment.words[word] = -1
-    while not segment.words[TOLD - 1]:
+    while not segment.words[REPORT - 1]:
         pass
     segment.words[word] = WON if lock.acquire() else LOST
     time.sleep(60)
@@ -83,23 +83,23 @@ def compete(segment: Segment, word: int) -> None:
 
 @pytest.mark.parametrize("trial", range(15))
 def test_of_several_waiters_one_takes_over_from_a_killed_holder(bus: Segment, trial: int) -> None:
-    told = [TOLD + 1, TOLD + 2, TOLD + 3]
+    reports = [REPORT + 1, REPORT + 2, REPORT + 3]
     holder = fork(lambda: hold(bus))
-    waiters = [fork(lambda word=word: compete(bus, word)) for word in told]
+    waiters = [fork(lambda word=word: compete(bus, word)) for word in reports]
     try:
-        wait_until(lambda: bus.words[TOLD] and all(bus.words[word] for word in told))
+        wait_until(lambda: bus.words[REPORT] and all(bus.words[word] for word in reports))
         kill(holder)
-        bus.words[TOLD - 1] = 1
-        wait_until(lambda: all(bus.words[word] > 0 for word in told))
-        assert sorted(bus.words[word] for word in told) == [WON, LOST, LOST]
+        bus.words[REPORT - 1] = 1
+        wait_until(lambda: all(bus.words[word] > 0 for word in reports))
+        assert sorted(bus.words[word] for word in reports) == [WON, LOST, LOST]
     finally:
         for pid in (holder, *waiters):
             kill(pid)
     assert obtains(MailboxLock(bus, NAME))
 
 
-def cycle(segment: Segment, word: int = TOLD) -> None:
-    """Count in the critical section, by a read and a write that anybody in between would spoil."""
+def cycle(segment: Segment, word: int = REPORT) -> None:
+    """Count in the critical section, by a read and a write that another process in between would spoil."""
     lock = MailboxLock(segment, NAME)
     while True:
         if not lock.acquire():
@@ -112,29 +112,29 @@ def cycle(segment: Segment, word: int = TOLD) -> None:
 
 
 def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
-    told = [TOLD + 1, TOLD + 2, TOLD + 3]
-    workers = [fork(lambda word=word: cycle(bus, word)) for word in told]
+    reports = [REPORT + 1, REPORT + 2, REPORT + 3]
+    workers = [fork(lambda word=word: cycle(bus, word)) for word in reports]
     try:
-        wait_until(lambda: all(bus.words[word] > 3_000 for word in told))
+        wait_until(lambda: all(bus.words[word] > 3_000 for word in reports))
         # While this process has the lock nobody counts.
         assert MailboxLock(bus, NAME, BOUND_S).acquire()
         counted = bus.words[COUNT]
     finally:
         for pid in workers:
             kill(pid)
-    # A worker tells of its count behind the critical section.
-    assert 0 <= counted - sum(bus.words[word] for word in told) <= len(told)
+    # A worker reports its count after the critical section.
+    assert 0 <= counted - sum(bus.words[word] for word in reports) <= len(reports)
 
 
 @pytest.mark.parametrize("bystanders", [0, 2])
 def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystanders: int) -> None:
     rng, lock = random.Random(3), MailboxLock(bus, NAME)
-    others = [fork(lambda word=word: cycle(bus, word)) for word in range(TOLD + 1, TOLD + 1 + bystanders)]
+    others = [fork(lambda word=word: cycle(bus, word)) for word in range(REPORT + 1, REPORT + 1 + bystanders)]
     try:
         for _ in range(30):
-            bus.words[TOLD] = 0
+            bus.words[REPORT] = 0
             victim = fork(lambda: cycle(bus))
-            wait_until(lambda: bus.words[TOLD])
+            wait_until(lambda: bus.words[REPORT])
             time.sleep(rng.uniform(0.0, 0.001))
             kill(victim)
             wait_until(lock.acquire)
@@ -146,7 +146,7 @@ def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystander
 
 def test_a_holder_overtaken_between_its_two_steps_is_not_the_owner(bus: Segment) -> None:
     slow, quick = MailboxLock(bus, NAME), MailboxLock(bus, NAME)
-    # The slow one has passed the semaphore, and loses its core before it owns the lock.
+    # The slow one has passed the semaphore, and is preempted before it owns the lock.
     lock_semaphore(bus.rack, NAME).acquire(0)
     assert quick.acquire()
     assert not slow._owner.take()

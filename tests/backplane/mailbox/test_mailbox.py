@@ -53,7 +53,7 @@ def test_reads_depend_on_ticks_alone(make_bus: MakeBus, every: int, delay: int, 
     writer, reader = ends(make_bus(mailbox(every=every, delay=delay, depth=32)))
     released = -every
     for tick in range(40):
-        # However far the writer has come meanwhile, the reader sees the slices that have ended.
+        # However far ahead the writer is, the reader sees the slices that have ended.
         while released + every <= tick + ahead:
             released += every
             write(writer, released)
@@ -135,7 +135,7 @@ def test_a_message_overwritten_before_it_is_read_is_a_bus_error(make_bus: MakeBu
     assert seen(reader, 1) == (1, NEW)
     for tick in range(1, 30):
         write(writer, tick)
-    # Tick 10 saw message 10, and the slots reach back to 23 only: a later message would be the future's.
+    # Tick 10 saw message 10, and the slots reach back to 23 only: a later message would not be visible yet.
     assert seen(reader, 10) == (1, BUS_ERROR)
     assert (reader.statistics.bus_errors, reader.statistics.corrupt) == (1, 0)
     assert seen(reader, 28) == (28, NEW)

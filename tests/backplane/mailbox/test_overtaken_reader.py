@@ -1,4 +1,4 @@
-"""A reader that loses its core anywhere while its writer goes round the ring: what it judged by then proves nothing.
+"""A reader that is preempted anywhere while its writer laps the ring: it must not report a fault.
 
 The reader is stopped before each single instruction of a read in turn, as the kernel may stop it, and the writer goes
 on meanwhile, up to the middle of a message.
@@ -24,7 +24,7 @@ from tests.link import Link, MakeLink, links
 DEPTH = 8
 READ_EVERY = 3
 LEAST = 300
-"""Instructions at which a reader is overtaken, at least: one that finds nothing new has fewer."""
+"""Least number of instructions at which a reader is overtaken: one that finds nothing new has fewer."""
 CODE = next(iter(rack.backplane.__path__))
 FAULTS = {
     "": set(),
@@ -33,7 +33,7 @@ FAULTS = {
     "delay": {Alarm.HELD_BACK},
     "reorder": {Alarm.DISORDER, Alarm.HELD_BACK},
 }
-"""Kinds of fault, and what a reader may ring for each."""
+"""Kinds of fault, and the alarms that a reader may raise for each."""
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 class Interruption:
-    """Counts the instructions of `backplane` that are carried out, and before that number `at` calls `action`."""
+    """Counts executed instructions of `backplane`, and calls `action` before number `at`."""
 
     def __init__(self, at: int, action: Callable[[], None]) -> None:
         self._left, self._action = at, action
@@ -70,30 +70,30 @@ class Interruption:
         if event == "opcode":
             self._left -= 1
             if self._left == -1:
-                # Nothing of the writer's is traced: tracing is off in here.
+                # The writer's code is not counted: tracing is off here.
                 self._action()
         return self._trace
 
 
 class Overtaken:
-    """A link whose reader is overtaken by its writer, in the middle of a read."""
+    """A link whose writer overtakes its reader in the middle of a read."""
 
     def __init__(self, rack: Link) -> None:
         self.rack, self.tick = rack, 0
         self._slots = Slots(rack.segment, rack.segment.layout.mailbox(NAME))
 
     def write(self, cycles: int) -> None:
-        """Do cycles of the writer."""
+        """Run cycles of the writer."""
         for _ in range(cycles):
             self.rack.writer.cycle(self.tick)
             self.tick += 1
 
     def read(self) -> None:
-        """Read as of now."""
+        """Read at the present tick."""
         self.rack.reader.cycle(self.tick - self.tick % READ_EVERY)
 
     def is_overtaken(self, at: int, cycles: int, stops_halfway: bool) -> bool:
-        """Read, and have the writer do its cycles before that instruction; False when there are not so many."""
+        """Read, and run the writer's cycles before that instruction; False if the read has fewer instructions."""
 
         def overtake() -> None:
             self.write(cycles)

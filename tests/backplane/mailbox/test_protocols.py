@@ -27,7 +27,7 @@ AT_ONCE: tuple[Protocol, ...] = ("double-buffer", "lock")
 
 
 def hammer(segment: Segment) -> None:
-    """Write for ever; every place of a message holds its serial."""
+    """Write for ever; every element of a message holds its serial."""
     writer = open_writer(segment, NAME)
     while True:
         # A write that the lock cut off has no serial.
@@ -115,7 +115,7 @@ def test_a_writer_killed_anywhere_leaves_its_last_whole_message(make_bus: MakeBu
         successor.close()
         assert follows(slots, reader.serial + 1)
         assert reader.read(latest).is_new
-    # A hammering writer may overtake a reader: a bus error. It never shows a damaged message.
+    # A fast writer may overtake a reader: a bus error. It never shows a damaged message.
     assert reader.statistics.corrupt == 0
     assert slots.fetch(reader.serial)
     assert epoch_of(slots.signature) == 2 * KILLS

@@ -1,4 +1,4 @@
-"""Checks on messages: no alarm for a slow machine, and one alarm an episode for each fault."""
+"""Checks on messages: no alarm for a slow machine, and one alarm per episode for each fault."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 def publish(rack: Link, tick: int, visible_at: int) -> None:
-    """Publish a message behind the back of its task."""
+    """Publish a message without its task."""
     writer = rack.writer.ports.writers["point"]
     writer.message.id = tick
     writer.message.row = tick
@@ -55,7 +55,7 @@ def test_a_reader_that_skips_cycles_reports_nothing_false(link: MakeLink, protoc
 def test_a_late_reader_reports_nothing_false(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
-    # It was released at 20, and lost its core while its writer went on.
+    # It was released at 20, and preempted while its writer continued.
     for tick in range(20, 38):
         rack.writer.cycle(tick)
     assert rack.reader.cycle(20).value.id == 19
@@ -93,7 +93,7 @@ def test_a_writer_that_loses_its_core_between_the_clock_and_its_slot_is_no_fault
     rack.run(0, 20)
     for tick in range(20, 38):
         rack.reader.cycle(tick)
-    # It asked for the time in time, then stood still: the message names a tick that has passed long ago.
+    # It read the clock in time, then stood still: the message carries a tick long past.
     publish(rack, 20, 21)
     rack.reader.cycle(38)
     rack.writer.end(20)
@@ -128,7 +128,7 @@ def test_a_restarted_writer_is_not_taken_for_a_fault(link: MakeLink, protocol: P
     rack = link(protocol)
     rack.run(0, 50)
     if published:
-        # Killed behind its write, before the end of its cycle.
+        # Killed after its write, before the end of its cycle.
         publish(rack, 50, 51)
     rack.writer.close()
     rack.reader.cycle(50)

@@ -34,7 +34,7 @@ def test_a_writer_that_is_only_late_is_neither_mute_nor_stale(link: MakeLink, pr
     for tick in range(20, 60):
         rack.reader.cycle(tick)
     assert rack.alarms() == []
-    # But who reads it holds: a cycle and the slice are lawful, three more are not.
+    # But its reader holds: a cycle and the slice are permitted, three more are not.
     age = 3 + rack.segment.layout.mailbox(NAME).delay
     assert [seen.tick for seen in rack.reader.seen if seen.is_lost] == [*range(19 + age, 60)]
 
@@ -136,7 +136,7 @@ def test_a_lost_writer_that_never_wrote_gives_nothing_to_hold(link: MakeLink) ->
 def test_after_a_pause_of_the_clock_no_writer_is_silent(link: MakeLink, rates: tuple[int, int]) -> None:
     rack = link(rates=rates)
     rack.run(0, 80)
-    # It left 40 ticks out: nobody was released, and every message is old.
+    # It skipped 40 ticks: no task was released, and every message is old.
     rack.run(120, 200)
     assert rack.alarms() == []
     assert not any(seen.is_lost for seen in rack.reader.seen)

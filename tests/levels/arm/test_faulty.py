@@ -1,4 +1,4 @@
-"""Faults between servo level and arm: they do what they say, where they say it, and repeat with the same seed."""
+"""Faults between servo level and arm: their effect, their joint, and their repetition with the same seed."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -
     given = arm._data.ctrl[arm.cell.actuators]
     assert given[1] == 0.0
     assert given[2] == HOLDING[2]
-    assert arm.torque[1] == HOLDING[1]  # nobody tells the servo level
+    assert arm.torque[1] == HOLDING[1]  # the servo level does not know
     assert acted == [0]
     link.inject([])
     link.drive(HOLDING, 0.0)

@@ -44,7 +44,7 @@ def wobble(made: Cell) -> Torque:
 
 @dataclass
 class Extremes:
-    """What a run of the simulation reached, looked at after every MuJoCo step."""
+    """Extremes reached in a run of the simulation, recorded after every MuJoCo step."""
 
     made: Cell
     speed: float = 0.0
@@ -127,7 +127,7 @@ def test_an_arm_without_commands_stands_still(name: str) -> None:
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Callable[[Cell], Extremes]) -> None:
     arm, made = arm_of(name)
-    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # what hits something is stopped by that
+    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # a contact would stop the arm
     extremes, rng = watched(made), np.random.default_rng(7)
     for block in range(60):
         side = rng.choice([-1.0, 1.0], len(made.home)) if block < 40 else np.ones(len(made.home))

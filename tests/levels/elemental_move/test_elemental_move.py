@@ -1,4 +1,4 @@
-"""The elemental move level above the real levels below it: paths ahead of their turn, other ways, restarts."""
+"""The elemental move level with the real levels below it: paths planned ahead, detours, restarts."""
 
 from __future__ import annotations
 

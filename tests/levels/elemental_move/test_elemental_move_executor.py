@@ -70,12 +70,12 @@ class Bench(Lockstep):
 
     @property
     def command(self) -> Message:
-        """What the level hands down."""
+        """The command of the level."""
         return self.read("elemental_move.command")
 
     @property
     def status(self) -> Message:
-        """What the level reports."""
+        """The status of the level."""
         return self.read("elemental_move.status")
 
     def segments(self) -> list[tuple[int, int]]:
@@ -338,7 +338,7 @@ def test_level_says_that_it_waits_for_the_board_below() -> None:
 
 
 def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() -> None:
-    # The path of move 1 was lost on its way, that of move 2 was not; another path for move 1 may end elsewhere.
+    # The path of move 1 was lost, that of move 2 was not; another path for move 1 may end elsewhere.
     bench = Bench()
     bench.order()
     bench.plan(2, bench.home + 0.3)

@@ -1,4 +1,4 @@
-"""The collision checker on the PUMA's cell, against places that geometry tells by hand."""
+"""The collision checker on the PUMA's cell, against positions computed by hand."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_clearance_decides_near_the_table_and_may_be_lowered(
 
 
 def test_links_of_the_arm_may_be_close_but_must_not_touch() -> None:
-    # Nothing stands around this arm: whatever is not free is the arm itself.
+    # This arm stands alone: every collision is one with itself.
     arm = cell("k1607")
     checker = CollisionChecker(arm, config("k1607")[1])
     rng, (low, high) = np.random.default_rng(1), arm.limits.position.T

@@ -1,4 +1,4 @@
-"""Payloads: what grip and motors cannot carry is refused before anything moves, with both numbers."""
+"""Payloads too heavy for grip or motors are refused before anything moves, with both numbers."""
 
 from __future__ import annotations
 

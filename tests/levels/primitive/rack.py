@@ -24,7 +24,7 @@ BEND = np.array([0.3, 0.0, 0.0, 0.4, 0.0, -0.3])
 
 
 class PrimitiveRack(Lockstep):
-    """The primitive level above the real servo and the simulated cell; `seen` and `set_points`: what it wrote."""
+    """The primitive level above the real servo and the simulated cell; `seen` and `set_points` are its messages."""
 
     def __init__(
         self, name: str = "puma560", motion: Sequence[MotionConfig] = (), params: Mapping[str, Any] | None = None

@@ -1,4 +1,4 @@
-"""The guard: the arm rests before it touches what comes in its way, and goes on when the way is clear."""
+"""The guard: the arm rests before it touches an obstacle, and continues when the way is clear."""
 
 from __future__ import annotations
 

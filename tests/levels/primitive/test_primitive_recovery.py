@@ -1,4 +1,4 @@
-"""The primitive level when a board dies, starts anew, misses cycles or falls silent, or the arm does not follow."""
+"""The primitive level when a board dies, restarts, misses cycles or falls silent, or the arm does not follow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A cell: any arm, by its description alone; every mistake in that is one line."""
+"""A cell: any arm, from its description alone; every mistake in it is reported in one line."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ K1607: dict[str, Any] = json.loads((DATA / "k1607_vectors.json").read_text())
 
 @pytest.fixture(scope="module")
 def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
-    """The PUMA without hand and friction, as the published numbers have it."""
+    """The PUMA without hand and friction, as in the published numbers."""
     tree = ElementTree.parse(ROBOTS / "puma560.xml")
     root = tree.getroot()
     for name, parent in [(n, p) for p in root.iter() for n in list(p)]:

@@ -59,7 +59,7 @@ class ServoRig:
 
     @property
     def servo(self) -> ServoExecutor:
-        """The executor, as it is now: a restart replaces it."""
+        """The present executor: a restart replaces it."""
         return cast(ServoExecutor, self.rack.tasks["servo"].level)
 
     @property
@@ -73,7 +73,7 @@ class ServoRig:
         return cast(Message, self.rack.tasks["servo"].write.state)
 
     def set_point(self, position: Array, velocity: Array, due: int) -> None:
-        """Give one set point."""
+        """Send one set point."""
         self.command.id += 1
         self.command.position, self.command.velocity, self.command.due = position, velocity, due
         self.rack.write("primitive.command", self.command)
@@ -89,7 +89,7 @@ class ServoRig:
             self.positions.append(self.status.position.copy())
 
     def step(self) -> None:
-        """Run one tick as a board does: take out what was found and which faults acted."""
+        """Run one tick as a board does: collect the findings, and the faults that acted."""
         servo = self.servo
         self.rack.step()
         self.found += [Found(self.rack.tick - 1, finding) for finding in servo.findings]
@@ -98,7 +98,7 @@ class ServoRig:
         servo.acted.clear()
 
     def inject(self, kind: str, seed: int = 5, **parameters: float) -> int:
-        """Let a fault begin in the next tick, which is returned, beside those that are active."""
+        """Let another fault begin in the next tick; return that tick."""
         self._faults.append(Fault(kind, parameters, seed, self.rack.tick, KINDS[kind].step))
         self.servo.inject(self._faults)
         return self.rack.tick
@@ -114,7 +114,7 @@ class ServoRig:
         self.servo.inject(self._faults)
 
     def alarms(self, *but: Alarm) -> list[Alarm]:
-        """Return what was found, in order, without `but`."""
+        """Return the alarms found, in order, without `but`."""
         return [finding.alarm for _, finding in self.found if finding.alarm not in but]
 
     def miss(self, ticks: int) -> None:

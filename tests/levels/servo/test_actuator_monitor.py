@@ -35,7 +35,7 @@ class Dash:
 
     @property
     def fastest_at(self) -> int:
-        """Tick at which the joint has come to that speed."""
+        """Tick at which the joint has reached that speed."""
         return round((APPROACH_S + self.speed / self._hardest) / TICK_S) + 4
 
     def at(self, time_s: float) -> tuple[Array, Array]:
@@ -63,7 +63,7 @@ class Dash:
 
 def dashing(name: str, joint: int, side: float, **params: float | str) -> tuple[ServoRig, Dash]:
     rig = ServoRig(*config(name), **params)
-    # What hits something is stopped by that.
+    # A contact would stop the arm.
     rig.servo.arm._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # type: ignore[attr-defined]
     dash = Dash(rig, name, joint, side)
     rig.run(dash.fastest_at, dash.at)
@@ -174,7 +174,7 @@ def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torqu
 def test_a_dead_motor_is_found_where_dry_friction_changes_sign_and_hides_it() -> None:
     rig = ServoRig(*config("puma560"))
     home = np.array(config("puma560")[0].home)
-    # The first joint comes to rest while the others go on.
+    # The first joint comes to rest while the others continue.
     first, others = Course(home, home + 0.4, 1.0), Course(home, home + 0.4, 2.0)
     turning = np.array([True, *[False] * 5])
 
@@ -217,7 +217,7 @@ class Bench:
 def test_a_part_that_is_pressed_on_its_support_is_no_motor_at_fault() -> None:
     bench = Bench()
     assert bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1) == []
-    # The arm has turned to it: only the wrist still presses, and is told a little more in every cycle.
+    # The arm has turned to it: only the wrist still presses, commanded a little more in every cycle.
     for cycle in range(40):
         assert bench.leave(1, j5=1.6 + 0.01 * cycle) == []
 

@@ -1,4 +1,4 @@
-"""Encoders with a resolution and noise: what the arm samples, and monitors that know what a good sample may be off."""
+"""Encoders with a resolution and noise: the samples of the arm, and the tolerance of the monitors."""
 
 from __future__ import annotations
 

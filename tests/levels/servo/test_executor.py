@@ -1,4 +1,4 @@
-"""The servo level: follows, holds, survives what goes wrong above it and around it."""
+"""The servo level: follows, holds, and survives faults of other levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Without a fault nothing is found: whole tasks with contacts and payloads, missed cycles, boards that start anew."""
+"""Without a fault nothing is found: whole tasks with contacts and payloads, missed cycles, restarted boards."""
 
 from __future__ import annotations
 

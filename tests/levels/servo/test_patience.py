@@ -25,7 +25,7 @@ OMEGA = 2.0 * math.pi / 1.2
 PATIENCE_TICKS = 120
 WITHIN = {"patience": PATIENCE_TICKS * 0.0025, "retry": 0.05}
 RECOVERS_TICKS = 75
-"""A retry, the good cycles behind it, and what is left of the last try."""
+"""A retry, the good cycles after it, and the rest of the last try."""
 KINDS = [
     ("sensor-nan", {}, Error.SENSORS),
     ("sensor-stuck", {}, Error.SENSORS),
@@ -179,7 +179,7 @@ def test_nasrem_continues_after_all_sensors_were_stuck_for_half_a_second() -> No
 
 
 def test_a_stuck_sensor_taken_for_a_failing_motor_is_trusted_again_where_the_joint_has_crept_to() -> None:
-    speed = np.full(6, 0.02)  # at once: what does not start looks like a motor at fault
+    speed = np.full(6, 0.02)  # at once: a joint that does not start looks like a motor at fault
     rig = ServoRig(ROBOT, SCENE, patience=5.0, retry=0.05)
     rig.run(60, lambda time_s: (HOME, 0.0 * speed))
     since = rig.status.target.copy()

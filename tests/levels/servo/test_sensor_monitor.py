@@ -1,4 +1,4 @@
-"""The servo level with faulty sensors: found in bounded cycles, braked, and resumed from where the arm stands."""
+"""The servo level with faulty sensors: found in bounded cycles, braked, and resumed from where the arm is."""
 
 from __future__ import annotations
 

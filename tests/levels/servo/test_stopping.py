@@ -122,7 +122,7 @@ def test_stop_ramps_to_rest_within_the_acceleration_limits_and_then_brakes() -> 
     rig.run(10, move.at)
     rig.rack.demand = Demand.STOP
     rig.run(10, move.at)
-    assert rig.status.braked == 1  # what has come to rest stays braked
+    assert rig.status.braked == 1  # an arm at rest stays braked
 
 
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
@@ -155,13 +155,13 @@ def test_an_arm_braked_from_the_start_stays_where_it_is_without_an_alarm() -> No
     assert rig.status.position == pytest.approx(config("puma560")[0].home, abs=1e-3)
 
 
-@pytest.mark.parametrize(("missed", "told"), [(1, None), (2, 2), (40, 40)])
-def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(missed: int, told: int | None) -> None:
+@pytest.mark.parametrize(("missed", "seen"), [(1, None), (2, 2), (40, 40)])
+def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(missed: int, seen: int | None) -> None:
     rig, move = rig_under_way()
     rig.miss(missed)
     rig.run(100, move.at)
     values = [(f.finding.alarm, f.finding.value) for f in rig.found]
-    assert values[:1] == ([] if told is None else [(Alarm.BRAKES_CLOSED, told)])
+    assert values[:1] == ([] if seen is None else [(Alarm.BRAKES_CLOSED, seen)])
     assert rig.status.stopped == 0
 
 

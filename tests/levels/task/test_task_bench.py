@@ -48,7 +48,7 @@ class Bench(Lockstep):
 
     @property
     def status(self) -> Message:
-        """What the level reports."""
+        """The status of the level."""
         return self.read("task.status")
 
     def window(self) -> list[int]:

@@ -1,4 +1,4 @@
-"""The `[task]` table: what it may say, and the one line for each mistake."""
+"""The `[task]` table: valid programs, and one line for each mistake."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read(*actions: dict[str, Any]) -> TaskConfig:
 
 
 def mistake(*actions: dict[str, Any]) -> str:
-    """Return everything wrong with a program, as the check of a config reports it."""
+    """Return all mistakes of a program, as the check of a config reports them."""
     with pytest.raises(ConfigError) as caught:
         resolve(NASREM.model_copy(update={"task": {"action": list(actions)}}))
     return str(caught.value)

@@ -122,7 +122,7 @@ def test_equal_priorities_take_their_turns_by_release_then_by_name() -> None:
 
 def test_every_job_costs_two_context_switches() -> None:
     chart = simulate(FIG_2, 16, context_switch_ns=1)
-    # in, R X W, out; in, P; in, R X W, out; P: what is left of two cycles is six units, one of them a switch.
+    # in, R X W, out; in, P; in, R X W, out; P: the rest of two cycles is six units, one of them a switch.
     assert row(chart) == "-RXXW--P-RXXW-PP"
     assert ends(chart, "level") == [(0, 5), (8, 13)]
     assert [job.end_ns for job in chart.late("level.planner")] == [None]
@@ -158,7 +158,7 @@ def random_tasks(seed: int) -> list[TimedTask]:
 
 
 def step_by_step(tasks: Sequence[TimedTask], until: int) -> tuple[list[str], dict[tuple[str, int], int]]:
-    """Return who computes in each unit of time, "X of a", and the end of every job by task and release.
+    """Return the task and part computing in each unit of time, "X of a", and the end of every job by task and release.
 
     It is written from the rules alone, unit by unit: slow, and too simple to be wrong in the same way.
     """
