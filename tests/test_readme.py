@@ -84,3 +84,13 @@ def test_a_run_reads_back_as_the_readme_has_it(tmp_path: Path) -> None:
     read = python(tmp_path, "read.py")
     assert read.returncode == 0, read.stderr
     assert read.stdout == "(400,) (400, 6) 6 True\n"
+
+
+def test_every_name_that_a_page_links_to_code_is_in_that_file() -> None:
+    named = [
+        (page.name, name, link)
+        for page in README.parent.glob("*.md")
+        for name, link in re.findall(r"\[`(\w+)`\]\(([\w/.-]+\.py)\)", page.read_text())
+    ]
+    assert named
+    assert not [entry for entry in named if not re.search(rf"\b{entry[1]}\b", (README.parent / entry[2]).read_text())]
