@@ -66,7 +66,8 @@ class Segment:
         except OSError as error:
             os.close(fd)
             if isinstance(error, FileExistsError):
-                raise SegmentError(_in_use(layout.rack)) from None
+                why = "already has a segment: it is running, or was killed; see 'rack list', 'rack clean'"
+                raise SegmentError(f"rack '{layout.rack}' {why}") from None
             raise SegmentError(f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}") from None
         return segment
 
@@ -216,10 +217,6 @@ def shm_path(rack: str) -> Path:
 
 def _shm_name(rack: str) -> str:
     return f"/{PREFIX}{rack}"
-
-
-def _in_use(rack: str) -> str:
-    return f"rack '{rack}' already has a segment: it is running, or was killed; see 'rack list', 'rack clean'"
 
 
 def _field(entry: dict[str, Any]) -> FieldSpec:

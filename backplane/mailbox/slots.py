@@ -117,7 +117,7 @@ class Slots:
         """
         words, box = self._words, self.box
         serial = words[_SERIAL] + 1
-        intruder = 0 if box[0] == serial - 1 else self._signature(serial) >> EPOCH_BITS
+        intruder = 0 if box[0] == serial - 1 else self._slot_words[serial & self.mask][_EPOCH] >> EPOCH_BITS
         words[_BASIS] = basis
         words[_SERIAL] = serial
         words[_TICK] = tick
@@ -141,9 +141,6 @@ class Slots:
         message = self._slots[serial & self.mask][SLOT_HEAD_SIZE:]
         for bit in bits:
             message[bit >> 3] ^= 1 << (bit & 7)
-
-    def _signature(self, serial: int) -> int:
-        return self._slot_words[serial & self.mask][_EPOCH]
 
     def holds(self, serial: int) -> bool:
         """Say whether that serial's slot holds its message, not an older or a newer one."""

@@ -65,7 +65,7 @@ class Guard:
         """Begin to watch the path of a segment, with the gripper at `opening`, in m."""
         self._checker.open_gripper(opening)
         self._checker.permit(segment.object, segment.touch and segment.object is not None)
-        self._place(world)
+        self._checker.place(world.position, world.quaternion)
         # Motion may start too close to something, but must not get closer.
         room = self._checker.room(path.evaluate(0.0).q)
         self._least = min(self._clearance, max(room, 0.0) * CLEARANCE_PART)
@@ -78,7 +78,7 @@ class Guard:
         begin = trajectory.at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
         still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
-        self._place(world)
+        self._checker.place(world.position, world.quaternion)
         far_clear = self._far_is_clear(path, begin)
         near_clear = self._near_is_clear(path, trajectory, time_s, None if still else world)
         return near_clear and (far_clear or not still)
@@ -119,9 +119,6 @@ class Guard:
             return True
         self.obstacle = self._checker.nearest()
         return False
-
-    def _place(self, world: Message) -> None:
-        self._checker.place(world.position, world.quaternion)
 
 
 class Sight:
