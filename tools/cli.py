@@ -31,7 +31,7 @@ COMMANDS = (
     ("analyze", "rack.tools.analyze:analyze", "Compare a run with the timing model, equation by equation."),
     ("gantt", "rack.tools.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
     ("campaign", "rack.tools.campaign:campaign", "Inject random faults into many runs, and judge each."),
-    ("bench", "rack.tools.bench.command:bench", "Measure costs on this machine."),
+    ("bench", "rack.tools.bench:bench", "Measure costs on this machine."),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 MAX_ARGUMENT = 4096

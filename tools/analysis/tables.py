@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any
 
 from rack.levels.timing.rack import LevelTiming
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.analysis.breaches import Breach, Broken
 from rack.tools.analysis.document import summary, task_document, worst_words
-from rack.tools.console.tables import table
+from rack.tools.console.tables import decimal, figure, ms, table
 from rack.tools.runs.cycles import START_UP_S, Cycles, restarts
 
 SHOWN = 10
@@ -105,12 +104,11 @@ def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
     return [
         name,
         *(str(found[key]) for key in ("cycles", "missed", "skipped")),
-        f"{found['deviation_ms']:.3f}",
-        f"{found['beside_ms']:.3f}",
-        *(_of(late, key) for key in ("p50", "p99", "p99_9", "max")),
-        *(_of(response, key) for key in ("p99", "max")),
+        *(decimal(found[key]) for key in ("deviation_ms", "beside_ms")),
+        *(figure(late, key) for key in ("p50", "p99", "p99_9", "max")),
+        *(figure(response, key) for key in ("p99", "max")),
         f"{found['slice_ms']:g}",
-        "-" if gap is None else f"{gap:.3f}",
+        decimal(gap),
     ]
 
 
@@ -168,13 +166,9 @@ def _counted(task: str, judged: tuple[Breach, ...], of_all: int) -> str:
     return f"{task}: {len(mine)} of {of_all} ({100 * len(mine) / of_all:.3g} %): {by_equation}"
 
 
-def _of(distribution: dict[str, Any] | None, key: str) -> str:
-    return "-" if distribution is None else f"{distribution[key]:.3f}"
-
-
 def _ms(ns: float) -> str:
     return f"{ns * MS:.3f}"
 
 
 def _number(value: float, unit: str) -> str:
-    return f"{value:.3f}" if unit == "1" else f"{value * MS:.3f}".removesuffix("000").rstrip(".") if value else "0"
+    return decimal(value) if unit == "1" else ms(value)

@@ -12,6 +12,7 @@ from rack.boards.faults.kind import KINDS
 from rack.tools.campaigns.campaign import Campaign
 from rack.tools.campaigns.results import Results, TrialResult
 from rack.tools.campaigns.statistics import by_kind, curve, rate, totals
+from rack.tools.console.tables import markdown_table
 
 Report = dict[str, Any]
 SHOWN = 30
@@ -147,10 +148,10 @@ def _lines(report: Report) -> Iterator[str]:
     )
     yield from (f"- {note}" for note in report["machine"]["notes"])
     yield ""
-    yield from table(["", ""], [[name, str(value)] for name, value in _summary(summary)])
+    yield from markdown_table(["", ""], [[name, str(value)] for name, value in _summary(summary)])
     if report["by_kind"]:
         yield from ("", "## Faults by kind", "")
-        yield from table(KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()])
+        yield from markdown_table(KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()])
         yield from (
             "",
             "At least: the smallest lower end of Wilson's 95 % interval among detected, in bound and recovered."
@@ -221,7 +222,7 @@ def _faultless(parts: list[Report]) -> Iterator[str]:
         ]
         for part in parts
     ]
-    yield from table(["", "s", "false trips", "an hour", "misses (no trips)"], rows)
+    yield from markdown_table(["", "s", "false trips", "an hour", "misses (no trips)"], rows)
 
 
 def _sizes(sizes: Report) -> Iterator[str]:
@@ -238,7 +239,7 @@ def _sizes(sizes: Report) -> Iterator[str]:
         rows = [
             [f"{point['size']:.4g}", point["joint"] or "all", _or_dash(point["delay_ms"])] for point in found["curve"]
         ]
-        yield from table([f"size, {unit}", "joint", "found after, ms"], rows)
+        yield from markdown_table([f"size, {unit}", "joint", "found after, ms"], rows)
 
 
 def _listed(lines: list[str]) -> Iterator[str]:
@@ -249,12 +250,3 @@ def _listed(lines: list[str]) -> Iterator[str]:
 
 def _or_dash(value: float | None) -> str:
     return "-" if value is None else f"{value:g}"
-
-
-def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """Yield the lines of a markdown table, its columns as wide as their widest cells."""
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    lines = [" | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows)]
-    yield f"| {lines[0]} |"
-    yield "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    yield from (f"| {line} |" for line in lines[1:])

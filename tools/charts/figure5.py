@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rack.boards.config import RackConfig
 from rack.boards.config.timing import tick_ns
+from rack.tools.console.pictures import paths_of, picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,22 +100,14 @@ def duration(cycle_s: float) -> str:
 
 def save(config: RackConfig, stem: Path) -> list[Path]:
     """Draw the figure with the levels of a rack into `stem`.png and .svg; return their paths."""
-    # matplotlib takes a second to import, and only pictures need it.
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    levels = placed(config)
-    with rc_context({"svg.hashsalt": config.name, "font.size": 9}):
-        figure = Figure(figsize=(9.0, 1.7 + 0.36 * len(levels)), layout="constrained")
+    levels, paths = placed(config), paths_of(stem)
+    with picture(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
         axes = figure.subplots()
         _draw_regions(axes)
         _draw_levels(axes, levels)
         axes.set_ylim(len(levels) - 0.4, -2.0)
         axes.set_title(f"Figure 5: what the cycles of {config.name} ask for", fontsize=10, loc="left")
         figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-        paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
-        figure.savefig(paths[0], dpi=150)
-        figure.savefig(paths[1], metadata={"Date": None})
     return paths
 
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from itertools import groupby
 
 from rack.levels.timing.schedule import Chart, Job, Span
-from rack.tools.charts.panel import NS_PER_MS, Panel
+from rack.tools.charts.panel import Panel
 from rack.tools.charts.patterns import IDLE, Lane
+from rack.tools.console.tables import ms
 
 OTHER = "."
 """Another board has the core."""
@@ -44,11 +45,6 @@ def column_for(window_ns: int, shortest_ns: int | None) -> int:
     fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
     seen = max((step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits)
     return max(fits, seen)
-
-
-def ms(time_ns: int) -> str:
-    """Return a time in ms, to the us."""
-    return f"{time_ns / NS_PER_MS:.3f}".rstrip("0").rstrip(".")
 
 
 def _row(chart: Chart, lane: Lane, column_ns: int) -> str:

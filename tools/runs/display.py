@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rack.boards.events import Event
-from rack.tools.console.tables import console, grid
+from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
 from rack.tools.runs.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
 
@@ -33,8 +33,8 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "missed": lambda row: str(row.missed),
     "skipped": lambda row: str(row.skipped),
     "restarts": lambda row: str(row.restarts),
-    "exec ms": lambda row: _ms(row.exec_ms),
-    "late ms": lambda row: _ms(row.lateness_ms),
+    "exec ms": lambda row: decimal(row.exec_ms, 2),
+    "late ms": lambda row: decimal(row.lateness_ms, 2),
     "state": lambda row: row.state,
 }
 """Columns by heading; `exec` and `late` are the longest since the last look."""
@@ -201,10 +201,6 @@ def _style(column: str, text: str) -> str:
     if column == "state":
         return STATES.get(text, "")
     return COUNTED.get(column, "") if text != "0" else ""
-
-
-def _ms(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _bar(progress: TaskProgress, width: int) -> RenderableType:

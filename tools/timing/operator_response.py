@@ -18,7 +18,8 @@ from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
 from rack.levels.timing.system_response import CommandPath, command_paths, lowest_level
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.tables import print_wrapped, table, terminal_width
+from rack.tools.console.pictures import paths_of, picture
+from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
 from rack.tools.runs.recording import Recording
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ class OperatorResponse:
     def _cells(self, row: dict[str, Any]) -> Iterator[str]:
         yield from (row["level"], str(row["commands"]))
         names = ["min", "median", "max", "longest", "max_from_reading", "sum_eq_3_3", "bound_eq_3_2"]
-        yield from ("-" if row[f"{name}_ms"] is None else f"{row[f'{name}_ms']:.1f}" for name in names)
+        yield from (decimal(row[f"{name}_ms"], 1) for name in names)
         yield from (str(row["beyond"]), str(row["off_prediction"]))
 
 
@@ -230,20 +231,16 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
 
 def plot(response: OperatorResponse, folder: Path) -> list[Path]:
     """Write response.png and response.svg, a histogram per level with its bounds, into `folder`; return their paths."""
-    from matplotlib.figure import Figure  # takes a second to load
-
     levels = [level for level in response.paths if any(c.level == level for c in response.measured)]
-    figure = Figure(figsize=(8.0, 0.8 + 1.7 * len(levels)), layout="constrained")
-    axes = figure.subplots(len(levels), 1, squeeze=False)
-    for axis, level in zip(axes[:, 0], levels, strict=True):
-        _plot_level(axis, response, level)
-    time = "simulated time" if response.lockstep else "the wall clock"
-    axes[-1, 0].set_xlabel(f"from giving a command to the torque that rests on it, ms of {time}")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize="small")
-    paths = [folder / f"response.{kind}" for kind in ("png", "svg")]
-    for path in paths:
-        figure.savefig(path, dpi=150)
+    paths = paths_of(folder / "response")
+    with picture(paths, 8.0, 0.8 + 1.7 * len(levels), layout="constrained") as figure:
+        axes = figure.subplots(len(levels), 1, squeeze=False)
+        for axis, level in zip(axes[:, 0], levels, strict=True):
+            _plot_level(axis, response, level)
+        time = "simulated time" if response.lockstep else "the wall clock"
+        axes[-1, 0].set_xlabel(f"from giving a command to the torque that rests on it, ms of {time}")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize="small")
     return paths
 
 

@@ -12,7 +12,7 @@ from rack.levels.timing.rack import LevelTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
 from rack.levels.timing.verdicts import LOAD, RESPONSE_TIME, EquationVerdict
-from rack.tools.console.tables import table
+from rack.tools.console.tables import ms, table
 
 
 def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:
@@ -60,11 +60,6 @@ def response_table(responses: Iterable[TaskResponse], width: int | None = None) 
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
     yield from table(head, [_response_row(response) for response in ordered], width, ("FIFO", "margin"))
-
-
-def ms(time_ns: float | None) -> str:
-    """Return a time in ms as text, rounded to 1 us; "-" for None."""
-    return "-" if time_ns is None else f"{round(time_ns * 1e-6, 3):g}"
 
 
 def _level_row(level: LevelTiming) -> list[str]:

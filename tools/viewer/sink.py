@@ -26,7 +26,7 @@ from rack.levels.messages import (
 )
 from rack.levels.robot.cell import Cell, build_cell
 from rack.tools.viewer.blueprint import blueprint, write_document
-from rack.tools.viewer.cell import CurrentGoal, Goals, PlannedPath, Poses, write_geometry
+from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses
 from rack.tools.viewer.levels import Activity, Commanded, Hierarchy, Moves
@@ -68,9 +68,9 @@ class ViewSink:
         slice_ns = layout.clock_ns if lockstep else period_ns
         self._of_task: dict[str, list[ViewPart]] = {
             task.name: [
-                CycleLanes(stream, task, speed, lockstep),
-                Load(stream, task, slice_ns, lockstep),
-                Misses(stream, task),
+                CycleLanes(stream, task, speed, lockstep).write,
+                Load(stream, task, slice_ns, lockstep).write,
+                Misses(stream, task).write,
             ]
             for task in layout.tasks
         }
@@ -118,13 +118,13 @@ class ViewSink:
             self._times.learn(cycles[self._fastest]["tick"], cycles[self._fastest]["start_ns"])
         for task, rows in cycles.items():
             block = RowBlock(rows, "start_ns", self._times)
-            for part in self._of_task[task]:
-                part.write(block)
+            for write in self._of_task[task]:
+                write(block)
             self._hierarchy.write(task, block)
         for mailbox, rows in signals.items():
             block = RowBlock(rows, "stamp_ns", self._times)
-            for part in self._of_mailbox[mailbox]:
-                part.write(block)
+            for write in self._of_mailbox[mailbox]:
+                write(block)
             if mailbox in self._ages:
                 self._ages[mailbox].write(block)
         for age in self._ages.values():
@@ -157,13 +157,13 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
     names = {field.name for field in mailbox.fields}
     parts: list[ViewPart] = []
     if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
-        parts.append(Activity(stream, mailbox))
+        parts.append(Activity(stream, mailbox).write)
     elif mailbox.name.endswith(".command") and "id" in names and mailbox.message != JOINT_SET_POINT.name:
-        parts.append(Commanded(stream, mailbox))
+        parts.append(Commanded(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
-        parts.append(Moves(stream, mailbox))
+        parts.append(Moves(stream, mailbox).write)
     if mailbox.message not in (*SHOWN_IN_3D, SERVO_STATUS.name):
-        parts.append(Fields(stream, mailbox))
+        parts.append(Fields(stream, mailbox).write)
     return parts
 
 
@@ -172,14 +172,14 @@ def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ARM_STATE.name:
-            return [Poses(stream, cell, config.clock_ns)]
+            return [Poses(stream, cell, config.clock_ns).write]
         case SERVO_STATUS.name:
-            return [Joints(stream, robot.joints, cell, robot.gripper is not None)]
+            return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
         case MOVE_PLAN.name:
-            return [PlannedPath(stream, cell)]
+            return [PlannedPath(stream, cell).write]
         case TASK_PLAN.name:
-            return [goals]
+            return [goals.write]
         case MOVE_STATUS.name:
-            return [CurrentGoal(goals)]
+            return [goals.write_status]
         case _:
             return []

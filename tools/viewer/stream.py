@@ -6,10 +6,10 @@ Its rows have three timelines: simulated time, tick, wall clock. They come in bl
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -98,11 +98,8 @@ class RowBlock:
         return np.asarray(self.rows["message"])
 
 
-class ViewPart(Protocol):
-    """Writes one aspect of one mailbox or task to the stream."""
-
-    def write(self, block: RowBlock) -> None:
-        """Write a block of rows."""
+ViewPart = Callable[[RowBlock], None]
+"""Writes one aspect of one mailbox or task to the stream, block by block."""
 
 
 class Changes:

@@ -17,7 +17,7 @@ from rack.levels.timing.response_time import response_times
 from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.console.tables import table
+from rack.tools.console.tables import figure, table
 from rack.tools.runs.display import display_for
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
@@ -184,14 +184,14 @@ def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Ite
 def _executor_row(partition: str, level: LevelFigures) -> list[str]:
     executor = level.executor
     counts = [str(count) for count in (executor.cycles, executor.missed, executor.skipped)]
-    return [partition, level.level, *_prediction(executor), *counts, *_ms(executor.residual_ms, "p50", "min")]
+    return [partition, level.level, *_prediction(executor), *counts, *_cells(executor.residual_ms, "p50", "min")]
 
 
 def _planner_row(partition: str, level: LevelFigures) -> list[str]:
     planner = level.planner
     assert planner is not None, "levels without a planner have no such row"
     row = [partition, level.level, *_prediction(planner), str(planner.cycles), str(planner.missed)]
-    return [*row, *_ms(planner.residual_ms, "p50", "min"), *_ms(level.plan_age_ms, "p50", "max")]
+    return [*row, *_cells(planner.residual_ms, "p50", "min"), *_cells(level.plan_age_ms, "p50", "max")]
 
 
 def _prediction(task: TaskFigures) -> list[str]:
@@ -202,5 +202,5 @@ def _prediction(task: TaskFigures) -> list[str]:
     return [f"{task.slice_ms:g}", response if task.fits else f"{response} FAILS"]
 
 
-def _ms(found: Distribution | None, *names: str) -> list[str]:
-    return ["-" if found is None else f"{found[name]:.2f}" for name in names]
+def _cells(found: Distribution | None, *names: str) -> list[str]:
+    return [figure(found, name, 2) for name in names]

@@ -29,7 +29,7 @@ def mailbox(as_json: Json = False) -> None:
 
     Figures are medians; on a busy machine look at the best ones.
     """
-    from rack.tools.bench.mailbox import lines_of, measure
+    from rack.tools.benches.mailbox import lines_of, measure
 
     costs = measure()
     _print({"mailbox": [asdict(cost) for cost in costs]}, lines_of(costs), as_json)
@@ -38,7 +38,7 @@ def mailbox(as_json: Json = False) -> None:
 @bench.command()
 def recording(config: Config = "nasrem", as_json: Json = False) -> None:
     """Misses and lateness of a rack without a recorder, with it, and with a live viewer, interleaved."""
-    from rack.tools.bench.recording import lines_of, measure
+    from rack.tools.benches.recording import lines_of, measure
     from rack.tools.console.tables import terminal_width
 
     costs = measure(config)
@@ -53,7 +53,7 @@ def switch(as_json: Json = False) -> None:
     time from the planner's last instant to the executor's first, and back. Exit status 1 if the machine does not permit
     real-time priorities.
     """
-    from rack.tools.bench.switch import measure
+    from rack.tools.benches.switch import measure
 
     cost = measure()
     _print(asdict(cost), cost.lines(), as_json)
@@ -71,7 +71,7 @@ def partition(
     Runs them in real time, one after another. Prints misses, residuals and plan ages, and next to them the timing
     model's predictions from the budgets of the config.
     """
-    from rack.tools.bench.partition import compare, lines_of
+    from rack.tools.benches.partition import compare, lines_of
     from rack.tools.console.progress import progress_for
     from rack.tools.console.tables import terminal_width
 
@@ -97,7 +97,7 @@ def response(
     must arrive at the predicted tick; in a twin of the run without that command, the torque must differ from that tick
     on. Exit status 1 if one does not, or exceeds a bound.
     """
-    from rack.tools.bench.response import ResponseRuns
+    from rack.tools.benches.response import ResponseRuns
     from rack.tools.console.progress import progress_for
     from rack.tools.console.tables import terminal_width
     from rack.tools.timing.operator_response import plot
