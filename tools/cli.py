@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 COMMANDS = (
     ("run", "rack.tools.run:run", "Run a rack until its task ends, and report on the run."),
     ("check", "rack.tools.check:check", "Validate a config and predict its timing."),
-    ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
     ("schema", "rack.tools.schema:schema", "Show the keys of a config, with unit, range, default and meaning."),
     ("list", "rack.tools.list:list_racks", "List the racks on this machine."),
     ("status", "rack.tools.status:status", "Show a running rack once."),
@@ -112,15 +111,14 @@ def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
 
 
 def _loaded(name: str, source: str) -> Any:
-    """Import a command from "module:attribute"; EXAMPLES in its module end its help."""
+    """Import a command from "module:attribute"."""
     import typer
 
     path, _, attribute = source.partition(":")
-    module = import_module(path)
-    found = getattr(module, attribute)
+    found = getattr(import_module(path), attribute)
     if not isinstance(found, typer.Typer):
         app = _app()
-        app.command(name, epilog=getattr(module, "EXAMPLES", None))(found)
+        app.command(name)(found)
         found = app
     return typer.main.get_command(found)
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from rack.tools.console.answer import Failure
-from rack.tools.report import RunFolder
+from rack.tools.console.answer import Failure, RunFolder
 from rack.tools.runs.window import ViewerWindow
 
 
 def replay(run: RunFolder) -> None:
     """Open the recording of a run in the viewer; return when it is closed.
 
-    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd itself.
+    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd.
 
     \b
     Examples:

@@ -1,14 +1,19 @@
-"""Progress of a command that makes many runs: a bar on a terminal, plain lines elsewhere, nothing with --json."""
+"""Progress: a bar on a terminal, plain lines elsewhere, nothing with --json."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
 from rack.tools.console.tables import console
+
+PATIENCE_S = 2.0
+"""Time between two lines of the progress of reading."""
 
 
 class Progress:
@@ -57,3 +62,16 @@ def progress_for(silent: bool) -> Iterator[Progress]:
     columns = (BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with RichProgress(*columns, console=terminal) as bar:
         yield Progress(bar)
+
+
+def reading_progress(silent: bool) -> Callable[[float], None]:
+    """Return a function that takes the part of a run that is read, 0 to 1, and prints it on stderr now and then."""
+    shown = time.monotonic()
+
+    def show(part: float) -> None:
+        nonlocal shown
+        if not silent and time.monotonic() - shown > PATIENCE_S:
+            shown = time.monotonic()
+            print(f"reading the run: {part:.0%}", file=sys.stderr, flush=True)
+
+    return show

@@ -22,7 +22,7 @@ ROW, COLUMN = 45.0, 110.0
 """Distance between nodes, in the graph's units; a letter is about 7 wide."""
 
 
-class Lane:
+class ValueLane:
     """A lane of a level: the name of a value, from where it changes."""
 
     def __init__(self, stream: Stream, *lane: str) -> None:
@@ -41,7 +41,7 @@ class Activity:
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream, self._board = stream, mailbox.name.partition(".")[0]
-        self._states, self._errors = Lane(stream, self._board, "state"), Changes()
+        self._states, self._errors = ValueLane(stream, self._board, "state"), Changes()
         style_lane(stream, (LEVELS, self._board, "state"), STATES)
 
     def write(self, block: RowBlock) -> None:
@@ -60,7 +60,7 @@ class Commanded:
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         board, _, port = mailbox.name.partition(".")
-        self._serials = Lane(stream, board, port)
+        self._serials = ValueLane(stream, board, port)
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
@@ -71,7 +71,7 @@ class Moves:
     """Writes the current elemental move of `MOVE_STATUS`es, by its verb."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._moves = Lane(stream, mailbox.name.partition(".")[0], "move")
+        self._moves = ValueLane(stream, mailbox.name.partition(".")[0], "move")
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""

@@ -108,7 +108,7 @@ REFUSED = {
     "no level": (("uper", "hold"), 'level = "uper": no such level takes commands; levels: upper, lower'),
     "no wait to bound": (
         ("upper", "hold", "--timeout", "1"),
-        "--timeout is the bound of --wait; give both, or neither",
+        "--timeout needs --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
     "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
