@@ -42,9 +42,9 @@ def mailbox(as_json: Json = False) -> None:
 
 @bench.command()
 def recording(config: Config = "nasrem", as_json: Json = False) -> None:
-    """Measure misses and lateness without a recorder, with one, and with a viewer.
+    """Measure the cost of recording: misses and lateness.
 
-    The three alternate within one run of the rack.
+    One rack runs without a recorder, with one, and with a live viewer, by turns.
     """
     from rack.tools.benches.recording import lines_of, measure
     from rack.tools.console.tables import terminal_width
@@ -74,10 +74,11 @@ def partition(
     rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each partition, interleaved")] = 2,
     as_json: Json = False,
 ) -> None:
-    """Run a rack in four partitions: planners tight or loose, on one core or two.
+    """Compare four partitions of a rack.
 
-    The runs are in real time, one after another. The output shows misses, residuals and plan ages, and next to them the
-    timing model's predictions from the budgets of the config.
+    Its planners are coupled tightly or loosely, on one core or two. The runs are in real time, one after another. The
+    output shows misses, residuals and plan ages, and next to them the timing model's predictions from the budgets of
+    the config.
     """
     from rack.tools.benches.partition import compare, lines_of
     from rack.tools.console.progress import progress_for

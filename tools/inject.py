@@ -32,7 +32,7 @@ Mailbox = Annotated[
 Tick = Annotated[str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")]
 When = Annotated[
     str | None,
-    typer.Option(metavar="CONDITION", help='begin when this holds, as "elemental_move.status.verb == grasp"'),
+    typer.Option(metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"'),
 ]
 Phase = Annotated[
     str | None, typer.Option(metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1")

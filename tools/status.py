@@ -10,7 +10,7 @@ import typer
 from rack.backplane.segment import Segment, racks
 from rack.tools.console.answer import Failure, Json, named, print_json, rack_names
 from rack.tools.console.tables import console
-from rack.tools.runs.display import table_of
+from rack.tools.runs.display import RackView
 from rack.tools.runs.snapshot import RackMonitor
 
 OnlyRack = Annotated[
@@ -42,4 +42,4 @@ def status(rack: OnlyRack = None, as_json: Json = False) -> None:
         names = ", ".join(running)
         raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
     found = RackMonitor(Segment.attach(rack or running[0])).look()
-    print_json(asdict(found)) if as_json else console().print(table_of(found))
+    print_json(asdict(found)) if as_json else console().print(RackView(found))

@@ -62,16 +62,13 @@ def _pair(pair: Pair) -> Document:
     return {
         "equation": pair.equation,
         "subject": pair.subject,
-        "predicted": _verdict(pair.predicted),
-        "measured": _verdict(pair.measured),
+        "predicted": None if pair.predicted is None else _without_subject(pair.predicted),
+        "measured": None if pair.measured is None else _without_subject(pair.measured),
         "disagrees": pair.disagrees,
     }
 
 
-def _verdict(verdict: EquationVerdict | None) -> Document | None:
-    if verdict is None:
-        return None
-    # Equation and subject are those of the pair.
+def _without_subject(verdict: EquationVerdict) -> Document:
     return {name: value for name, value in verdict.document().items() if name not in ("equation", "subject")}
 
 

@@ -53,7 +53,8 @@ def report_of(recording: Recording) -> Report:
     """Return the report of a recorded run as plain data."""
     config, layout = recording.rack_config, recording.layout
     ended, found = recording.ended, misses(recording)
-    report = _head(config, ended, _last_tick(recording) + 1)
+    last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
+    report = _head(config, ended, last + 1)
     if not ended:
         # Without the end of the run in the recording, the trace has to do.
         report["missed"], report["skipped"] = counted(found)
@@ -64,7 +65,7 @@ def report_of(recording: Recording) -> Report:
         "steal": steal(recording),
         "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
         "holds": holds(recording),
-        **faults(recording, layout),
+        **faults(recording.events, layout),
         "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
         "system_response": system_response(recording),
         "task": _task_outcome(recording),
@@ -104,10 +105,6 @@ def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
         "missed": sum(task["missed"] for task in counters),
         "skipped": sum(task["skipped"] for task in counters),
     }
-
-
-def _last_tick(recording: Recording) -> int:
-    return max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
 
 
 def _compared(recording: Recording, other: Recording, found: list[Report]) -> Report:

@@ -55,7 +55,10 @@ def _delays(axes: Axes, report: Report) -> None:
         if parts:
             axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
         place, frame = (1.02, row), ("axes fraction", "data")
-        axes.annotate(_numbers(report["by_kind"][kind]), place, xycoords=frame, fontsize=8, va="center")
+        figures, cycles = report["by_kind"][kind], report["by_kind"][kind]["cycles"]
+        numbers = f"{figures['detected']} of {figures['injected']}"
+        numbers += "" if cycles is None else f"; {cycles['median']:.3g}, {cycles['max']:.3g}"
+        axes.annotate(numbers, place, xycoords=frame, fontsize=8, va="center")
     axes.axvline(1.0, color=BOUND, linewidth=1.2)
     axes.set_xlim(-0.03, WIDEST)
     _name_rows(axes, kinds)
@@ -77,11 +80,6 @@ def _part(fault: Report) -> float | None:
     if fault["bound"] == 0 and fault["bound_ms"] is None:
         return 0.0 if fault["delay"] == 0 else 2 * WIDEST
     return part_of_bound(fault["delay"], fault["bound"], fault["delay_ms"], fault["bound_ms"])
-
-
-def _numbers(figures: Report) -> str:
-    counts, cycles = f"{figures['detected']} of {figures['injected']}", figures["cycles"]
-    return counts if cycles is None else f"{counts}; {cycles['median']:.3g}, {cycles['max']:.3g}"
 
 
 def _sizes(axes: Axes, report: Report) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
@@ -270,18 +270,10 @@ def _shown(strike: Strike, events: Sequence[Event]) -> Strike:
     return strike if found == strike.tick else replace(strike, tick=found, count=max(1, strike.count))
 
 
-class Recorded(Protocol):
-    """A recorded run."""
-
-    @property
-    def events(self) -> Sequence[Mapping[str, Any]]:
-        """Its events, as plain data."""
-
-
-def faults(recording: Recorded, layout: Layout) -> Report:
-    """Return every fault injected into a run, detections that none explains, and restarts by task."""
-    events = [Event(**event) for event in recording.events if "tick" in event]
-    ended: Mapping[str, Any] = next((event for event in recording.events if event["kind"] == "outcome"), {})
+def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
+    """Return every fault injected into a run, detections that none explains, and restarts by task, by its events."""
+    events = [Event(**event) for event in recorded if "tick" in event]
+    ended: Mapping[str, Any] = next((event for event in recorded if event["kind"] == "outcome"), {})
     strikes = [_strike(entry) for entry in ended.get("faults", [])]
     is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
     verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep))

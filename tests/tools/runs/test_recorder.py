@@ -12,7 +12,7 @@ from rack.backplane.message import Field, MessageType
 from rack.boards.config import load
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import RunResult, run_rack
 from rack.tools.runs.parquet import columns_of
 from rack.tools.runs.recording import Recording
@@ -28,7 +28,7 @@ PATH = MessageType(
 
 
 def run(config: Path, name: str, folder: Path | None) -> RunResult:
-    return run_rack(load(config, [f"name={name}"]), SECONDS, folder, SilentDisplay())
+    return run_rack(load(config, [f"name={name}"]), SECONDS, folder, Display())
 
 
 @pytest.fixture
