@@ -125,7 +125,6 @@ def response(
 
 
 def _print(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
-    """Print a result: as JSON, or as text for people."""
     from rack.tools.console.tables import print_wrapped
 
     print_json(document) if as_json else print_wrapped("\n".join(lines))

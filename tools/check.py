@@ -170,34 +170,30 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
     yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
     yield from found["notes"]
-    clock = [CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-", "", "", "", ""]
+    clock = [*map(str, (CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-")), "", "", "", ""]
     rows = [
         [
-            *(t["slot"], t["task"], t["core"], t["priority"] or "-"),
-            *(f"{t['rate_hz']:g}", t["every_ticks"], f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+            *map(str, (t["slot"], t["task"], t["core"], t["priority"] or "-")),
+            *(f"{t['rate_hz']:g}", str(t["every_ticks"]), f"{t['slice_ms']:g}", _hex(t["trace_address"])),
         ]
         for t in found["tasks"]
     ]
     head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", "slice, ms", "trace at"]
     yield ""
-    yield from _table(head, [clock, *rows], width, ("trace at", "slice, ms"))
+    yield from table(head, [clock, *rows], width, ("trace at", "slice, ms"))
     rows = [
         [
-            *(_hex(m["address"]), m["mailbox"], m["message"], m["size"], m["depth"], m["protocol"]),
+            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), m["protocol"]),
             *(f"{m['delay_ms']:g}", f"{m['writer']} > {', '.join(m['readers']) or '(nobody)'}"),
         ]
         for m in found["mailboxes"]
     ]
     head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
     yield ""
-    yield from _table(head, rows, width, ("slots", "bytes", "message", "protocol"))
+    yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))
     yield ""
     windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
     yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
-
-
-def _table(head: list[str], rows: list[list[Any]], width: int | None, dropped: tuple[str, ...]) -> Iterator[str]:
-    yield from table(head, [[str(cell) for cell in row] for row in rows], width, dropped)
 
 
 def _hex(address: int) -> str:

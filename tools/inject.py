@@ -122,7 +122,11 @@ def kinds_text(width: int | None = None) -> Iterator[str]:
     """Yield the kinds as a table, and their parameters as another; with a width they fit into it."""
     from rack.boards.faults import KINDS
 
-    rows = [[kind.name, kind.means, str(kind.bound), _remarks(kind.realtime, kind.once)] for kind in KINDS]
+    remarks = {"real time only": "realtime", "strikes once": "once"}
+    rows = [
+        [kind.name, kind.means, str(kind.bound), ", ".join(text for text, key in remarks.items() if getattr(kind, key))]
+        for kind in KINDS
+    ]
     yield from table(["kind", "effect", "found within", ""], rows, width)
     yield ""
     yield "Cycles are the task's; a planner's is its time slice."
@@ -137,10 +141,6 @@ def kinds_text(width: int | None = None) -> Iterator[str]:
         for p in kind.parameters
     ]
     yield from table(["kind", "parameter", "unit", "default", "range", "meaning"], numbers, width)
-
-
-def _remarks(realtime: bool, once: bool) -> str:
-    return ", ".join([*(["real time only"] if realtime else []), *(["strikes once"] if once else [])])
 
 
 def kinds_document() -> list[dict[str, Any]]:

@@ -18,6 +18,6 @@ def replay(run: RunFolder) -> None:
     # A restarted recorder leaves several files.
     recordings = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
     if not recordings or not all(recording.is_file() for recording in recordings):
-        raise Failure(f"{run}: no recording for the viewer, it has no run.rrd", 2)
+        raise Failure(f"{run}: nothing to replay: it has no run.rrd", 2)
     if problem := ViewerWindow(*(str(recording.resolve()) for recording in recordings)).wait():
         raise Failure(problem)

@@ -133,7 +133,9 @@ def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackT
     cycles = found[name]
     rows = cycles.rows[at]
     starts, ends = _due_ns(cycles, rack)[at], rows["end_ns"]
-    rivals = {other: Occupation.of(rival.rows) for other, rival in found.items() if _may_preempt(rival, cycles)}
+    others = {other: rival for other, rival in found.items() if other != name and rival.core == cycles.core}
+    # By their priorities, these can have had the core while this task wanted it.
+    rivals = {o: Occupation.of(rival.rows) for o, rival in others.items() if rival.priority >= cycles.priority}
     # A plan update that is a critical section keeps the executor waiting.
     if rack.boards[cycles.task.board].is_critical and (planner := found.get(f"{name}.planner")) is not None:
         rivals[planner.task.name] = Occupation(planner.rows["process_ns"], planner.rows["end_ns"])
@@ -157,12 +159,6 @@ def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackT
         )
         for row in range(len(at))
     ]
-
-
-def _may_preempt(rival: Cycles, cycles: Cycles) -> bool:
-    """Return whether a task can have had the core while another wanted it, by their priorities."""
-    is_another = rival.task.name != cycles.task.name
-    return is_another and rival.core == cycles.core and rival.priority >= cycles.priority
 
 
 def brief_ms(ns: float) -> str:

@@ -151,7 +151,7 @@ def _planner(timing: LevelTiming, switch_ns: int) -> str:
         place = "on the same processor"
     took = f"a plan takes {brief_ms(planning_ns)} ms {place}"
     if needed is None:
-        return f"{took}, and nothing is left for it in such a cycle"
+        return f"{took}, and no time is left for it in such a cycle"
     fits = needed <= (permitted or 0)
     return f"{took}: {f'fits into {needed} of its' if fits else f'needs {needed} and has'} {permitted} cycles"
 

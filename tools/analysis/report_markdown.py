@@ -1,4 +1,4 @@
-"""A report as text for people: report.md with every column, and a terminal's view with as many as fit."""
+"""A report as text: report.md with every column, and on a terminal as many as fit."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
     if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
-        yield f"- the recorder lost rows: {lost}"
+        yield f"- rows lost by the recorder: {lost}"
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])
@@ -245,7 +245,7 @@ def _response(response: Report | None) -> Iterator[str | Grid]:
         if found["beyond"]:
             yield from ("", f"{way}: {len(found['beyond'])} beyond the bound{_first(found['beyond'], 'longest')}:")
         for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
-            why = "; ".join(each["delayed_by"]) or "nothing in the recording says why"
+            why = "; ".join(each["delayed_by"]) or "no cause is recorded"
             yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
         if found["unseen"]:
-            yield from ("", f"{way}: {found['unseen']} not measured, messages are missing in the recording.")
+            yield from ("", f"{way}: {found['unseen']} not measured: messages are missing in the recording.")

@@ -24,7 +24,7 @@ from rack.tools.runs.recording import Recording
 
 LAUNCH_S = 3.0
 """About how long launching and recording a run take in addition to its time."""
-PLANNERS_DROPPED = ("plans", "median left", "median age")
+PLANNERS_DROPPED = ("plans", "residual p50", "age p50")
 """Columns that a narrow terminal leaves out, in this order."""
 
 
@@ -172,13 +172,13 @@ def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Ite
     """Yield two tables for people, fitted to `width`: executors, and planners with their plan ages; times in ms."""
     levels = [(one.partition, level) for one in found for level in one.levels]
     planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
-    yield "executors: predicted worst response, and time left of the cycle, ms"
-    head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "median left", "worst"]
-    yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "median left"))
+    yield "executors: predicted worst-case response, and residual, ms"
+    head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "residual p50", "residual min"]
+    yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50"))
     yield ""
-    yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
-    head = ["partition", "level", "slice", "predicted", "plans", "late", "median left", "worst", "median age", "oldest"]
-    yield from table(head, planned, width, PLANNERS_DROPPED)
+    yield "planners: the same for a plan's time slice, and the age of plans when they are read, ms"
+    head = ["partition", "level", "slice", "predicted", "plans", "late", "residual p50", "residual min"]
+    yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
 
 
 def _executor_row(partition: str, level: LevelFigures) -> list[str]:

@@ -17,7 +17,7 @@ from rack.backplane.process import processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.boards import Rack
-from rack.boards.config import RackConfig, load
+from rack.boards.config import load
 from rack.levels.timing.trace_times import Distribution, counts, distribution, lateness_ns
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import decimal, figure, table
@@ -70,7 +70,9 @@ def measure(name: str) -> list[RecordingCost]:
 
     Raises `Failure` if the rack ends early or a recorder cannot attach.
     """
-    config = _endless(load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"]))
+    config = load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"])
+    endless = {name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()}
+    config = config.model_copy(update={"board": endless})
     found: dict[str, list[_Sample]] = {phase: [] for phase in PHASES}
     with tempfile.TemporaryDirectory() as folder, Rack(config) as rack:
         rack.start()
@@ -89,11 +91,6 @@ def measure(name: str) -> list[RecordingCost]:
         while rack.watch(0.5):
             continue
     return [_cost(phase, samples) for phase, samples in found.items()]
-
-
-def _endless(config: RackConfig) -> RackConfig:
-    boards = {name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()}
-    return config.model_copy(update={"board": boards})
 
 
 def _reading(rack: Rack, meter: Meter) -> list[np.ndarray]:

@@ -90,8 +90,8 @@ class ResponseBench:
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as text for people, the table fitted to `width`."""
         yield self.response.text(width)
-        count = len(self.response.measured)
-        yield f"{len(self.response.beyond)} of {count} beyond a bound, {len(self.response.off)} off the predicted tick"
+        beyond, off, measured = (len(getattr(self.response, name)) for name in ("beyond", "off", "measured"))
+        yield f"{beyond} of {measured} beyond a bound, {off} not at the predicted tick"
         for twin in self.twins:
             where = "nowhere" if twin.differs is None else f"first at tick {twin.differs}"
             command = f"command {twin.serial} to {twin.level}, given at tick {twin.given}"

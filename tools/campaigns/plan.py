@@ -58,7 +58,7 @@ class Plan:
 
 
 def needs_real_time(kind: str) -> bool:
-    """Say whether a kind does not exist in lockstep, or means nothing there: no time passes while a process dies."""
+    """Return whether a kind does not exist in lockstep, or means nothing there: no time passes while a process dies."""
     return kind == EXTERNAL or KINDS[kind].realtime
 
 
@@ -105,7 +105,7 @@ class Targets:
         return [task for task, role in self._roles.items() if role in kind.tasks]
 
     def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
-        """Say whether the mailbox has readers, and messages often enough: plans are not periodic."""
+        """Return whether the mailbox has readers, and messages often enough: plans are not periodic."""
         # The clock writes only for an operator.
         if not box.readers or box.writer == CLOCK or (kind.where == "lock" and box.protocol != "lock"):
             return False

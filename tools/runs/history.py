@@ -118,9 +118,8 @@ class Difference:
 
 
 def first_difference(one: Recording, other: Recording) -> Difference | None:
-    """Return where two runs diverge; None when all that both wrote is equal.
+    """Return where two runs diverge, up to the end of the shorter one; None when all that both wrote is equal.
 
-    Messages after the end of the shorter run are not compared.
     Raises `Failure` when the two have no mailbox in common, or either lost rows.
     """
     for recording in (one, other):

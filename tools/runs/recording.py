@@ -58,7 +58,7 @@ class Recording:
         with _naming(path):
             file = pq.ParquetFile(path)
         if absent := [column for column in columns if column not in file.schema_arrow.names]:
-            raise Failure(f"{path}: not a recording of a rack, it has no column '{absent[0]}'", 2)
+            raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
         return file
 
     def _text(self, name: str) -> str:
@@ -72,7 +72,7 @@ class Recording:
 
     def _there(self, name: str) -> Path:
         if not (self.folder / name).is_file():
-            raise Failure(f"{self.folder}: no run, it has no {name}", 2)
+            raise Failure(f"{self.folder}: not a run: it has no {name}", 2)
         return self.folder / name
 
     @cached_property

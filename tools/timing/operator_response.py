@@ -130,18 +130,20 @@ class OperatorResponse:
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
         head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
-        yield from table(head, [[*self._cells(row)] for row in self.rows()], width, ("min", "sum, eq. 3.3", "median"))
+        names = ["min", "median", "max", "longest", "max_from_reading", "sum_eq_3_3", "bound_eq_3_2"]
+        rows = [
+            [
+                *(row["level"], str(row["commands"]), *(decimal(row[f"{name}_ms"], 1) for name in names)),
+                *(str(row["beyond"]), str(row["off_prediction"])),
+            ]
+            for row in self.rows()
+        ]
+        yield from table(head, rows, width, ("min", "sum, eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
             yield f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
         for command in self.off:
             late = (command.acts or 0) - command.predicted
             yield f"command {command.serial} to {command.level}, given at tick {command.given}: {late:+d} ticks"
-
-    def _cells(self, row: dict[str, Any]) -> Iterator[str]:
-        yield from (row["level"], str(row["commands"]))
-        names = ["min", "median", "max", "longest", "max_from_reading", "sum_eq_3_3", "bound_eq_3_2"]
-        yield from (decimal(row[f"{name}_ms"], 1) for name in names)
-        yield from (str(row["beyond"]), str(row["off_prediction"]))
 
 
 def response_of(recording: Recording) -> OperatorResponse | None:

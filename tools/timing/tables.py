@@ -1,7 +1,4 @@
-"""A forecast as text: the system's response, and tables of levels, verdicts and response times; times in ms.
-
-To fit into a `width` the tables leave out some columns.
-"""
+"""A forecast as text: the system's response, and tables of levels, verdicts and response times; times in ms."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
 
 
 class Poses:
-    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the way of the tool."""
+    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the path of the tool."""
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()

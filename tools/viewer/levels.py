@@ -137,14 +137,10 @@ class Hierarchy:
             self._tasks,
             positions=[self._positions[task] for task in self._tasks],
             colors=[STATES[self._shown[task]] for task in self._tasks],
-            labels=[_label(task) for task in self._tasks],
+            # A planner's node is next to its board's.
+            labels=[task.partition(".")[2] or task for task in self._tasks],
         )
         self._stream.at(tick, stamp_ns, (HIERARCHY,), nodes)
-
-
-def _label(task: str) -> str:
-    """Return the label of a task's node; a planner's node is next to its board's."""
-    return task.partition(".")[2] or task
 
 
 def _names(rows: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ def test_recording_changes_nothing_in_a_run(small: Path, rack_name: str, recorde
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(Failure, match="no run, it has no config"):
+    with pytest.raises(Failure, match="not a run: it has no config"):
         Recording(tmp_path)
 
 
