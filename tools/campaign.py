@@ -34,7 +34,7 @@ Faultless = Annotated[
         metavar="S",
         min=0.0,
         max=1e6,
-        help=f"seconds without faults, alone and under load, each; default {FAULTLESS_S:g}",
+        help=f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
     ),
 ]
 Load = Annotated[bool, typer.Option("--load", help="without faults: only under load, by stress-ng where installed")]
