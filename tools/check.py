@@ -22,8 +22,7 @@ from rack.tools.timing.repair import Repair, repair
 from rack.tools.timing.tables import forecast_lines
 
 From = Annotated[
-    Path | None,
-    typer.Option("--from", metavar="RUN", help="use the budgets measured in this run, not the config's"),
+    Path | None, typer.Option("--from", metavar="RUN", help="use the budgets measured in this run, not the config's")
 ]
 Percentile = Annotated[
     float,

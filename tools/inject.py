@@ -12,8 +12,7 @@ from rack.tools.console.answer import Failure, Json, Timeout, check_timeout, nam
 from rack.tools.console.tables import table, terminal_width
 
 Rack = Annotated[
-    str | None,
-    typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named),
+    str | None, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named)
 ]
 BoardName = Annotated[
     str | None, typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock")
@@ -31,8 +30,7 @@ Mailbox = Annotated[
 ]
 Tick = Annotated[str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")]
 When = Annotated[
-    str | None,
-    typer.Option(metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"'),
+    str | None, typer.Option(metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"')
 ]
 Phase = Annotated[
     str | None, typer.Option(metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1")

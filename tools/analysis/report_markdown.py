@@ -77,7 +77,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
     if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
-        yield f"- rows lost by the recorder: {lost}"
+        yield f"- the recorder lost rows: {lost}"
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])

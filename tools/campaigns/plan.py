@@ -93,9 +93,12 @@ class Targets:
         self.by_kind[EXTERNAL] = [Target(EXTERNAL, task, self._cycle(task)) for task in [*self._roles, CLOCK]]
 
     def _of(self, kind: Kind) -> list[Target]:
-        if kind.takes_mailbox:
-            return [self._at(kind, box) for box in self.layout.mailboxes if self._is_seen(kind, box)]
-        return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
+        if not kind.takes_mailbox:
+            return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
+        seen = [box for box in self.layout.mailboxes if self._is_seen(kind, box)]
+        readers = [min(map(self._cycle, box.readers)) for box in seen]
+        targets = zip(seen, readers, strict=True)
+        return [Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader) for box, reader in targets]
 
     def _tasks(self, kind: Kind) -> list[str]:
         if kind.where == "clock":
@@ -111,10 +114,6 @@ class Targets:
             return False
         role = self._roles[box.writer]
         return role in kind.tasks and (kind.where != "writer" or role == "executor")
-
-    def _at(self, kind: Kind, box: MailboxSpec) -> Target:
-        reader = min(cycle_ticks(self.layout, task) for task in box.readers)
-        return Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader)
 
     def _cycle(self, task: str) -> int:
         return cycle_ticks(self.layout, task)

@@ -43,14 +43,14 @@ class Judgement:
 
     kind: str
     board: str
-    mailbox: str
-    joint: str
-    size: float | None
-    began: int
     struck: int
     seen: Seen
-    is_judged: bool
-    cycle: int
+    mailbox: str = ""
+    joint: str = ""
+    size: float | None = None
+    began: int = -1
+    is_judged: bool = True
+    cycle: int = 1
     found_by: str = ""
     found_as: str = ""
     delay: int | None = None

@@ -60,10 +60,7 @@ class Repair:
 
     def document(self) -> dict[str, Any]:
         """Return it as plain data."""
-        return {
-            "steps": [[change.document() for change in changes] for changes in self.steps],
-            "fits": not self.left,
-        }
+        return {"steps": [[change.document() for change in changes] for changes in self.steps], "fits": not self.left}
 
 
 def repair(rack: JudgedConfig) -> Repair:

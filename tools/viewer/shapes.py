@@ -36,11 +36,7 @@ def xyzw(quaternions: Floats) -> Floats:
 
 def _solid(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
     """Return orientation and colour of a solid geom."""
-    return {
-        "quaternions": [xyzw(model.geom_quat[geom])],
-        "colors": [colour(model, geom)],
-        "fill_mode": "solid",
-    }
+    return {"quaternions": [xyzw(model.geom_quat[geom])], "colors": [colour(model, geom)], "fill_mode": "solid"}
 
 
 def _box(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
