@@ -78,7 +78,7 @@ def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_pa
 def test_a_folder_without_a_run_is_refused_in_one_line(tmp_path: Path) -> None:
     done = rack("analyze", tmp_path)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "no run" in done.stderr
+    assert "not a run" in done.stderr
 
 
 def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Path) -> None:
