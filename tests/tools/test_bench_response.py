@@ -9,7 +9,7 @@ from random import Random
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.operating.command import CommandConfig
 from rack.levels.timing.system_response import command_paths
-from rack.tools.bench.response import (
+from rack.tools.benches.response import (
     RUN_S,
     CommandedRun,
     ResponseRuns,

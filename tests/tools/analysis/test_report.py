@@ -18,7 +18,7 @@ from rack.boards.config import load
 from rack.levels.timing.equations import response_ticks
 from rack.tools.analysis.report import report_of, task_times, write_report
 from rack.tools.analysis.report_markdown import markdown, show
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
@@ -30,7 +30,7 @@ MS = 1_000_000
 PARTS = ("min", "p50", "p99", "p99_9", "max")
 
 
-class Watchful(SilentDisplay):
+class Watchful(Display):
     """Looks often: a run in lockstep is soon over."""
 
     period_s = 0.02
@@ -79,7 +79,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("response")
     (path / "small.toml").write_text(SMALL)
     settings = [f"name=test-response-{os.getpid()}", "board.upper.rate_hz=10", "board.lower.rate_hz=80"]
-    run_rack(load(path / "small.toml", settings), 5.0, path / "run", SilentDisplay())
+    run_rack(load(path / "small.toml", settings), 5.0, path / "run", Display())
     return path / "run"
 
 

@@ -12,7 +12,7 @@ from rack.backplane.message import Field, MessageType
 from rack.boards.config import load
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import RunResult, run_rack
 from rack.tools.runs.parquet import columns_of
 from rack.tools.runs.recording import Recording
@@ -28,7 +28,7 @@ PATH = MessageType(
 
 
 def run(config: Path, name: str, folder: Path | None) -> RunResult:
-    return run_rack(load(config, [f"name={name}"]), SECONDS, folder, SilentDisplay())
+    return run_rack(load(config, [f"name={name}"]), SECONDS, folder, Display())
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_recording_changes_nothing_in_a_run(small: Path, rack_name: str, recorde
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(Failure, match="no run, it has no config"):
+    with pytest.raises(Failure, match="not a run: it has no config"):
         Recording(tmp_path)
 
 

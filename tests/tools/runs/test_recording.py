@@ -16,7 +16,7 @@ from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.report import write_report
 from rack.tools.charts.gantt import subject_of
 from rack.tools.console.answer import Failure
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 from tests.conftest import SMALL
@@ -39,7 +39,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording")
     (folder / "small.toml").write_text(SMALL)
     config = load(folder / "small.toml", [f"name=recording-{folder.parent.name}"])
-    assert run_rack(config, 1.0, folder / "run", SilentDisplay()).recording == "complete"
+    assert run_rack(config, 1.0, folder / "run", Display()).recording == "complete"
     return folder / "run"
 
 

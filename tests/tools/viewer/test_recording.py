@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 
 from rack.boards.config import load, loads
 from rack.levels.robot.cell import STATE, Cell, build_cell
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 from rack.tools.runs.window import executable
@@ -26,7 +26,7 @@ SECONDS = 6.5
 def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("run")
     config = load("nasrem", [f"name=viewer-{folder.parent.name}", "clock.mode=lockstep"])
-    assert run_rack(config, SECONDS, folder, SilentDisplay()).recording == "complete"
+    assert run_rack(config, SECONDS, folder, Display()).recording == "complete"
     return Recording(folder)
 
 
