@@ -26,13 +26,12 @@ from rack.boards.config.files import CONFIGS, anchor, read, with_faults
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
 from rack.boards.config.ports import TaskPorts, reference
-from rack.boards.config.schema import LAST_SLOT, RackConfig
+from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import Tables, override, parse
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
-from rack.boards.operating.command import CommandConfig
 from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
 from rack.levels.level import LevelContext, Pace
 from rack.levels.tables import RobotConfig, Table

@@ -18,8 +18,8 @@ from rack.backplane.layout import Protocol, Role
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
-from rack.boards.operating.command import CommandConfig
-from rack.levels.tables import Positive, RobotConfig, SceneConfig, Table
+from rack.levels.operator import Goal, Operation
+from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
@@ -38,6 +38,7 @@ Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
+Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
@@ -154,6 +155,43 @@ class BoardConfig(Table):
         description="while this board is lost: hold: the level below holds; stop: the arm ramps to rest and brakes; "
         "brake: it brakes at once",
     )
+
+
+class CommandConfig(Table):
+    """`[[command]]`: one command of an operator to one level."""
+
+    level: str = Field(description="board whose level is commanded, such as servo or task")
+    what: Literal["hold", "resume", "setpoint", "goto"] = Field(
+        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there"
+    )
+    tick: int | None = Field(
+        None, ge=0, le=LAST_TICK, description="tick at which it is given; at most one of tick and at"
+    )
+    at: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
+        None, description="instead of tick: simulated time, s"
+    )
+    joints: tuple[Finite, ...] | None = Field(None, description="goal: one position per joint, rad")
+    position: Vector | None = Field(None, description="goal: tool position, m; with quaternion or direction")
+    quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
+        None, description="goal: tool orientation as w, x, y, z"
+    )
+    direction: Vector | None = Field(
+        None, description="goal: direction of the tool's z axis, free to turn about it; default: down"
+    )
+    home: bool = Field(False, description="goal: the arm's start position")
+
+    @property
+    def said(self) -> Operation:
+        """The command's verb."""
+        return Operation[self.what.upper()]
+
+    @property
+    def goals(self) -> list[Goal]:
+        """The goals given: there must be one, or none."""
+        found = [Goal.JOINTS] if self.joints is not None else []
+        if self.position is not None or self.quaternion is not None or self.direction is not None:
+            found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
+        return [*found, Goal.HOME] if self.home else found
 
 
 class TaskPlace(NamedTuple):

@@ -16,10 +16,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
+from rack.boards.config.commands import describe, level_of, message_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
 from rack.boards.faults.describe import board_of, describe_kind, joint_name, subject_of
-from rack.boards.operating.command import describe, level_of, message_of
 from rack.levels.operator import Operation
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]

@@ -32,9 +32,8 @@ from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.line import CrateLine, Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
 from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.recovery import Recovery, Supervision
-from rack.boards.ending import Ending
 from rack.boards.errors import ConfigError, LaunchError, Mistake
-from rack.boards.events import Cause, Event, Journal, Outcome
+from rack.boards.events import Cause, Ending, Event, Journal, Outcome
 from rack.boards.faults.kind import KINDS
 
 LAUNCH_S = 60.0
