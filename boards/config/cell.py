@@ -1,6 +1,6 @@
-"""What follows from the arm and its cell, built once per process.
+"""Data derived from the arm and its cell, built once per process.
 
-Importing MuJoCo takes half a second, so functions import it: only racks with an arm pay.
+Importing MuJoCo takes 0.5 s, so the import is inside functions: only racks with an arm pay for it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from rack.levels.tables import RobotConfig, SceneConfig
 
 
 def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = True) -> dict[str, int]:
-    """Return the symbolic sizes by name, none without an arm; add everything wrong with the cell to `mistakes`.
+    """Return the symbolic sizes by name, none without an arm; add every mistake in the cell to `mistakes`.
 
-    If the cell is not whole, as [robot] or [scene] has mistakes of its own, only names are looked up.
+    If [robot] or [scene] has mistakes of its own, the cell is not whole and only names are checked.
     """
     if config.robot is None:
         return {}
@@ -37,7 +37,7 @@ def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = Tru
 
 
 def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
-    """Return a line for every name that the model does not have; none if the model cannot be read."""
+    """Return a line for every name missing from the model; none if the model cannot be read."""
     from rack.levels.robot.lookup import unknown_names
 
     try:
@@ -69,7 +69,7 @@ def _geom_names(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[
 
 @lru_cache(maxsize=4)
 def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
-    """Return the positions that joints may be commanded to, (joints, 2), rad. Raises `RobotError`."""
+    """Return the range of commanded joint positions, (joints, 2), rad. Raises `RobotError`."""
     from rack.levels.robot.cell import build_cell
 
     return build_cell(robot, scene, clock_ns).limits.position

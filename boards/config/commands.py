@@ -1,4 +1,4 @@
-"""An operator's commands: checked against the rack they are for, and made into requests for the operator table."""
+"""Operator commands: checked against their rack, made into requests for the operator table, and described in words."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DOWN = (0.0, 0.0, -1.0)
 
 
 def commandable(config: RackConfig) -> dict[str, Commands]:
-    """Return the commands that each level takes from an operator, by board; other levels are left out."""
+    """Return the commands that each level takes from an operator, by board; levels that take none are omitted."""
     found = {}
     for name, board in config.board.items():
         try:
@@ -85,15 +85,15 @@ def _tick(command: CommandConfig, clock_ns: int) -> int:
 def command_mistakes(
     commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, broken: frozenset[str] = frozenset()
 ) -> list[Mistake]:
-    """Return everything wrong with commands, given with their places in a config; the place of a live one is empty.
+    """Return every mistake in commands, given with their places in a config; a live command has an empty place.
 
-    `broken` are boards with mistakes of their own: commands for them are not checked.
+    Commands for `broken` boards, which have mistakes of their own, are not checked.
     """
     given = list(commands)
     checked = [(place, command) for place, command in given if command.level not in broken]
     found = [mistake for place, command in checked for mistake in _mistakes(place, command, config)]
     if len(given) > OPERATOR_ENTRIES:
-        found.append(Mistake("command", len(given), f"too many to wait at once; permitted: {OPERATOR_ENTRIES}"))
+        found.append(Mistake("command", len(given), f"too many pending commands; permitted: {OPERATOR_ENTRIES}"))
     return found
 
 
@@ -105,7 +105,7 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
     levels = commandable(config)
     if command.level not in levels:
-        why = f"no such level takes commands; levels: {', '.join(levels) or 'none'}"
+        why = f"no level of this name takes commands; levels that do: {', '.join(levels) or 'none'}"
         yield Mistake(at("level"), command.level, why)
         return
     known = levels[command.level]
@@ -122,7 +122,7 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
 
 
 def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Iterator[Mistake]:
-    """Check that there is one goal, of a form that the level takes."""
+    """Check that there is one goal, of a form that the level accepts."""
     wanted, given = known[command.said], command.goals
     what = f"{command.what} of '{command.level}'"
     if not wanted:
@@ -163,7 +163,7 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
 
 
 def level_of(entry: RequestEntry, layout: Layout) -> str:
-    """Return the board whose level a request is for."""
+    """Return the board whose level a request addresses."""
     return layout.mailboxes[entry[RequestWord.MAILBOX]].name.partition(".")[0]
 
 

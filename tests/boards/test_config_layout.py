@@ -87,7 +87,7 @@ def test_cores_that_the_machine_lacks_are_shared_out_and_reported(small: Path, m
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
     assert [obtained_core(core) for core in range(6)] == [2, 3, 2, 3, 2, 3]
     assert shared_out(load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])) == [
-        "core 5 is not available (available: 2, 3): upper on core 3"
+        "core 5 is not available (available: 2, 3): core 3 runs upper"
     ]
 
 

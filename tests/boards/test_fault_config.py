@@ -87,7 +87,7 @@ def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "expected"),
     [
         ("supervision.restarts=-1", "supervision.restarts = -1: should be greater than or equal to 0"),
         ("supervision.within_s=0", "supervision.within_s = 0: should be greater than 0"),
@@ -97,8 +97,8 @@ def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
         ("supervision.restart=1", "unknown key; did you mean 'restarts'?"),
     ],
 )
-def test_load_tells_a_mistake_of_supervision(small: Path, setting: str, told: str) -> None:
+def test_load_reports_a_mistake_of_supervision(small: Path, setting: str, expected: str) -> None:
     with pytest.raises(ConfigError) as error:
         load(small, [setting])
-    assert told in str(error.value)
+    assert expected in str(error.value)
     assert len(error.value.mistakes) == 1

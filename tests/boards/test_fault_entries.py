@@ -138,8 +138,8 @@ def test_the_table_holds_and_tells_what_was_asked_for(config: MakeConfig, rack_n
         assert describe(entries[1], layout, ("a", "b")) == "sensor-bias of driven (b, size 0.1 rad)"
         assert document(entries[0], layout, ())["until"] is None
         entries[1].words[Entry.STAGE], entries[1].words[Entry.UNTIL] = Stage.ACTIVE, NEVER
-        told = document(entries[1], layout, ("a", "b"))
-        assert (told["stage"], told["until"], told["parameters"]) == ("active", None, {"joint": 1.0, "size": 0.1})
+        entry = document(entries[1], layout, ("a", "b"))
+        assert (entry["stage"], entry["until"], entry["parameters"]) == ("active", None, {"joint": 1.0, "size": 0.1})
     finally:
         segment.close()
         unlink(rack_name)

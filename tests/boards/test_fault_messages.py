@@ -262,7 +262,7 @@ def test_a_forged_message_is_never_handed_out(link: MakeLink, protocol: Protocol
     reading = rack.reader.cycle(8)
     assert (reading.value.id, reading.verdict) == (7, Verdict.NEW)
     assert rack.alarms() == [(8, Alarm.MASQUERADE)]
-    # The true writer takes the place back, and tells.
+    # The true writer takes its mailbox back, and reports it.
     rack.writer.cycle(8)
     assert rack.alarms("writer") == [(8, Alarm.MASQUERADE)]
     rack.run(9, 12)

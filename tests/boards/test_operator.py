@@ -207,7 +207,7 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 MISTAKES = {
     "no such level": (
         "level='uper', what='hold'",
-        'command[0].level = "uper": no such level takes commands; levels: upper, lower',
+        'command[0].level = "uper": no level of this name takes commands; levels that do: upper, lower',
     ),
     "not for this level": (
         "level='lower', what='goto', home=true",

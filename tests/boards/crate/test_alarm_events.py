@@ -63,7 +63,7 @@ def heard(
     return AlarmEvents(segment, JOINTS).of(row, owner)
 
 
-# What an operator says is told from the operator table: test_operator.py.
+# What an operator says comes from the operator table: test_operator.py.
 TOLD_HERE = [alarm for alarm in Alarm if alarm is not Alarm.COMMANDED]
 
 

@@ -78,19 +78,19 @@ def test_a_progressing_task_does_not_hang(bus: Segment, clock: Clock) -> None:
 
 
 def test_a_task_that_finishes_nothing_hangs_once(bus: Segment, clock: Clock) -> None:
-    beat, told = Heartbeat(bus), []
+    beat, found = Heartbeat(bus), []
     for _ in range(10):
         run_on(bus, clock, LOCKSTEP_S / 8, FAST)
-        told += beat.hanging()
-    assert told == [FAST]
+        found += beat.hanging()
+    assert found == [FAST]
 
 
 def test_a_task_that_recovered_and_hangs_again_is_reported_again(bus: Segment, clock: Clock) -> None:
-    beat, told = Heartbeat(bus), []
+    beat, found = Heartbeat(bus), []
     for hanging in ((FAST,), (), (FAST,)):
         run_on(bus, clock, 2 * LOCKSTEP_S, *hanging)
-        told += beat.hanging()
-    assert told == [FAST, FAST]
+        found += beat.hanging()
+    assert found == [FAST, FAST]
 
 
 def test_a_lost_task_is_known_to_be(bus: Segment, clock: Clock) -> None:

@@ -60,8 +60,8 @@ def test_a_killed_process_ends_the_run_with_its_name(
         os.kill(process_of(rack, victim), signal.SIGKILL)
         outcome = end_of(rack)
     assert (outcome.cause, outcome.worked) == ("board lost", False)
-    told = "the crate ended" if victim == "crate" else f"board '{victim}' ended: signal SIGKILL"
-    assert any(told in fault for fault in outcome.faults)
+    text = "the crate ended" if victim == "crate" else f"board '{victim}' ended: signal SIGKILL"
+    assert any(text in fault for fault in outcome.faults)
     assert next(event.board for event in rack.events if event.kind == "died") == victim
     wait_until(lambda: not any(runs(pid) for pid in family))
 

@@ -90,9 +90,9 @@ def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_p
     ]
     words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
     done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
-    told = done.stderr if policy == "refuse" else done.stdout
+    printed = done.stderr if policy == "refuse" else done.stdout
     assert done.returncode == (1 if policy == "refuse" else 0), done.stderr
-    assert "SCHED_FIFO refused, ordinary scheduling for wave" in told
-    assert "@GROUP - rtprio 99" in told
+    assert "SCHED_FIFO refused, ordinary scheduling for wave" in printed
+    assert "@GROUP - rtprio 99" in printed
     # It stands in every look at the rack, too.
-    assert policy == "refuse" or "NO REAL-TIME PRIORITY: wave" in told.splitlines()[-3]
+    assert policy == "refuse" or "NO REAL-TIME PRIORITY: wave" in printed.splitlines()[-3]

@@ -54,13 +54,13 @@ def test_a_run_of_some_seconds_ends_at_its_very_tick(config: MakeConfig, seconds
 
 
 def test_events_tell_the_run_in_order(config: MakeConfig) -> None:
-    told: list[Event] = []
-    rack = Rack(config(), told.append)
+    received: list[Event] = []
+    rack = Rack(config(), received.append)
     run(rack, 0.1)
-    assert told == rack.events
-    assert [event.kind for event in told if event.kind != "ready"] == ["launch", "start", "end"]
-    assert (told[0].tick, told[-1].tick, told[-1].text) == (-1, 39, "time over after 40 ticks")
-    assert [event.time_ns for event in told] == sorted(event.time_ns for event in told)
+    assert received == rack.events
+    assert [event.kind for event in received if event.kind != "ready"] == ["launch", "start", "end"]
+    assert (received[0].tick, received[-1].tick, received[-1].text) == (-1, 39, "time over after 40 ticks")
+    assert [event.time_ns for event in received] == sorted(event.time_ns for event in received)
 
 
 def test_output_of_a_board_becomes_an_event(config: MakeConfig) -> None:

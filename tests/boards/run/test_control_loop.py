@@ -187,23 +187,23 @@ def test_ordinary_scheduling_can_always_be_had() -> None:
 
 
 def test_a_board_dies_with_its_crate() -> None:
-    told, tell = os.pipe()
+    reading, writing = os.pipe()
 
     def crate() -> None:
         parent = os.getpid()
 
         def board() -> None:
             die_with_parent(parent)
-            os.write(tell, b"%d\n" % os.getpid())
+            os.write(writing, b"%d\n" % os.getpid())
             time.sleep(60)
 
         fork(board)
         time.sleep(60)
 
     pid = fork(crate)
-    with os.fdopen(told) as lines:
+    with os.fdopen(reading) as lines:
         board = int(lines.readline())
-    os.close(tell)
+    os.close(writing)
     os.kill(pid, 9)
     assert exit_status(pid) == -9
     wait_until(lambda: not runs(board))
