@@ -46,8 +46,8 @@ def second(config: MakeConfig, rack: Rack, *settings: str, text: str = PLAIN) ->
 def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack) -> None:
     with pytest.raises(ConfigError) as refused:
         Rack(second(config, first, "board.wave.core=0"), share=False).launch()
-    holder = f"rack '{first.config.name}' (process {os.getpid()}) runs wave there at real-time priority"
-    wanted = f"core 0, asked for by wave: {holder}: stop that rack, choose other cores, or give --share"
+    holder = f"rack '{first.config.name}' (process {os.getpid()}) runs wave on it at real-time priority"
+    wanted = f"core 0, requested by wave: {holder}: stop that rack, choose other cores, or use --share"
     assert str(refused.value) == wanted
 
 
@@ -55,7 +55,7 @@ def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack)
 def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
     with Rack(second(config, first, "board.wave.core=0")) as rack:
         ready = [event.text for event in rack.events if event.kind == "ready"]
-    assert ready[0].startswith(f"core 0, asked for by wave: rack '{first.config.name}'")
+    assert ready[0].startswith(f"core 0, requested by wave: rack '{first.config.name}'")
 
 
 @needs_fifo

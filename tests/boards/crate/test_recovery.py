@@ -86,7 +86,7 @@ def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(config:
         outcome = rack.run(5.0)
         assert rack.segment.words[System.EMERGENCY_STOP] == 1
     assert outcome.cause == "board lost"
-    assert "restarts are used up" in outcome.faults[0]
+    assert "no restarts left" in outcome.faults[0]
     assert [event.text[:9] for event in of(rack.events, "reaction", "restart")] == ["restart 1", "restart 2"]
     demand = of(rack.events, "reaction", "demand")[0]
     assert demand.subject == "emergency stop"
