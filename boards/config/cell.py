@@ -6,6 +6,7 @@ Importing MuJoCo takes 0.5 s, so the import is inside functions: only racks with
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake
 from rack.levels.errors import RobotError
 from rack.levels.tables import RobotConfig, SceneConfig
+
+if TYPE_CHECKING:
+    from rack.levels.robot.cell import Cell
 
 
 def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = True) -> dict[str, int]:
@@ -26,7 +30,9 @@ def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = Tru
     found: list[str] = []
     try:
         if is_whole:
-            return dict(_sizes(config.robot, config.scene, config.clock_ns))
+            from rack.levels.robot.cell import sizes
+
+            return sizes(_cell(config.robot, config.scene, config.clock_ns))
     except RobotError as error:
         found = [str(error)]
     for line in _unknown_names(config.robot, config.scene) or found:
@@ -46,30 +52,20 @@ def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
         return ()
 
 
-@lru_cache(maxsize=4)
-def _sizes(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[tuple[str, int], ...]:
-    from rack.levels.robot.cell import build_cell, sizes
-
-    return tuple(sizes(build_cell(robot, scene, clock_ns)).items())
-
-
 def geom_name(robot: RobotConfig, scene: SceneConfig, clock_ns: int, geom: int) -> str:
     """Return the name of a geom of the cell."""
-    return _geom_names(robot, scene, clock_ns)[geom]
-
-
-@lru_cache(maxsize=4)
-def _geom_names(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[str, ...]:
     from rack.levels.robot import lookup
-    from rack.levels.robot.cell import build_cell
 
-    model = build_cell(robot, scene, clock_ns).model
-    return tuple(lookup.geom_name(model, geom) for geom in range(model.ngeom))
+    return lookup.geom_name(_cell(robot, scene, clock_ns).model, geom)
 
 
-@lru_cache(maxsize=4)
 def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
     """Return the range of commanded joint positions, (joints, 2), rad. Raises `RobotError`."""
+    return _cell(robot, scene, clock_ns).limits.position
+
+
+@lru_cache(maxsize=4)
+def _cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     from rack.levels.robot.cell import build_cell
 
-    return build_cell(robot, scene, clock_ns).limits.position
+    return build_cell(robot, scene, clock_ns)

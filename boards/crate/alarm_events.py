@@ -19,7 +19,8 @@ from rack.boards.config.cell import geom_name
 from rack.boards.config.commands import describe, level_of, message_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
-from rack.boards.faults.describe import board_of, describe_kind, joint_name, subject_of
+from rack.boards.faults.describe import board_of, joint_name, subject_of
+from rack.boards.faults.describe import describe as describe_fault
 from rack.levels.operator import Operation
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]
@@ -121,7 +122,8 @@ class AlarmEvents:
             entry, fault = self._faults.entries[number], number
             subject, board = subject_of(entry, self._layout, self._joints), board_of(entry, self._layout)
             code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
-            text = f"{describe_kind(entry, self._layout, self._joints)} {code}{self._duration(entry, code)}"
+            what = describe_fault(entry, self._layout, self._joints, with_board=False)
+            text = f"{what} {code}{self._duration(entry, code)}"
         elif alarm == Alarm.COMMANDED:
             request = self._operator.entries[number]
             subject = board = level_of(request, self._layout)

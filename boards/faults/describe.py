@@ -53,18 +53,10 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     }
 
 
-def describe(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
-    """Return a fault as one line: its kind, target and parameters."""
-    return _text(entry, layout, joints, f" of {board_of(entry, layout)}")
-
-
-def describe_kind(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
-    """Return a fault as one line without its target: its kind and parameters."""
-    return _text(entry, layout, joints, "")
-
-
-def _text(entry: FaultEntry, layout: Layout, joints: Sequence[str], target: str) -> str:
+def describe(entry: FaultEntry, layout: Layout, joints: Sequence[str], with_board: bool = True) -> str:
+    """Return a fault as one line: its kind, board and parameters."""
     kind = KINDS[entry[Entry.KIND]]
+    target = f" of {board_of(entry, layout)}" if with_board else ""
     about = [subject_of(entry, layout, joints)]
     for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
         if parameter.name != "joint":

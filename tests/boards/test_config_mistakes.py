@@ -184,12 +184,12 @@ def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
     assert all(line.isprintable() and len(line) < 500 for line in lines)
 
 
-def test_a_segment_that_no_machine_has_room_for_is_refused(small: Path) -> None:
+def test_a_segment_too_large_for_any_machine_is_refused(small: Path) -> None:
     with pytest.raises(ConfigError, match=r"^mailbox upper.command: \d+ messages are kept .*; permitted: 1073741824; "):
         resolve(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
 
 
-def test_a_broken_board_does_not_make_its_neighbours_wrong(small: Path) -> None:
+def test_a_broken_board_causes_no_mistakes_in_its_neighbours(small: Path) -> None:
     assert [mistake.place for mistake in mistakes(small, "board.lower.slot=99")] == ["board.lower.slot"]
 
 
@@ -202,7 +202,7 @@ def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "place"), [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")]
 )
-def test_a_value_of_several_kinds_makes_one_mistake(setting: str, place: str) -> None:
+def test_a_value_of_several_possible_types_makes_one_mistake(setting: str, place: str) -> None:
     (mistake,) = mistakes("nasrem", f"robot.sensors.{setting}")
     assert (mistake.place, mistake.value) == (f"robot.sensors.{place}", -1)
 

@@ -141,7 +141,7 @@ def only_mistake(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] =
 
 
 @pytest.mark.parametrize(("fault", "line"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_told_with_what_is_valid(config: MakeConfig, fault: Fault, line: str) -> None:
+def test_a_mistake_is_reported_with_the_permitted_values(config: MakeConfig, fault: Fault, line: str) -> None:
     found = only_mistake(config, fault)
     assert line in found
     assert found.startswith("fault[0]")
@@ -149,7 +149,7 @@ def test_a_mistake_is_told_with_what_is_valid(config: MakeConfig, fault: Fault, 
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_every_kind_can_be_asked_for_by_its_name_and_target_alone(kind: Kind) -> None:
+def test_every_kind_needs_only_its_name_and_target(kind: Kind) -> None:
     fault = FaultConfig.model_validate(fault_of(kind))
     entry = injection(fault, *rack_for(kind.where == "lock", lockstep=False))
     assert KINDS[entry.kind] is kind
@@ -164,7 +164,7 @@ def test_a_parameter_that_a_kind_lacks_lists_those_it_has(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize(("kind", "parameter"), PARAMETERS, ids=lambda given: given.name)
-def test_a_parameter_out_of_range_is_told_with_its_range(kind: Kind, parameter: Parameter) -> None:
+def test_a_parameter_out_of_range_is_reported_with_its_range(kind: Kind, parameter: Parameter) -> None:
     for value in (parameter.least - 0.25, parameter.most + 0.25):
         line = mistake_of(kind, **{parameter.name: value})
         assert line.startswith(f"fault[0].{parameter.name} = {value!r}: out of range")
@@ -174,7 +174,7 @@ def test_a_parameter_out_of_range_is_told_with_its_range(kind: Kind, parameter: 
 @pytest.mark.parametrize(
     ("kind", "parameter"), [(k, p) for k, p in PARAMETERS if p.is_whole], ids=lambda given: given.name
 )
-def test_half_of_something_that_is_counted_is_refused(kind: Kind, parameter: Parameter) -> None:
+def test_fractions_of_whole_numbers_are_refused(kind: Kind, parameter: Parameter) -> None:
     assert "permitted: whole numbers" in mistake_of(kind, **{parameter.name: parameter.least + 0.5})
 
 
@@ -205,7 +205,7 @@ def test_a_kind_that_strikes_once_does_not_last(kind: Kind, key: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_mailbox], ids=lambda kind: kind.name)
-def test_a_kind_that_is_of_no_mailbox_lists_those_that_are(kind: Kind) -> None:
+def test_a_kind_without_mailboxes_lists_the_kinds_that_have_them(kind: Kind) -> None:
     takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
     line = mistake_of(kind, mailbox="wave.status")
     assert line == f'fault[0].mailbox = "wave.status": {kind.name} does not affect mailboxes; kinds that do: {takers}'
@@ -240,7 +240,7 @@ def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None
     )
 
 
-def test_all_mistakes_of_all_faults_are_told_at_once(config: MakeConfig) -> None:
+def test_all_mistakes_of_all_faults_are_reported_at_once(config: MakeConfig) -> None:
     faults = (
         {"kind": "kil", "board": "wve", "tick": 1, "at": 1.0},
         {"kind": "mute", "board": "wave", "mailbox": "sea", "when": "sea", "strength": 1, "for": 1, "cycles": 1},
@@ -252,7 +252,7 @@ def test_all_mistakes_of_all_faults_are_told_at_once(config: MakeConfig) -> None
     )
 
 
-def test_mistakes_of_faults_are_told_beside_those_of_the_rest(config: MakeConfig) -> None:
+def test_mistakes_of_faults_are_reported_with_all_others(config: MakeConfig) -> None:
     faults = [{"kind": "kil", "board": "wave"}, {"kind": "kill", "board": "watch", "tick": "soon"}]
     tables = f"fault=[{', '.join(inline(fault) for fault in faults)}]"
     with pytest.raises(ConfigError) as error:

@@ -122,7 +122,7 @@ def test_subjects_have_names_for_programs_too(segment: Segment) -> None:
     assert heard(segment, "wave", Alarm.CLOCK_STOPPED).subject == ""
 
 
-def test_a_return_names_the_returned_task(segment: Segment) -> None:
+def test_a_rejoin_names_the_task(segment: Segment) -> None:
     event = heard(segment, CLOCK, Alarm.REJOINED, 2, 200)
     assert (event.board, event.subject, event.text) == ("watch", "watch", "'watch' rejoined after 200 ticks (500 ms)")
     assert heard(segment, CLOCK, Alarm.REJOINED, -1, 4).board == CLOCK

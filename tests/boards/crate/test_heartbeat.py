@@ -93,7 +93,7 @@ def test_a_task_that_recovered_and_hangs_again_is_reported_again(bus: Segment, c
     assert found == [FAST, FAST]
 
 
-def test_a_lost_task_is_known_to_be(bus: Segment, clock: Clock) -> None:
+def test_a_lost_task_does_not_hang(bus: Segment, clock: Clock) -> None:
     beat = Heartbeat(bus)
     bus.block(FAST)[Block.LOST] = 1
     run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
@@ -117,7 +117,7 @@ def test_an_idle_task_does_not_hang(bus: Segment, clock: Clock) -> None:
         assert beat.hanging() == []
 
 
-def test_a_clock_that_makes_no_tick_hangs(bus: Segment, clock: Clock) -> None:
+def test_a_clock_without_ticks_hangs(bus: Segment, clock: Clock) -> None:
     bus.words[System.LOCKSTEP] = 0
     beat = Heartbeat(bus)
     run_on(bus, clock, 0.5)

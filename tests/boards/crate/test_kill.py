@@ -206,7 +206,7 @@ def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
         assert not named(f"{rack_name}:")
 
 
-def test_a_board_killed_at_any_moment_of_its_life_is_no_hang(config: MakeConfig) -> None:
+def test_a_board_killed_at_any_moment_does_not_count_as_hanging(config: MakeConfig) -> None:
     rng = random.Random(5)
     for _ in range(6):
         with Rack(config(REALTIME, NEVER)) as rack:

@@ -67,7 +67,7 @@ def test_waiting_racks_hold_no_core(config: MakeConfig, first: Rack, setting: st
 
 @needs_fifo
 @needs_two_cores
-def test_a_board_that_names_no_core_gets_another(config: MakeConfig, first: Rack) -> None:
+def test_a_board_without_a_core_setting_moves_to_a_free_core(config: MakeConfig, first: Rack) -> None:
     with Rack(second(config, first, text=ELSEWHERE), share=False) as rack:
         ready = [event.text for event in rack.events if event.kind == "ready"]
         core = rack.segment.layout.task("wave").core

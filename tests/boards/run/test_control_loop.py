@@ -92,7 +92,7 @@ def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
     assert rack.segment.block("wave")[Block.MISSED] == 1
 
 
-def test_a_slow_level_has_its_whole_cycle(bench: MakeBench) -> None:
+def test_a_slow_level_may_use_its_whole_cycle(bench: MakeBench) -> None:
     rack = bench()
     watch = rack.task("watch")
     rack.to(7)
@@ -149,7 +149,7 @@ def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -
     assert (slots.tick, slots.basis) == (8, 3)
 
 
-def test_a_planner_traces_its_plans_and_not_every_question(bench: MakeBench) -> None:
+def test_a_planner_traces_plans_but_not_idle_cycles(bench: MakeBench) -> None:
     rack = bench("board.wave.params.plan_every=4")
     planner = rack.task("wave.planner")
     for tick in (0, 4, 5, 6, 8):
@@ -162,7 +162,7 @@ def test_a_planner_traces_its_plans_and_not_every_question(bench: MakeBench) -> 
     assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.MISSED)] == [5, 3, 8, 0]
 
 
-def test_a_second_task_on_a_mailbox_is_refused(bench: MakeBench) -> None:
+def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:
     rack = bench()
     writer = open_writer(rack.segment, "wave.status")
     with pytest.raises(MailboxError, match=r"'wave\.status' has a writer already"):
@@ -181,7 +181,7 @@ def test_a_board_takes_its_core_and_stops_its_garbage_collector() -> None:
     assert exit_status(fork(take)) == 0
 
 
-def test_ordinary_scheduling_can_always_be_had() -> None:
+def test_ordinary_scheduling_is_never_refused() -> None:
     assert set_priority(0)
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 

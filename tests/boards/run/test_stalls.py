@@ -84,7 +84,7 @@ def run(rack: Link, seed: int) -> None:
 
 @pytest.mark.parametrize(("rates", "depth"), [((1, 1), 1024), ((1, 8), ROUND), ((8, 1), 1024)])
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_stalls_of_writer_and_reader_ring_nothing(
+def test_stalls_of_writer_and_reader_raise_no_alarm(
     link: MakeLink, protocol: Protocol, rates: tuple[int, int], depth: int
 ) -> None:
     rack = link(protocol, rates, depth=depth)
