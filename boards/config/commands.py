@@ -34,7 +34,7 @@ def commandable(config: RackConfig) -> dict[str, Commands]:
         try:
             executor = find_class(board.executor, Executor)
         except LookupError:
-            continue  # a mistake of its own, reported elsewhere
+            continue  # reported elsewhere
         if any(port.source == OWN_OPERATOR for port in executor.inputs.values()):
             found[name] = executor.commands
     return found
@@ -156,7 +156,7 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
     try:
         ranges = joint_ranges(robot, config.scene, config.clock_ns)
     except RobotError:
-        return  # a mistake of its own, reported elsewhere
+        return  # reported elsewhere
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
             yield Mistake(place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad")

@@ -92,7 +92,7 @@ def _sources(
         if port in wired:
             yield port, wired[port]
         elif neighbour is not None:
-            # A neighbour that does not exist is a mistake of its own, reported by the rules.
+            # A neighbour that does not exist is reported by the rules.
             if start not in ("above", "below") or neighbour in config.board.keys() - {name}:
                 yield port, f"{neighbour}.{rest}"
         else:

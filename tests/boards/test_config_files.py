@@ -70,7 +70,7 @@ def test_bases_are_merged_in_order(small: Path, write: Write) -> None:
 
 
 def test_an_arm_is_replaced_as_a_whole(write: Write) -> None:
-    # The gripper of the bundled arm must not stay behind on one that has none.
+    # An arm without a gripper must not inherit that of the bundled arm.
     model = write("arm.xml", "<mujoco/>")
     arm = f'[robot]\nmodel = "{model.name}"\njoints = ["a"]\ntool = "t"\nhome = [0]\n'
     limits = "velocity = [1]\nacceleration = [1]\njerk = [1]\n"

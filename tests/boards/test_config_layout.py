@@ -1,4 +1,4 @@
-"""From config to layout: who writes, who reads, how long it takes, how much is kept."""
+"""From config to layout: writers, readers, delays and depths."""
 
 from __future__ import annotations
 

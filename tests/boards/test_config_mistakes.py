@@ -146,7 +146,7 @@ what = "hold"
 home = true
 """
     found = {mistake.place: mistake.why for mistake in mistakes(write("mine.toml", text))}
-    # What a mistake of its own hides: nothing of the world board, of the first fault, of the first command follows.
+    # No further mistakes of tables that are broken: the world board, the first fault, the first command.
     assert set(found) == {
         "clock.wake",
         "robot.joints",

@@ -34,13 +34,13 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
     "reorder": ({"kind": "reorder", "board": "wave"}, "watch", 1 + 1 + 8),
     "delay": ({"kind": "delay", "board": "wave", "by": 3}, "watch", 3 + 1 + 8),
     "corrupt": ({"kind": "corrupt", "board": "wave"}, "watch", 1 + 8),
-    "corrupt plan, visible behind its slice": ({"kind": "corrupt", "board": "wave.planner"}, "wave", 4 + 1),
+    "corrupt plan, visible after its slice": ({"kind": "corrupt", "board": "wave.planner"}, "wave", 4 + 1),
     "babble": ({"kind": "babble", "board": "wave"}, None, 1 + 4),
     "masquerade": ({"kind": "masquerade", "board": "wave"}, None, 1 + 4),
     "clock stops": ({"kind": "clock-stop", "board": "clock"}, None, 3),
     "clock skips": ({"kind": "clock-skip", "board": "clock", "ticks": 4}, None, 4),
     "clock jitters": ({"kind": "clock-jitter", "board": "clock"}, None, 2),
-    # What is driven has a cycle of two ticks.
+    # The driven board has a cycle of two ticks.
     "sensor-nan": ({"kind": "sensor-nan", "board": "driven"}, None, 2),
     "sensor-stuck": ({"kind": "sensor-stuck", "board": "driven"}, None, 40),
     "sensor-dropout": ({"kind": "sensor-dropout", "board": "driven"}, None, 4),

@@ -1,4 +1,4 @@
-"""Faults of a writer: really done to its messages, found by who reads them within their bounds, and over when over."""
+"""Faults of a writer: they act on its messages, are detected by the reader within their bounds, and end."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FAULTS: dict[str, tuple[float, ...]] = {
     "babble": (16,),
 }
 ALSO = {"delay": {Alarm.MUTE}, "reorder": {Alarm.HELD_BACK}}
-"""What else may be rung: a message that will come late has not come yet; the last to be exchanged comes late."""
+"""Other permitted alarms: a delayed message is at first missing; the last swapped message is late."""
 BEGIN, END, LAST = 64, 160, 320
 
 
@@ -42,7 +42,7 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 def forge(rack: Link, tick: int) -> None:
-    """Publish a forged message from a process of its own."""
+    """Publish a forged message from another process."""
     assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 
@@ -101,7 +101,7 @@ def test_reads_with_a_fault_depend_on_ticks_alone(link: MakeLink, kind: str, rat
     (seen, alarms, written), (seen_again, alarms_again, written_again) = runs
     assert seen == seen_again
     assert written == written_again
-    # A forged message is there until the true writer's next: whoever comes first sees it.
+    # A forged message lasts until the true writer's next one: only a reader that comes before sees it.
     assert alarms == alarms_again or kind == "masquerade"
 
 
@@ -305,7 +305,7 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
         wait_until(lambda: state_of(pid) in ("Z" if is_killed else "T"))
         assert (struck(entry), entry[Entry.COUNT]) == (4, 1)
         reading = rack.reader.cycle(5)
-        # A dead process leaves its lock to the one who waits, a stopped one keeps it.
+        # The lock of a dead process goes to the waiter; a stopped process keeps it.
         assert reading.verdict is (Verdict.OLD if is_killed else Verdict.BUS_ERROR)
         assert reading.value.id == 3
         assert rack.alarms() == [(5, Alarm.LOCKED)]

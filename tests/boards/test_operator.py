@@ -76,7 +76,7 @@ def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., Ra
 @pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
 def test_commands_reach_their_level_under_any_protocol(commanded: Callable[..., RackConfig], protocol: str) -> None:
     config = commanded(HELD, f"protocol.default={protocol}")
-    # The clock waits for nobody.
+    # The clock must never wait.
     assert wire(config).mailbox("upper.operator").protocol == "double-buffer"
     _, _, boxes = run(config)
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]

@@ -1,4 +1,4 @@
-"""Alarms as events: rung into the rings of a real segment, and read as the Rack reads them."""
+"""Alarms as events: raised in the rings of a real segment, and read as the Rack reads them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def heard(
     return AlarmEvents(segment, JOINTS).of(row, owner)
 
 
-# What an operator says comes from the operator table: test_operator.py.
+# Operator commands come from the operator table: see test_operator.py.
 TOLD_HERE = [alarm for alarm in Alarm if alarm is not Alarm.COMMANDED]
 
 

@@ -94,5 +94,5 @@ def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_p
     assert done.returncode == (1 if policy == "refuse" else 0), done.stderr
     assert "SCHED_FIFO refused, ordinary scheduling for wave" in printed
     assert "@GROUP - rtprio 99" in printed
-    # It stands in every look at the rack, too.
+    # Every view of the rack repeats it.
     assert policy == "refuse" or "NO REAL-TIME PRIORITY: wave" in printed.splitlines()[-3]

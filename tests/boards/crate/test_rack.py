@@ -145,7 +145,7 @@ def test_a_removed_rack_frees_its_memory(config: MakeConfig) -> None:
     run(rack, 0.0025)
     name = shm_path(rack.config.name).name
     maps = Path("/proc/self/maps")
-    # Deleted by name, and still mapped: who reads the counters of a run that has ended has them.
+    # Unlinked but still mapped, so the counters of an ended run remain readable.
     assert rack.segment.block("wave")[Block.CYCLES] == 1
     before = maps.read_text().count("(deleted)")
     del rack

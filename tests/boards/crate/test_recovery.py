@@ -1,4 +1,4 @@
-"""Boards that die or hang come back on the grid, as their policy permits; a run in lockstep repeats with them."""
+"""Boards that die or hang rejoin the grid, as their policy permits; in lockstep such a run is repeatable."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ MakeBench = Callable[..., "Bench"]
 
 
 class Bench:
-    """A wired rack whose tasks a test cycles itself; the clock stands at tick 0 and ticks last an hour."""
+    """A wired rack whose tasks are cycled by the test; the clock stands at tick 0 and a tick lasts an hour."""
 
     def __init__(self, plan: Resolved) -> None:
         self.plan = plan
@@ -131,7 +131,7 @@ def test_a_cut_off_access_shows_in_the_trace_and_the_cycle_continues(bench: Make
     watch.cycle(8)
     wave.cycle(8)
     assert rack.flags("watch") == [Flag(0), Flag.BUS_ERROR]
-    # What could not be written did not come in time.
+    # A failed write is a missed deadline.
     assert rack.flags("wave") == [Flag(0), Flag.BUS_ERROR | Flag.MISSED]
     assert [rack.segment.block(name)[Block.BUS_ERRORS] for name in ("wave", "watch")] == [1, 1]
 

@@ -65,7 +65,7 @@ def test_under_time_slice_a_level_reads_by_ticks_alone(config: MakeConfig) -> No
     found = written(Rack(config(text=PLAIN)))
     seen, made = found.messages["watch.status"], found.messages["wave.status"]
     assert seen["tick"].tolist() == list(range(0, TICKS, 8))
-    # What the wave wrote one tick earlier, and nothing at tick 0.
+    # The wave's message of the tick before; none at tick 0.
     expected = [0.0, *(made["message"]["value"][tick - 1] for tick in range(8, TICKS, 8))]
     assert seen["message"]["value"].tolist() == expected
     assert seen["basis"].tolist() == [0, *(tick - 1 for tick in range(8, TICKS, 8))]
