@@ -170,7 +170,7 @@ def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str]
 def test_a_rack_that_is_not_there_is_named(rack_name: str) -> None:
     status, _, why = refused("stop", rack_name)
     assert status == 1
-    assert f"rack '{rack_name}' is not there" in why
+    assert f"rack '{rack_name}' does not exist" in why
 
 
 def test_a_folder_that_holds_files_is_not_written_over(small: Path, tmp_path: Path) -> None:
