@@ -12,23 +12,9 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
 
-EventKind = Literal[
-    "launch",
-    "ready",
-    "start",
-    "printed",
-    "died",
-    "stop",
-    "end",
-    "recorder",
-    "command",
-    "fault",
-    "detection",
-    "miss",
-    "reaction",
-    "recovery",
-    "held",
-]
+OfRun = Literal["launch", "ready", "start", "printed", "died", "stop", "end", "recorder", "command"]
+OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
+EventKind = OfRun | OfFaults
 
 
 @dataclass(frozen=True)

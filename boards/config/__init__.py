@@ -16,17 +16,5 @@ from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import budgets, rack_timing
 
-__all__ = [
-    "CONFIGS",
-    "FAULTS",
-    "RackConfig",
-    "Resolved",
-    "budgets",
-    "load",
-    "loads",
-    "names",
-    "rack_timing",
-    "resolve",
-    "shared_out",
-    "wire",
-]
+__all__ = ["CONFIGS", "FAULTS", "RackConfig", "Resolved", "budgets", "load", "loads", "names", "rack_timing"]
+__all__ += ["resolve", "shared_out", "wire"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -157,8 +158,19 @@ class Wiring:
         """Return the layout of a config without mistakes."""
         tasks = tuple(self._task(ports) for ports in self.tasks)
         by_name = {task.name: task for task in tasks}
-        mailboxes = [self._mailbox(mailbox, by_name, sizes) for mailbox in self._writers]
-        mailboxes += [self._operators_mailbox(mailbox, kind) for mailbox, kind in self._operated.items()]
+        mailboxes = []
+        for name, (ports, kind) in self._writers.items():
+            writer = by_name[ports.task]
+            delay = writer.every * writer.within_cycles
+            # A reader may read as late as the end of its slice a message that was visible at its start.
+            readers = [by_name[reader] for reader in self._readers(name)]
+            slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
+            depth = depth_for(max(slowest + delay, self._kept_ticks), writer.every)
+            spec = partial(MailboxSpec, writer=writer.name, every=writer.every, delay=delay, depth=depth)
+            mailboxes.append(self._mailbox(name, kind, sizes, spec))
+        # The clock passes an operator's commands on.
+        operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
+        mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self._operated.items()]
         return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes))
 
     def _task(self, ports: TaskPorts) -> TaskSpec:
@@ -179,50 +191,27 @@ class Wiring:
     def _kept_ticks(self) -> int:
         return round(KEPT_S * 1e9 / self.config.clock_ns)
 
-    def _mailbox(self, name: str, tasks: Mapping[str, TaskSpec], sizes: Mapping[str, int]) -> MailboxSpec:
-        ports, kind = self._writers[name]
-        writer = tasks[ports.task]
-        readers = self._readers(name)
-        delay = writer.every * writer.within_cycles
-        # A reader may read as late as the end of its slice a message that was visible at its start.
-        slowest = max((tasks[reader].every * tasks[reader].within_cycles for reader in readers), default=0)
-        return MailboxSpec(
+    def _mailbox(
+        self, name: str, kind: MessageType, sizes: Mapping[str, int], spec: Callable[..., MailboxSpec]
+    ) -> MailboxSpec:
+        """Complete the record of a mailbox by its message, readers and protocol."""
+        return spec(
             name=name,
-            writer=writer.name,
-            readers=readers,
+            readers=self._readers(name),
             protocol=self._protocol(name),
-            every=writer.every,
-            delay=delay,
-            depth=depth_for(max(slowest + delay, self._kept_ticks), writer.every),
             message=kind.name,
             version=kind.version,
             size=kind.dtype(sizes).itemsize,
             fields=field_specs(kind, sizes),
         )
 
-    def _operators_mailbox(self, name: str, kind: MessageType) -> MailboxSpec:
-        """Return the mailbox through which the clock passes an operator's commands to a level."""
-        protocol = self._protocol(name)
-        return MailboxSpec(
-            name=name,
-            writer=CLOCK,
-            readers=self._readers(name),
-            # A lock would make the clock wait for readers.
-            protocol="double-buffer" if protocol == "lock" else protocol,
-            every=1,
-            delay=1,
-            depth=OPERATOR_DEPTH,
-            message=kind.name,
-            version=kind.version,
-            size=kind.dtype({}).itemsize,
-            fields=field_specs(kind, {}),
-        )
-
     def _readers(self, mailbox: str) -> tuple[str, ...]:
         return tuple(ports.task for ports in self.tasks if mailbox in ports.reads.values())
 
     def _protocol(self, mailbox: str) -> Protocol:
-        return self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
+        protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
+        # A lock would make the clock wait for readers.
+        return "double-buffer" if protocol == "lock" and mailbox in self._operated else protocol
 
 
 def too_large(layout: Layout) -> Iterable[Mistake]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rack.backplane.address_map import CLOCK
@@ -81,19 +81,10 @@ def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, 
 
 def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
     """Return a line for every core that another rack occupies and a real-time task of this config requests."""
+    tasks = [(CLOCK, config.clock.core, config.clock.priority), *((t.name, t.core, t.priority) for t in config.tasks())]
     wanted: dict[int, list[str]] = {}
-    for task, core in _wanted(config):
-        wanted.setdefault(obtained_core(core), []).append(task)
+    for task, core, priority in tasks:
+        if priority:
+            wanted.setdefault(obtained_core(core), []).append(task)
     both = sorted(wanted.keys() & held.keys()) if config.clock.mode == "realtime" else []
     return [f"core {core}, requested by {', '.join(wanted[core])}: {held[core]}" for core in both]
-
-
-def _wanted(config: RackConfig) -> Iterator[tuple[str, int]]:
-    """Yield each real-time task with its core."""
-    if config.clock.priority:
-        yield CLOCK, config.clock.core
-    for name, board in config.board.items():
-        if board.priority:
-            yield name, board.core
-        if board.planner_priority:
-            yield f"{name}.planner", board.core if board.planner_core is None else board.planner_core

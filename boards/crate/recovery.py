@@ -103,11 +103,8 @@ class Recovery:
     def advance(self) -> list[str]:
         """Power on the boards that are due; return them."""
         self._starting = [name for name in self._starting if self._is_absent(name)]
-        due = []
-        for board in self._supervision.in_order(self._waiting):
-            absent = [name for name in (*self._waiting, *self._starting) if name != board]
-            if not self._supervision.must_wait(board, absent):
-                due.append(board)
+        absent, in_order = [*self._waiting, *self._starting], self._supervision.in_order(self._waiting)
+        due = [board for board in in_order if not self._supervision.must_wait(board, absent)]
         for board in due:
             self._waiting.remove(board)
             self._starting.append(board)

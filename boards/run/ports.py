@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from rack.backplane.fault_table import Entry, FaultEntry
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
@@ -113,11 +112,6 @@ class OutputPorts:
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [(port, w, getattr(self._faulty.get(port), "write", w.write)) for port, w in self.writers.items()]
-
-    def message(self, port: str) -> Message | None:
-        """Return the outgoing message of a port; None if there is no such port."""
-        writer = self.writers.get(port)
-        return writer.message if writer else None
 
     @property
     def bus_errors(self) -> int:

@@ -33,7 +33,7 @@ class Stopwatch:
         self._block = segment.block(task)
         self._clock = SystemClock(segment)
         self._inputs, self._outputs = inputs, outputs
-        self._status = outputs.message("status")
+        self._status = getattr(outputs.messages, "status", None)
         self._trace = TraceWriter(segment, task)
         self._record = self._trace.record
         self._lockstep_clock = clock_semaphore(segment.rack) if self._clock.is_lockstep else None

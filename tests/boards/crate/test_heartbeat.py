@@ -93,15 +93,11 @@ def test_a_task_that_recovered_and_hangs_again_is_reported_again(bus: Segment, c
     assert found == [FAST, FAST]
 
 
-def test_a_lost_task_does_not_hang(bus: Segment, clock: Clock) -> None:
-    beat = Heartbeat(bus)
-    bus.block(FAST)[Block.LOST] = 1
-    run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
-    assert beat.hanging() == []
-
-
-def test_in_real_time_the_tasks_are_the_clocks_to_watch(bus: Segment, clock: Clock) -> None:
-    bus.words[System.LOCKSTEP] = 0
+@pytest.mark.parametrize("is_lost", [True, False])
+def test_a_lost_task_does_not_hang_and_in_real_time_the_clock_checks_tasks(
+    bus: Segment, clock: Clock, is_lost: bool
+) -> None:
+    bus.words[System.LOCKSTEP], bus.block(FAST)[Block.LOST] = is_lost, is_lost
     beat = Heartbeat(bus)
     run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
     assert beat.hanging() == []
@@ -171,7 +167,6 @@ def test_bounds_stretch_with_the_wall_clock(bus: Segment, clock: Clock) -> None:
 
 
 def test_in_lockstep_a_plan_takes_as_long_as_it_takes(bus: Segment, clock: Clock) -> None:
-    bus.words[System.LOCKSTEP] = 1
     beat = Heartbeat(bus)
     clock.now_s += 30.0
     assert beat.hanging() == []
