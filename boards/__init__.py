@@ -1,17 +1,17 @@
-"""The boards: one process a level, launched, watched and ended by the Rack.
+"""The boards: one process per level, launched, supervised and ended by the Rack.
 
     from rack.boards import Rack
 
     with Rack.from_file("nasrem") as rack:
         print(rack.run(seconds=10))
 
-- `Rack` launches a config's boards, watches them, and ends them again; `Outcome` is how a run ended.
-- `Event` is one thing that happened; `Rack(config, on_event=...)` hands each one to your program as it comes.
+- `Rack` launches the boards of a config, supervises them and ends them; `Outcome` says how a run ended.
+- `Event` is one occurrence in a run; `Rack(config, on_event=...)` passes each to your program as it happens.
 - `load` reads a config by name or path, with overrides; `RackConfig` is the result.
-- `BoardError` is the root of all errors: `ConfigError` holds every `Mistake` of a config, `LaunchError` is a board that
-  does not start.
+- `BoardError` is the root of all errors: `ConfigError` holds every `Mistake` of a config, `LaunchError` means that a
+  board did not start.
 
-Names are imported when they are first used: the crate and its boards import parts of this package and must stay small.
+Names are imported on first use: the crate and its boards import parts of this package and must stay small.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Classes of levels by name: "package.module:Class" to the class."""
+"""Classes of levels by name, as in "package.module:Class"."""
 
 from __future__ import annotations
 

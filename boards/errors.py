@@ -3,7 +3,7 @@
 `BoardError` is the root: catch it and every refusal of this package is caught.
 
 - `ConfigError`: a config with mistakes, all of them at once, before any process starts.
-- `LaunchError`: a board that does not start: its self-test failed, or it was not ready in time.
+- `LaunchError`: a board that did not start: its self-test failed, or it was not ready in time.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class BoardError(Exception):
 
 
 class LaunchError(BoardError):
-    """A rack that cannot be launched although its config is correct."""
+    """A rack with a correct config that cannot be launched."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake of a config: its place, the value there (None: none), and why it is wrong or what is permitted."""
+    """One mistake in a config: its place, the value there (None: none), and the reason or the permitted values."""
 
     place: str
     value: Any
@@ -40,7 +40,7 @@ class Mistake:
 
 
 class ConfigError(BoardError):
-    """A config that cannot run. `mistakes` holds every mistake found; the text has one line for each."""
+    """A config that cannot run. `mistakes` holds every mistake found; the text has one line per mistake."""
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list({str(mistake): mistake for mistake in mistakes}.values())
@@ -48,16 +48,16 @@ class ConfigError(BoardError):
 
 
 def shown(value: Any) -> str:
-    """Return a config value as in TOML, cut to one short line."""
+    """Return a config value as in TOML, shortened to one line."""
     value = list(value) if isinstance(value, tuple) else value
     try:
         text = str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
-    except ValueError:  # Python does not print integers of thousands of digits
+    except ValueError:  # Python refuses to print integers of thousands of digits
         text = f"an integer of {value.bit_length()} bits"
     return one_line(text, LONGEST_VALUE)
 
 
 def one_line(text: str, longest: int) -> str:
-    """Return text as one line of at most that many characters, without control characters."""
+    """Return text as one line of at most `longest` characters, without control characters."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text[: 2 * longest].split()))
     return text if len(text) <= longest else f"{text[: longest - 3]}..."

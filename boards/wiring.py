@@ -1,4 +1,4 @@
-"""Plain data that the Rack sends to the crate: all that one process needs to run."""
+"""Plain data that the Rack sends to the crate: everything that a process needs to run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rack.levels.level import LevelContext
 
 @dataclass(frozen=True)
 class BusTimes:
-    """A slower bus: processor time that each kind of access takes at least, ns; see `[board.<name>.transfer]`."""
+    """A slower bus: minimum processor time of each kind of access, ns; see `[board.<name>.transfer]`."""
 
     read_ns: int = 0
     write_ns: int = 0
@@ -21,10 +21,10 @@ class BusTimes:
 
 @dataclass(frozen=True)
 class TaskWiring:
-    """One task: its class `target`, as "package.module:Class", and a mailbox for each port.
+    """One task: its class `target`, as "package.module:Class", and the mailbox of each port.
 
-    `critical_priority`: SCHED_FIFO priority that a tight planner takes for its plan update. `guards_clock`: the task,
-    one of the fastest, watches the clock. `fails_self_test`: a fault of the config.
+    `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
+    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config.
     """
 
     task: str
@@ -41,12 +41,12 @@ class TaskWiring:
 
 @dataclass(frozen=True)
 class ClockWiring:
-    """The clock's board: how a run proceeds in time. `period_ns` is wall-clock time, so it includes the speed factor.
+    """The clock's board: the course of a run in time. `period_ns` is wall-clock time, including the speed factor.
 
     All other times are ticks. The run ends at `stop_tick` (0: never), or `linger` after the status mailbox `ends_run`
-    says done or error, or after its writer, not lost, has written nothing for `silent`. In lockstep the clock is never
-    more than `history` ahead of a recorder, and a lost board rejoins `restart_ticks` after its loss. `on_loss`: what
-    the loss of a task demands of the arm.
+    reports done or error, or if its writer, not lost, has written nothing for `silent`. In lockstep the clock is at
+    most `history` ahead of a recorder, and a lost board rejoins `restart_ticks` after its loss. `on_loss`: the demand
+    on the arm while a task is lost.
     """
 
     lockstep: bool

@@ -3,7 +3,7 @@
 - `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a `RackConfig`.
 - `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults, commands.
 - `wire(config)`: the layout alone.
-- `shared_out(config)`: the cores that the machine lacks.
+- `shared_out(config)`: a line for every requested core that does not exist.
 - `names()`, `CONFIGS`, `FAULTS`: the bundled configs and fault scripts.
 - `budgets(config)`, `rack_timing(config, layout)`: the config in terms of the timing model.
 
@@ -16,17 +16,5 @@ from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import budgets, rack_timing
 
-__all__ = [
-    "CONFIGS",
-    "FAULTS",
-    "RackConfig",
-    "Resolved",
-    "budgets",
-    "load",
-    "loads",
-    "names",
-    "rack_timing",
-    "resolve",
-    "shared_out",
-    "wire",
-]
+__all__ = ["CONFIGS", "FAULTS", "RackConfig", "Resolved", "budgets", "load", "loads", "names", "rack_timing"]
+__all__ += ["resolve", "shared_out", "wire"]

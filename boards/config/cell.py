@@ -1,11 +1,12 @@
-"""What follows from the arm and its cell, built once per process.
+"""Data derived from the arm and its cell, built once per process.
 
-Importing MuJoCo takes half a second, so functions import it: only racks with an arm pay.
+Importing MuJoCo takes 0.5 s, so the import is inside functions: only racks with an arm pay for it.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +16,23 @@ from rack.boards.errors import Mistake
 from rack.levels.errors import RobotError
 from rack.levels.tables import RobotConfig, SceneConfig
 
+if TYPE_CHECKING:
+    from rack.levels.robot.cell import Cell
+
 
 def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = True) -> dict[str, int]:
-    """Return the symbolic sizes by name, none without an arm; add everything wrong with the cell to `mistakes`.
+    """Return the symbolic sizes by name, none without an arm; add every mistake in the cell to `mistakes`.
 
-    If the cell is not whole, as [robot] or [scene] has mistakes of its own, only names are looked up.
+    If [robot] or [scene] has mistakes of its own, the cell is not whole and only names are checked.
     """
     if config.robot is None:
         return {}
     found: list[str] = []
     try:
         if is_whole:
-            return dict(_sizes(config.robot, config.scene, config.clock_ns))
+            from rack.levels.robot.cell import sizes
+
+            return sizes(_cell(config.robot, config.scene, config.clock_ns))
     except RobotError as error:
         found = [str(error)]
     for line in _unknown_names(config.robot, config.scene) or found:
@@ -37,7 +43,7 @@ def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = Tru
 
 
 def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
-    """Return a line for every name that the model does not have; none if the model cannot be read."""
+    """Return a line for every name missing from the model; none if the model cannot be read."""
     from rack.levels.robot.lookup import unknown_names
 
     try:
@@ -46,30 +52,20 @@ def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
         return ()
 
 
-@lru_cache(maxsize=4)
-def _sizes(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[tuple[str, int], ...]:
-    from rack.levels.robot.cell import build_cell, sizes
-
-    return tuple(sizes(build_cell(robot, scene, clock_ns)).items())
-
-
 def geom_name(robot: RobotConfig, scene: SceneConfig, clock_ns: int, geom: int) -> str:
     """Return the name of a geom of the cell."""
-    return _geom_names(robot, scene, clock_ns)[geom]
-
-
-@lru_cache(maxsize=4)
-def _geom_names(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> tuple[str, ...]:
     from rack.levels.robot import lookup
-    from rack.levels.robot.cell import build_cell
 
-    model = build_cell(robot, scene, clock_ns).model
-    return tuple(lookup.geom_name(model, geom) for geom in range(model.ngeom))
+    return lookup.geom_name(_cell(robot, scene, clock_ns).model, geom)
+
+
+def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
+    """Return the range of commanded joint positions, (joints, 2), rad. Raises `RobotError`."""
+    return _cell(robot, scene, clock_ns).limits.position
 
 
 @lru_cache(maxsize=4)
-def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
-    """Return the positions that joints may be commanded to, (joints, 2), rad. Raises `RobotError`."""
+def _cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     from rack.levels.robot.cell import build_cell
 
-    return build_cell(robot, scene, clock_ns).limits.position
+    return build_cell(robot, scene, clock_ns)

@@ -1,4 +1,4 @@
-"""An operator's commands: checked against the rack they are for, and made into requests for the operator table."""
+"""Operator commands: checked against their rack, made into requests for the operator table, and described in words."""
 
 from __future__ import annotations
 
@@ -12,30 +12,29 @@ from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
-from rack.backplane.operator_table import Request
+from rack.backplane.operator_table import Request, RequestEntry, RequestWord
 from rack.boards.classes import find_class
 from rack.boards.config.cell import joint_ranges
 from rack.boards.config.mistakes import mistakes_of
-from rack.boards.config.schema import RackConfig
+from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.operating.command import CommandConfig
 from rack.levels.algebra import norm
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor
-from rack.levels.operator import Commands, Goal, goal_names, listed
+from rack.levels.operator import Commands, Goal, Operation, goal_names, listed
 
 OWN_OPERATOR = "own.operator"
 DOWN = (0.0, 0.0, -1.0)
 
 
 def commandable(config: RackConfig) -> dict[str, Commands]:
-    """Return the commands that each level takes from an operator, by board; other levels are left out."""
+    """Return the commands that each level takes from an operator, by board; levels that take none are omitted."""
     found = {}
     for name, board in config.board.items():
         try:
             executor = find_class(board.executor, Executor)
         except LookupError:
-            continue  # a mistake of its own, reported elsewhere
+            continue  # reported elsewhere
         if any(port.source == OWN_OPERATOR for port in executor.inputs.values()):
             found[name] = executor.commands
     return found
@@ -86,15 +85,15 @@ def _tick(command: CommandConfig, clock_ns: int) -> int:
 def command_mistakes(
     commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, broken: frozenset[str] = frozenset()
 ) -> list[Mistake]:
-    """Return everything wrong with commands, given with their places in a config; the place of a live one is empty.
+    """Return every mistake in commands, given with their places in a config; a live command has an empty place.
 
-    `broken` are boards with mistakes of their own: commands for them are not checked.
+    Commands for `broken` boards, which have mistakes of their own, are not checked.
     """
     given = list(commands)
     checked = [(place, command) for place, command in given if command.level not in broken]
     found = [mistake for place, command in checked for mistake in _mistakes(place, command, config)]
     if len(given) > OPERATOR_ENTRIES:
-        found.append(Mistake("command", len(given), f"too many to wait at once; permitted: {OPERATOR_ENTRIES}"))
+        found.append(Mistake("command", len(given), f"too many pending commands; permitted: {OPERATOR_ENTRIES}"))
     return found
 
 
@@ -106,7 +105,7 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
     levels = commandable(config)
     if command.level not in levels:
-        why = f"no such level takes commands; levels: {', '.join(levels) or 'none'}"
+        why = f"no level of this name takes commands; levels that do: {', '.join(levels) or 'none'}"
         yield Mistake(at("level"), command.level, why)
         return
     known = levels[command.level]
@@ -123,7 +122,7 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
 
 
 def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Iterator[Mistake]:
-    """Check that there is one goal, of a form that the level takes."""
+    """Check that there is one goal, of a form that the level accepts."""
     wanted, given = known[command.said], command.goals
     what = f"{command.what} of '{command.level}'"
     if not wanted:
@@ -157,7 +156,36 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
     try:
         ranges = joint_ranges(robot, config.scene, config.clock_ns)
     except RobotError:
-        return  # a mistake of its own, reported elsewhere
+        return  # reported elsewhere
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
             yield Mistake(place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad")
+
+
+def level_of(entry: RequestEntry, layout: Layout) -> str:
+    """Return the board whose level a request addresses."""
+    return layout.mailboxes[entry[RequestWord.MAILBOX]].name.partition(".")[0]
+
+
+def message_of(entry: RequestEntry, layout: Layout) -> Message:
+    """Return a copy of a request's message, an `OPERATOR_COMMAND`."""
+    spec = layout.mailboxes[entry[RequestWord.MAILBOX]]
+    message = Message(message_dtype(spec.fields, spec.size))
+    message.raw[:] = entry.message[: spec.size]
+    return message
+
+
+def describe(message: Message) -> str:
+    """Return a command as one line: its verb and its goal."""
+    what, goal = Operation(message.what).name.lower(), message.goal
+    if goal == Goal.JOINTS:
+        return f"{what} joints {_numbers(message.joints[: message.count])}"
+    if goal == Goal.POSE:
+        return f"{what} position {_numbers(message.position)} quaternion {_numbers(message.quaternion)}"
+    if goal == Goal.DIRECTION:
+        return f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
+    return f"{what} home" if goal == Goal.HOME else what
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{value:g}" for value in values.tolist())

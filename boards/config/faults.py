@@ -1,4 +1,4 @@
-"""Fault tables against the rack that they are for: every mistake of every one at once, then the entries they make."""
+"""Fault tables checked against their rack, all mistakes at once, and made into entries of the fault table."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from rack.levels.level import Executor
 
 SEEDS = 2**31
 Steps = tuple[type, ...]
-"""Classes of steps, as `Executor.faults` names them."""
+"""Classes of steps, as in `Executor.faults`."""
 Place = str
-"""The place of a fault in a config, as in "fault[0]"; empty for a fault from elsewhere."""
+"""The place of a fault in a config, as in "fault[0]"; empty for a fault injected live."""
 
 
 def places(config: RackConfig) -> list[tuple[Place, FaultConfig]]:
@@ -36,24 +36,24 @@ def fault_mistakes(
     layout: Layout | None = None,
     unspecified: frozenset[str] = frozenset(),
 ) -> list[Mistake]:
-    """Return everything wrong with faults, given with their places.
+    """Return every mistake in faults, given with their places.
 
-    Without a layout, rules that need one are not checked. Boards in `unspecified` have mistakes of their own.
+    Without a layout, rules that need one are skipped. Boards in `unspecified` have mistakes of their own.
     """
     rules = [FaultRules(place, fault, config, layout, unspecified) for place, fault in faults]
     found = [mistake for rule in rules for mistake in rule.mistakes()]
     if len(rules) > FAULT_ENTRIES:
-        found.append(Mistake("fault", len(rules), f"too many for one run; permitted: {FAULT_ENTRIES}"))
+        found.append(Mistake("fault", len(rules), f"too many faults for one run; permitted: {FAULT_ENTRIES}"))
     return found
 
 
 def injections(config: RackConfig, layout: Layout) -> tuple[Injection, ...]:
-    """Return the entries of a config's own faults, in which `fault_mistakes` has found no mistake."""
+    """Return the entries of a config's own faults, already checked by `fault_mistakes`."""
     return tuple(_injection(fault, config, layout, place) for place, fault in places(config))
 
 
 def injection(fault: FaultConfig, config: RackConfig, layout: Layout) -> Injection:
-    """Return the entry of one fault that is not the config's. Raises `ConfigError` with every mistake."""
+    """Return the entry of a fault injected live. Raises `ConfigError` with every mistake."""
     if mistakes := fault_mistakes([("", fault)], config, layout):
         raise ConfigError(mistakes)
     return _injection(fault, config, layout, "")
@@ -77,11 +77,11 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: Pl
 
 
 def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
-    """Return the index of the mailbox; -1: every one that the task writes, or none."""
+    """Return the index of the mailbox; -1: all that the task writes, or none."""
     if fault.mailbox is None and kind.where != "bus":
         return -1
     named = (at for at, box in enumerate(layout.mailboxes) if box.name == fault.mailbox)
-    # One message is forged, in one mailbox: the first that has a reader.
+    # One message is forged, in one mailbox: by default the first that has a reader.
     own = (at for at, box in enumerate(layout.mailboxes) if box.writer == fault.board and box.readers)
     return next(own if fault.mailbox is None else named, -1)
 
@@ -93,7 +93,7 @@ def _first_tick(fault: FaultConfig, clock_ns: int) -> int:
 
 
 def _ticks(fault: FaultConfig, layout: Layout) -> int:
-    """Return the duration of a fault; 0: to the end of the run, or only once."""
+    """Return the duration of a fault; 0: until the end of the run, or it strikes once."""
     if fault.cycles is not None:
         return fault.cycles * cycle_ticks(layout, fault.board)
     return 0 if fault.lasts is None else max(1, round(fault.lasts * 1e9 / layout.clock_ns))
@@ -110,7 +110,7 @@ class FaultRules:
     unspecified: frozenset[str] = frozenset()
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield everything wrong with the fault."""
+        """Yield every mistake in the fault."""
         yield from self._once_each()
         fault = self.fault
         tasks: dict[str, Role] = {place.name: place.role for place in self.config.tasks()}
@@ -133,11 +133,11 @@ class FaultRules:
                 yield self._mistake("when", str(error.args[0]))
 
     def _once_each(self) -> Iterator[Mistake]:
-        """Begin and end are each given in one way."""
+        """Check that its begin and its end are each given in one way."""
         for keys in (("tick", "at", "when"), ("for", "cycles")):
             given = [key for key in keys if self._value(key) is not None]
             for key in given[1:]:
-                yield self._mistake(key, f"{given[0]} is given as well; permitted: one of {', '.join(keys)}")
+                yield self._mistake(key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}")
 
     def _of_kind(self, kind: Kind) -> Iterator[Mistake]:
         if kind.realtime and self.config.clock.mode == "lockstep":
@@ -145,16 +145,16 @@ class FaultRules:
             yield self._mistake("kind", why)
         for key in ("for", "cycles") if kind.once else ():
             if self._value(key) is not None:
-                yield self._mistake(key, f"{kind.name} strikes once and has no duration; leave it out")
+                yield self._mistake(key, f"{kind.name} strikes once and has no duration; remove it")
         for key in ("tick", "at", "when") if kind.where == "start" else ():
             if self._value(key) is not None:
-                yield self._mistake(key, f"{kind.name} strikes as the board starts; leave it out")
+                yield self._mistake(key, f"{kind.name} strikes as the board starts; remove it")
         if self.fault.phase and not kind.within_tick:
             takers = _listed(other.name for other in KINDS if other.within_tick)
-            yield self._mistake("phase", f"{kind.name} begins with a cycle; kinds that strike within a tick: {takers}")
+            yield self._mistake("phase", f"{kind.name} cannot strike within a tick; kinds that can: {takers}")
         if self.fault.mailbox is not None and not kind.takes_mailbox:
             takers = _listed(other.name for other in KINDS if other.takes_mailbox)
-            yield self._mistake("mailbox", f"{kind.name} does not strike mailboxes; kinds that do: {takers}")
+            yield self._mistake("mailbox", f"{kind.name} does not affect mailboxes; kinds that do: {takers}")
         yield from self._parameters(kind)
 
     def _parameters(self, kind: Kind) -> Iterator[Mistake]:
@@ -167,25 +167,27 @@ class FaultRules:
                 yield Mistake(self._at(name), _plain(value), why)
         for parameter in kind.parameters:
             if parameter.default is None and parameter.name not in self.fault.parameters:
-                yield Mistake(self._at(parameter.name), None, f"missing; {parameter.meaning}, {parameter.unit}")
+                yield Mistake(self._at(parameter.name), None, f"missing; {parameter}")
 
     def _target(self, kind: Kind, tasks: Mapping[str, Role], driving: Mapping[str, Steps]) -> Iterator[Mistake]:
-        """Check that the task can have such a fault."""
+        """Check that the task can be struck by such a fault."""
         board = self.fault.board
         if board == CLOCK:
             if "clock" not in kind.tasks:
                 kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
-                yield self._mistake("board", f"the clock cannot have {kind.name}; its kinds: {kinds}")
+                yield self._mistake("board", f"{kind.name} cannot strike the clock; kinds that can: {kinds}")
         elif kind.tasks == ("clock",):
-            yield self._mistake("board", f'{kind.name} strikes the clock; permitted: "{CLOCK}"')
+            yield self._mistake("board", f'{kind.name} strikes only the clock; permitted: "{CLOCK}"')
         elif tasks[board] not in kind.tasks:
             role = kind.tasks[0]
             fitting = _listed(name for name, other in tasks.items() if other == role)
-            yield self._mistake("board", f"{kind.name} strikes {role}s; {role}s: {fitting}")
+            yield self._mistake("board", f"{kind.name} strikes only {role}s; {role}s: {fitting}")
         elif kind.where == "arm":
             able = [name for name, steps in driving.items() if isinstance(kind.step, steps)]
             if board not in able:
-                yield self._mistake("board", f"drives nothing that can have {kind.name}; boards: {_listed(able)}")
+                yield self._mistake(
+                    "board", f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}"
+                )
         elif kind.takes_mailbox and self.layout is not None:
             yield from self._mailboxes(kind, self.layout)
 
@@ -195,21 +197,23 @@ class FaultRules:
         if wanted is not None and wanted not in written:
             yield self._mistake("mailbox", f"'{self.fault.board}' does not write it; it writes: {_listed(written)}")
         elif kind.where == "bus" and wanted is None and not any(m.readers for m in written.values()):
-            yield self._mistake("mailbox", f"missing; what '{self.fault.board}' writes has no reader")
+            yield self._mistake("mailbox", f"missing; no mailbox of '{self.fault.board}' has a reader")
         elif kind.where == "lock":
             locked = [name for name, mailbox in written.items() if mailbox.protocol == "lock"]
             if wanted not in locked if wanted is not None else not locked:
-                why = f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' with it: {_listed(locked)}"
+                why = (
+                    f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' that use it: {_listed(locked)}"
+                )
                 yield self._mistake("mailbox", why)
 
     def _driving(self) -> dict[str, Steps]:
-        """Return the classes of steps that can strike what each board's executor drives."""
+        """Return the classes of steps that can strike each board's hardware, by board."""
         found: dict[str, Steps] = {}
         for name, board in self.config.board.items():
             try:
                 found[name] = find_class(board.executor, Executor).faults
             except LookupError:
-                # A class that does not exist is a mistake of its own; this one must not hide it.
+                # The missing class is a mistake of its own; it must not cause another one here.
                 found[name] = (object,)
         return found
 
@@ -227,11 +231,11 @@ class FaultRules:
 
 
 def _range(parameter: Parameter, value: float, joints: int | None) -> str:
-    """Return why the parameter cannot have a value; empty when it can."""
+    """Return why a value is not permitted for the parameter; empty if it is."""
     most = joints - 1 if parameter.name == "joint" and joints is not None else parameter.most
     if not parameter.least <= value <= most or (parameter.is_whole and value != int(value)):
         whole = "whole numbers " if parameter.is_whole else ""
-        return f"out of range; permitted: {whole}{parameter.least:g} to {most:g}; {parameter.meaning}, {parameter.unit}"
+        return f"out of range; permitted: {whole}{parameter.least:g} to {most:g}; {parameter}"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""Config files: found by name or path, merged with all that they extend, their paths made absolute."""
+"""Config files: found by name or path, merged with the files that they extend, with absolute paths."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ EXTENDS = "configs that this file extends, by name or path, in order; its own ke
 
 
 def read(name_or_path: str | Path) -> Tables:
-    """Return the tables of a config and of all that it extends, merged.
+    """Return the tables of a config, merged with those of the files that it extends.
 
-    A name means a bundled config; text with a '/' or ending in '.toml' is a path. Raises `ConfigError`.
+    A name means a bundled config; text that contains '/' or ends in '.toml' is a path. Raises `ConfigError`.
     """
     return _read(_path(name_or_path, "config", CONFIGS), (), {})
 
 
 def with_faults(tables: Tables, name_or_path: str | Path) -> Tables:
-    """Return config tables with the faults of a script added to their own.
+    """Return config tables with the faults of a script appended.
 
     A script contains `[[fault]]` tables and nothing else. A name means a bundled script. Raises `ConfigError`.
     """
@@ -49,7 +49,7 @@ def names(folder: Path = CONFIGS) -> list[str]:
 
 
 def file_at(path: Path) -> Path | None:
-    """Return the absolute path of a file; None if there is none, or no such path can be (unknown ~user)."""
+    """Return the absolute path of a file; None if it does not exist or the path is invalid (unknown ~user)."""
     try:
         path = path.expanduser()
         return path.resolve() if path.is_file() else None
@@ -58,7 +58,7 @@ def file_at(path: Path) -> Path | None:
 
 
 def anchor(tables: Tables, folder: Path) -> Tables:
-    """Return the tables with absolute paths: relative to `folder`, for a bundled model also to configs/."""
+    """Return the tables with absolute paths, resolved from `folder`, or for a bundled model from configs/."""
     anchored = dict(tables)
     robot, own = tables.get("robot"), tables.get("python_path")
     if isinstance(robot, dict) and isinstance(robot.get("model"), str):
@@ -69,7 +69,7 @@ def anchor(tables: Tables, folder: Path) -> Tables:
 
 
 def portable(model: Path) -> str:
-    """Return a model's path as a config writes it: for a bundled one, relative to configs/."""
+    """Return a model's path as written in a config: for a bundled model, relative to configs/."""
     return model.relative_to(CONFIGS).as_posix() if model.is_relative_to(CONFIGS) else str(model)
 
 
@@ -83,14 +83,14 @@ def _path(name_or_path: str | Path, place: str, folder: Path) -> Path:
 
 
 def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tables:
-    """Return the tables of a file and of all that it extends; `known` caches them, as two may extend a third."""
+    """Return the tables of a file, merged with those that it extends; `known` caches files extended more than once."""
     if path in known:
         return known[path]
     if path in chain:
         loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
         raise ConfigError([Mistake(f"{path.name}: extends", None, f"extends itself: {loop}")])
     if len(chain) >= MAX_DEPTH:
-        why = f"too many files in a chain of extends; permitted: {MAX_DEPTH}"
+        why = f"chain of extends too long; permitted: {MAX_DEPTH} files"
         raise ConfigError([Mistake(f"{path.name}: extends", None, why)])
     own = anchor(_tables(path), path.parent)
     merged: Tables = {}
@@ -101,7 +101,7 @@ def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tab
 
 
 def _extended(base: Tables, top: Tables) -> Tables:
-    """Return a file's tables overlaid on those it extends; a [robot] with its own model replaces the arm entirely."""
+    """Return a file's tables merged over those it extends; a [robot] with its own model replaces the arm."""
     robot = top.get("robot")
     if isinstance(robot, dict) and "model" in robot:
         base = {key: value for key, value in base.items() if key != "robot"}
@@ -112,7 +112,7 @@ def _tables(path: Path) -> Tables:
     try:
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:
-            raise ConfigError([Mistake(str(path), None, f"has {size} bytes; permitted: {MAX_FILE_BYTES}")])
+            raise ConfigError([Mistake(str(path), None, f"too large, {size} bytes; permitted: {MAX_FILE_BYTES}")])
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([Mistake(str(path), None, f"cannot be read: {error}")]) from None
@@ -125,7 +125,7 @@ def _bases(extends: Any, path: Path) -> list[Path]:
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
     found = {item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) for item in extends}
     lost = [
-        Mistake(place, item, f"no such file next to {path.name} or among the bundled: {', '.join(names())}")
+        Mistake(place, item, f"no such file next to {path.name} or among the bundled configs: {', '.join(names())}")
         for item, base in found.items()
         if base is None
     ]

@@ -1,9 +1,10 @@
-"""From config to layout: every mailbox and every task of a rack, as plain data for its segment."""
+"""From a config to its layout: all mailboxes and tasks of a rack, as plain data for its segment."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,33 +25,33 @@ OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox; commands are rare."""
 MAX_SEGMENT_BYTES = 2**30
 KEPT_S = 2.0
-"""Simulated time that mailboxes and trace rings keep for a recorder: real-time boards may starve it for 1 s."""
+"""Simulated time that mailboxes and trace rings retain for a recorder, which real-time boards may starve for 1 s."""
 
 
 def obtained_core(core: int) -> int:
-    """Return the core that a task asking for `core` gets; cores that the machine lacks are shared out in turn."""
+    """Return the core for a task that requests `core`; cores that the machine lacks map to the others in turn."""
     available = sorted(os.sched_getaffinity(0))
     return core if core in available else available[core % len(available)]
 
 
 def shared_out(config: RackConfig) -> list[str]:
-    """Return one line for every core that is asked for and does not exist, for the launch to print."""
+    """Return a line for every requested core that does not exist, for the launch to print."""
     wanted: dict[int, list[str]] = {config.clock.core: [CLOCK]}
     for place in config.tasks():
         wanted.setdefault(place.core, []).append(place.name)
     available = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
     return [
-        f"core {core} is not available (available: {available}): {', '.join(tasks)} on core {obtained_core(core)}"
+        f"core {core} is not available (available: {available}): core {obtained_core(core)} runs {', '.join(tasks)}"
         for core, tasks in sorted(wanted.items())
         if obtained_core(core) != core
     ]
 
 
 class Wiring:
-    """The ports of all tasks brought together: the writer and the readers of each mailbox.
+    """The ports of all tasks, connected: the writer and the readers of each mailbox.
 
-    `mistakes` holds everything wrong with them. `broken` names tables that have mistakes of their own: nothing that
-    depends on them is checked.
+    `mistakes` holds every mistake in them. Nothing that depends on the tables in `broken`, which have mistakes of
+    their own, is checked.
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
@@ -58,7 +59,7 @@ class Wiring:
         self.mistakes: list[Mistake] = []
         self.tasks = all_ports(config, self.mistakes)
         found = {ports.task for ports in self.tasks}
-        # The mailboxes of such boards are unknown: that a reader lacks one is no mistake of the reader.
+        # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
         self._unknown = {place.board for place in config.tasks() if place.name not in found}
         self._unknown |= {place.removeprefix("board.") for place in broken}
         self._writers: dict[str, tuple[TaskPorts, MessageType]] = {}
@@ -82,7 +83,7 @@ class Wiring:
                 self._writers[mailbox] = ports, ports.outputs[port]
 
     def _check_operated(self) -> None:
-        """The clock writes an operator's mailbox, and must never wait."""
+        """Check that only the clock writes operators' mailboxes, and never waits for a lock."""
         for mailbox in self._operated:
             if mailbox in self._writers:
                 first = self._writers[mailbox][0].task
@@ -114,7 +115,7 @@ class Wiring:
                 self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
 
     def _check_params(self) -> None:
-        """Check the parameters of each board against those that its executor's and planner's classes declare."""
+        """Check each board's parameters against the declarations of its executor's and planner's classes."""
         kinds = [(ports.place.board, ports.kind.params) for ports in self.tasks if ports.kind.params is not None]
         for board, kind in dict.fromkeys(kinds):
             params = self.config.board[board].params
@@ -124,7 +125,7 @@ class Wiring:
                 self.mistakes += mistakes_of(error, kind, params, f"board.{board}.params")
 
     def _check_programs(self) -> None:
-        """Check `[task]` against the programs that the levels' classes declare."""
+        """Check `[task]` against the programs declared by the levels' classes."""
         for kind in dict.fromkeys(ports.kind.program for ports in self.tasks if ports.kind.program is not None):
             try:
                 program = kind.model_validate(self.config.task)
@@ -144,7 +145,7 @@ class Wiring:
         return ", ".join([*self._writers, *self._operated])
 
     def check_sizes(self, sizes: Mapping[str, int]) -> list[Mistake]:
-        """Return a mistake for every message that needs a size which the rack does not know."""
+        """Return a mistake for every message that needs a size unknown to the rack."""
         found = []
         for mailbox, (ports, kind) in self._writers.items():
             try:
@@ -157,8 +158,19 @@ class Wiring:
         """Return the layout of a config without mistakes."""
         tasks = tuple(self._task(ports) for ports in self.tasks)
         by_name = {task.name: task for task in tasks}
-        mailboxes = [self._mailbox(mailbox, by_name, sizes) for mailbox in self._writers]
-        mailboxes += [self._operators_mailbox(mailbox, kind) for mailbox, kind in self._operated.items()]
+        mailboxes = []
+        for name, (ports, kind) in self._writers.items():
+            writer = by_name[ports.task]
+            delay = writer.every * writer.within_cycles
+            # A reader may read as late as the end of its slice a message that was visible at its start.
+            readers = [by_name[reader] for reader in self._readers(name)]
+            slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
+            depth = depth_for(max(slowest + delay, self._kept_ticks), writer.every)
+            spec = partial(MailboxSpec, writer=writer.name, every=writer.every, delay=delay, depth=depth)
+            mailboxes.append(self._mailbox(name, kind, sizes, spec))
+        # The clock passes an operator's commands on.
+        operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
+        mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self._operated.items()]
         return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes))
 
     def _task(self, ports: TaskPorts) -> TaskSpec:
@@ -179,64 +191,41 @@ class Wiring:
     def _kept_ticks(self) -> int:
         return round(KEPT_S * 1e9 / self.config.clock_ns)
 
-    def _mailbox(self, name: str, tasks: Mapping[str, TaskSpec], sizes: Mapping[str, int]) -> MailboxSpec:
-        ports, kind = self._writers[name]
-        writer = tasks[ports.task]
-        readers = self._readers(name)
-        delay = writer.every * writer.within_cycles
-        # A reader may still read, at the end of its own slice, what was visible at its start.
-        slowest = max((tasks[reader].every * tasks[reader].within_cycles for reader in readers), default=0)
-        return MailboxSpec(
+    def _mailbox(
+        self, name: str, kind: MessageType, sizes: Mapping[str, int], spec: Callable[..., MailboxSpec]
+    ) -> MailboxSpec:
+        """Complete the record of a mailbox by its message, readers and protocol."""
+        return spec(
             name=name,
-            writer=writer.name,
-            readers=readers,
+            readers=self._readers(name),
             protocol=self._protocol(name),
-            every=writer.every,
-            delay=delay,
-            depth=depth_for(max(slowest + delay, self._kept_ticks), writer.every),
             message=kind.name,
             version=kind.version,
             size=kind.dtype(sizes).itemsize,
             fields=field_specs(kind, sizes),
         )
 
-    def _operators_mailbox(self, name: str, kind: MessageType) -> MailboxSpec:
-        """Return the mailbox in which the clock gives an operator's commands to a level."""
-        protocol = self._protocol(name)
-        return MailboxSpec(
-            name=name,
-            writer=CLOCK,
-            readers=self._readers(name),
-            # With a lock the clock would wait for its readers.
-            protocol="double-buffer" if protocol == "lock" else protocol,
-            every=1,
-            delay=1,
-            depth=OPERATOR_DEPTH,
-            message=kind.name,
-            version=kind.version,
-            size=kind.dtype({}).itemsize,
-            fields=field_specs(kind, {}),
-        )
-
     def _readers(self, mailbox: str) -> tuple[str, ...]:
         return tuple(ports.task for ports in self.tasks if mailbox in ports.reads.values())
 
     def _protocol(self, mailbox: str) -> Protocol:
-        return self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
+        protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
+        # A lock would make the clock wait for readers.
+        return "double-buffer" if protocol == "lock" and mailbox in self._operated else protocol
 
 
 def too_large(layout: Layout) -> Iterable[Mistake]:
-    """Yield a mistake for the largest mailbox of a segment beyond the permitted size."""
+    """Yield a mistake that names the largest mailbox if the segment is too large."""
     size = AddressMap(layout).size
     if size > MAX_SEGMENT_BYTES:
         box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
-        why = f"keeps {box.depth} messages for its slowest reader, which makes a segment of {size} bytes"
+        why = f"{box.depth} messages are kept for its slowest reader, so the segment needs {size} bytes"
         advice = f"permitted: {MAX_SEGMENT_BYTES}; shorten cycles or within_cycles"
         yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
 
 
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
-    """Return the fields of a message type with their offsets, shapes and numpy types, for tools that attach by name."""
+    """Return the fields of a message type with offsets, shapes and numpy types, for tools that attach by name."""
     offsets: Mapping[str, Any] = kind.dtype(sizes).fields or {}
     specs = []
     for field in kind.fields:

@@ -1,7 +1,7 @@
-"""Mistakes in the tables of a config: of each table by itself, as pydantic finds them, and between tables.
+"""Mistakes in the tables of a config: those that pydantic finds in a single table, and those between tables.
 
-Each rule yields mistakes, so that together they report every mistake at once. A rule skips what depends on a broken
-table: that table's own mistakes are reported already.
+Each rule yields its mistakes, so all are reported at once. A rule skips what depends on a broken table, whose own
+mistakes are already reported.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, R
 from rack.boards.errors import Mistake
 
 RESERVED = (CLOCK, "above", "below", "own")
-"""Names that mean something else in the wiring of ports."""
+"""Names with a special meaning in the wiring of ports."""
 PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 PLANNER_TRANSFER = ("exchange_ms", "update_ms")
 BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
-HINTS = {"robot": "; a [robot] with its own model is another arm and inherits nothing from a file that it extends"}
-"""What to know about a table that misses a key."""
+HINTS = {"robot": "; a [robot] with its own model is a different arm and inherits nothing from extended files"}
+"""Hints for tables that lack a key."""
 
 
 def mistakes_of(error: ValidationError, model: type[BaseModel], tables: Any, place: str = "") -> list[Mistake]:
-    """Return the mistakes of `tables`, which stand at `place` in the config and failed as a `model`."""
+    """Return the mistakes of `tables`, which are at `place` in the config and failed validation as `model`."""
     found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
-    # A value that may be of several types yields a mistake for each: keep the first, or the one of its item.
+    # A value that may have several types yields a mistake for each type: keep the first, or that of its item.
     first = {mistake.place: mistake for mistake in reversed(found)}
     within = {place for place in first if any(other.startswith((f"{place}[", f"{place}.")) for other in first)}
     return [first[place] for place in reversed(first) if place not in within]
@@ -43,10 +43,10 @@ def mistakes_of(error: ValidationError, model: type[BaseModel], tables: Any, pla
 def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
     keys = _keys(entry["loc"], tables, entry["type"] == "missing")
     where = (place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)).lstrip(".")
-    if entry["type"].startswith("union_tag"):  # a table of several kinds, one of whose keys says which
+    if entry["type"].startswith("union_tag"):  # a table of several kinds, selected by one key
         about = entry["ctx"]
         permitted = about.get("expected_tags", "").replace("'", "")
-        why = f"permitted: {permitted}" if permitted else "missing; it says what kind of table this is"
+        why = f"permitted: {permitted}" if permitted else "missing; it selects the kind of table"
         return Mistake(f"{where}.{about['discriminator'].strip(chr(39))}", about.get("tag"), why)
     known, field = _declared(model, keys, tables)
     meaning = f"; {field.description}" if field is not None and field.description else ""
@@ -63,7 +63,7 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
 
 
 def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int | str]:
-    """Return those keys of a location that are in the table, and a missing one: pydantic inserts names of variants."""
+    """Return the keys of a location without the names of variants that pydantic inserts."""
     keys: list[int | str] = []
     for key in loc:
         in_list = isinstance(table, list) and isinstance(key, int) and key < len(table)
@@ -74,7 +74,7 @@ def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int 
 
 
 def _declared(model: type[BaseModel], keys: list[int | str], table: Any) -> tuple[list[str], FieldInfo | None]:
-    """Return the names of all keys of the table that `keys` lead into, and the field of the last one."""
+    """Return the names of all keys of the table that contains the last of `keys`, and that key's field."""
     models, known, field, is_name = [model], dict[str, FieldInfo](), None, False
     for key in keys:
         models = [kind for kind in models if _fits(kind, table)] or models
@@ -95,7 +95,7 @@ def _declared(model: type[BaseModel], keys: list[int | str], table: Any) -> tupl
 
 
 def _fits(kind: type[BaseModel], table: Any) -> bool:
-    """Say whether a table may be of this kind: keys with few permitted values, as in do = "goto", tell kinds apart."""
+    """Say whether a table may be of this kind, judged by its keys with fixed values, as in do = "goto"."""
     fixed = {key: get_args(f.annotation) for key, f in kind.model_fields.items() if get_origin(f.annotation) is Literal}
     return isinstance(table, dict) and all(table.get(key) in values for key, values in fixed.items())
 
@@ -109,7 +109,7 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def disagreements(config: RackConfig, broken: frozenset[str] = frozenset()) -> list[Mistake]:
-    """Return every disagreement between the tables of `config`; `broken` names tables that it lacks."""
+    """Return every disagreement between the tables of `config`; `broken` names the tables missing from it."""
     boards = list(config.board.items())
     known = [*config.board, *(place.removeprefix("board.") for place in broken if place.startswith("board."))]
     found = [
@@ -138,7 +138,7 @@ def _board(name: str, board: BoardConfig, known: list[str]) -> Iterator[Mistake]
 
 
 def _circles(config: RackConfig) -> Iterator[Mistake]:
-    """Find levels that are above themselves through others: a walk from level to level would not end."""
+    """Find circles among levels: a walk from level to level would not end."""
     for key, end in (("below", "lowest"), ("above", "highest")):
         links = {name: getattr(board, key) for name, board in config.board.items()}
         seen: set[str] = set()
@@ -169,7 +169,7 @@ def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
         why = f"must be below the executor's priority, {board.priority}, with a tightly coupled planner"
         yield Mistake(f"{place}.planner_priority", board.planner_priority, why)
     if not has_planner:
-        # Nobody would notice that such a time is not counted.
+        # Otherwise such a time would be ignored silently.
         for table, keys in (("budget", PLANNER_BUDGET), ("transfer", PLANNER_TRANSFER)):
             for key in keys:
                 if value := getattr(getattr(board, table), key, None):
@@ -190,7 +190,7 @@ def _slots(config: RackConfig) -> Iterator[Mistake]:
 def _ends(config: RackConfig) -> Iterator[Mistake]:
     ending = [name for name, board in config.board.items() if board.ends_run]
     for name in ending[1:]:
-        yield Mistake(f"board.{name}.ends_run", True, f"only one board can end the run, and '{ending[0]}' does")
+        yield Mistake(f"board.{name}.ends_run", True, f"only one board can end the run; '{ending[0]}' already does")
 
 
 def _clock(config: RackConfig) -> Iterator[Mistake]:
@@ -201,7 +201,7 @@ def _clock(config: RackConfig) -> Iterator[Mistake]:
         yield Mistake("clock.speed", clock.speed, 'lockstep runs as fast as it can; speed needs mode = "realtime"')
     tick_ms = clock.period_ms / clock.speed
     if tick_ms < SHORTEST_MS:
-        why = f"makes a tick of {tick_ms:g} ms in real time; permitted: {SHORTEST_MS:g} ms or more"
+        why = f"a tick would take {tick_ms:g} ms of real time; permitted: {SHORTEST_MS:g} ms or more"
         yield Mistake("clock.speed", clock.speed, why)
 
 
@@ -209,8 +209,12 @@ def _rates(config: RackConfig) -> Iterator[Mistake]:
     for name, board in config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
-            why = "missing; give rate_hz, Hz, or every, ticks"
-            yield Mistake(place, board.rate_hz, why if board.every is None else "every is also given; permitted: one")
+            why = "missing; give rate_hz (Hz) or every (ticks)"
+            yield Mistake(
+                place,
+                board.rate_hz,
+                why if board.every is None else "every is also given; permitted: one of rate_hz, every",
+            )
             continue
         try:
             every = config.every(name)
@@ -218,11 +222,13 @@ def _rates(config: RackConfig) -> Iterator[Mistake]:
             yield Mistake(place, None, str(error))
         else:
             if every > LONGEST_EVERY:
-                yield Mistake(place, board.rate_hz, f"makes a cycle of {every} ticks; permitted: {LONGEST_EVERY}")
+                yield Mistake(
+                    place, board.rate_hz, f"a cycle would take {every} ticks; permitted: up to {LONGEST_EVERY}"
+                )
 
 
 def _polling(config: RackConfig) -> Iterator[Mistake]:
-    """Refuse a board that busy-waits on a shared core: under a real-time priority it would starve the others."""
+    """Refuse a board that busy-waits on a shared core: at a real-time priority it would starve the others."""
     cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.tasks()}
     for name, board in config.board.items():
         others = [other for other, core in cores.items() if core == board.core and other != name]

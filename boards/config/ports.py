@@ -1,7 +1,7 @@
-"""The ports of every task and the mailboxes they are wired to.
+"""The ports of all tasks and the mailboxes to which they are connected.
 
 A port's source is a mailbox, or is relative to its board: "above.command", "below.status", "own.plan". The config may
-wire a port to another mailbox.
+connect a port to another mailbox.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rack.levels.level import Executor, Input, Planner
 
 @dataclass(frozen=True)
 class TaskPorts:
-    """A task's class, and a mailbox for every port.
+    """A task's class, and the mailbox of each port.
 
     `reads` and `writes` map ports to mailboxes, `inputs` and `outputs` to message types.
     """
@@ -92,7 +92,7 @@ def _sources(
         if port in wired:
             yield port, wired[port]
         elif neighbour is not None:
-            # A neighbour that does not exist is a mistake of its own, reported by the rules.
+            # A neighbour that does not exist is reported by the rules.
             if start not in ("above", "below") or neighbour in config.board.keys() - {name}:
                 yield port, f"{neighbour}.{rest}"
         else:

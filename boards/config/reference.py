@@ -1,6 +1,6 @@
 """Every key of a config with type, unit, range, default and meaning, from the models that validate it.
 
-The tables of levels come from a config: the classes that it names declare `[task]` and `[board.<name>.params]`.
+`[task]` and `[board.<name>.params]` are declared by the levels' classes, so those tables depend on the config.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from rack.boards.faults.kind import KINDS
 UNIT = re.compile(
     r", ((?:kg m2|N s/m|N/m|N m|N|rad/s[23]?|rad|m/s|m|ms|s|Hz|ticks|cycles)(?: or (?:rad|N m))?)(?=$|[;:,])"
 )
-"""The unit in a description: after a comma, before the end or more text."""
+"""The unit in a description: between a comma and the end, or further punctuation."""
 REQUIRED = "required"
 WHOLE = "rack"
-"""Name of the table of the keys outside any table."""
+"""Name of the table for keys outside any table."""
 
 Schema = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Key:
-    """One key of a table. Empty: no unit, everything permitted, no default."""
+    """One key of a table. Empty texts: no unit, any value permitted, no default."""
 
     name: str
     type: str
@@ -43,7 +43,7 @@ class Key:
 
 @dataclass(frozen=True)
 class KeyTable:
-    """One table of a config: its name, as in "board.budget", its heading in TOML, its meaning and its keys."""
+    """One table of a config: name, as in "board.budget", TOML heading, meaning and keys."""
 
     name: str
     heading: str
@@ -52,7 +52,7 @@ class KeyTable:
 
 
 class Place(NamedTuple):
-    """Where a table stands in TOML: its keys, whether it is one of a list, and what tells it from others there."""
+    """The place of a table in TOML: its path, whether it is an item of a list, and the key that selects its variant."""
 
     path: str
     is_list: bool = False
@@ -66,7 +66,7 @@ class Place(NamedTuple):
 
 
 def key_tables(config: RackConfig) -> list[KeyTable]:
-    """Return every table that a config of these boards may have. Raises `ConfigError` for a class that is not found."""
+    """Return every table that a config of these boards may contain. Raises `ConfigError` for a missing class."""
     mistakes: list[Mistake] = []
     ports = all_ports(config, mistakes)
     if mistakes:
@@ -83,7 +83,7 @@ def key_tables(config: RackConfig) -> list[KeyTable]:
 
 
 def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
-    """Return the table called `name`, or all whose names begin with it. Raises `LookupError` with those there are."""
+    """Return the table `name`, or all whose names begin with it. Raises `LookupError` with the existing tables."""
     known = {found.name: found for found in key_tables(config)}
     wanted = name.strip("[]")
     start, _, rest = wanted.partition(".")
@@ -93,7 +93,7 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     found = [known[wanted]] if wanted in known else [t for n, t in known.items() if n.startswith(f"{wanted}.")]
     if not found:
         top = dict.fromkeys(name.partition(".")[0] for name in known)
-        raise LookupError(f"no such table; tables: {', '.join(top)}, and more that 'rack schema' lists")
+        raise LookupError(f"no such table; tables: {', '.join(top)}, and others listed by 'rack schema'")
     return found
 
 
@@ -103,7 +103,7 @@ def _tables(model: type[BaseModel], name: str, place: Place) -> Iterator[KeyTabl
 
 
 def _walk(schema: Schema, known: Schema, name: str, place: Place) -> Iterator[KeyTable]:
-    """Yield a table, then those in it."""
+    """Yield a table, then its subtables."""
     properties, required = schema.get("properties", {}), schema.get("required", ())
     inner = {key: list(_inner(entry, known, Place(key))) for key, entry in properties.items()}
     keys = [_key(key, properties[key], key in required) for key, found in inner.items() if not found]
@@ -117,7 +117,7 @@ def _walk(schema: Schema, known: Schema, name: str, place: Place) -> Iterator[Ke
 
 
 def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Place]]:
-    """Yield the tables that the value of a key at `at` may be or hold."""
+    """Yield the tables that a value may be or contain, each with its place."""
     if "$ref" in entry:
         yield known[entry["$ref"].rpartition("/")[2]], at
     for option in entry.get("anyOf", ()):
@@ -163,7 +163,7 @@ def _type_of(entry: Schema) -> str:
 
 
 def _held(entry: Schema) -> Schema | None:
-    """Return the schema of what a list or a table holds, all alike; None for others."""
+    """Return the schema of the items of a list or table of like items; None for other types."""
     places = (entry.get("items"), *entry.get("prefixItems", ()), entry.get("additionalProperties"))
     held = (*places, *entry.get("patternProperties", {}).values())
     return next((found for found in held if isinstance(found, dict)), None)
@@ -179,7 +179,7 @@ def _permitted(entry: Schema) -> str:
 
 
 def _range(entry: Schema) -> str:
-    """Return the permitted values of one type; of a list, those of its items."""
+    """Return the permitted values of a type; for a list, those of its items."""
     if values := entry.get("enum") or ([entry["const"]] if "const" in entry else []):
         return ", ".join(map(shown, values))
     if (held := _held(entry)) is not None:
@@ -208,7 +208,7 @@ def _summary(docstring: str) -> str:
 
 
 def _fault_kinds() -> Iterator[KeyTable]:
-    """Yield a table for every kind of fault that takes parameters: keys of its `[[fault]]` besides the common ones."""
+    """Yield a table for every kind of fault with parameters: the keys of its `[[fault]]` besides the common ones."""
     for kind in KINDS:
         keys = [
             Key(

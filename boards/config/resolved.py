@@ -1,6 +1,6 @@
-"""The way from TOML to a rack: `load` reads and validates the tables, `resolve` checks and wires everything, once.
+"""From TOML to a rack: `load` reads and validates the tables, `resolve` checks and wires everything, once.
 
-They are two steps because a launch imports the levels in the crate's process while `resolve` wires the config here.
+The two are separate so that at launch the crate imports the levels while this process resolves the config.
 """
 
 from __future__ import annotations
@@ -21,42 +21,41 @@ from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
-from rack.boards.config.faults import fault_mistakes, injections
+from rack.boards.config.faults import fault_mistakes, injections, places
 from rack.boards.config.files import CONFIGS, anchor, read, with_faults
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
 from rack.boards.config.ports import TaskPorts, reference
-from rack.boards.config.schema import LAST_SLOT, RackConfig
+from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import Tables, override, parse
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
-from rack.boards.operating.command import CommandConfig
 from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
 from rack.levels.level import LevelContext, Pace
 from rack.levels.tables import RobotConfig, Table
 
 LINGER_S = 0.5
-"""Simulated time that a run continues after the task's end, to see the arm at rest."""
+"""Simulated time that a run continues after the task ends, to let the arm come to rest."""
 SILENT_S = 30.0
 """Simulated time without a status after which the level that ends the run counts as dead; at least 8 of its cycles."""
 AHEAD_S = KEPT_S / 2
-"""Simulated time by which lockstep may be ahead of a recorder: half of what the rings keep."""
+"""Simulated time by which lockstep may run ahead of a recorder: half of the time that the rings retain."""
 PERMIT = (
-    "To permit it: a line '@GROUP - rtprio 99' in /etc/security/limits.conf for one of your groups, and a new login "
-    "(ulimit -r shows it); or CAP_SYS_NICE"
+    "To allow it, add the line '@GROUP - rtprio 99' for one of your groups to /etc/security/limits.conf and log in "
+    "again (ulimit -r shows the limit), or grant CAP_SYS_NICE"
 )
-"""How a user gets real-time priorities."""
+"""How a user obtains real-time priorities."""
 
 T = TypeVar("T", bound=Table)
 
 
 def load(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None) -> RackConfig:
-    """Return the config of that name or in that file, with `key.sub=value` overrides; its levels can be imported.
+    """Return a config by name or path, with `key.sub=value` overrides, and add its levels to the import path.
 
-    The faults of the script `faults`, by name or path, are added to its own. Paths in an override are relative to the
-    current folder. Raises `ConfigError` with every mistake if a table by itself is wrong; `resolve` checks the rest.
+    Faults of the script `faults`, by name or path, are appended to its own. Paths in an override are relative to the
+    current folder. Raises `ConfigError` with every mistake if a single table is wrong; `resolve` checks the rest.
     """
     tables = read(name_or_path)
     if faults is not None:
@@ -71,9 +70,8 @@ def loads(text: str) -> RackConfig:
 
 def resolve(config: RackConfig) -> Resolved:
     """Check and wire a config. Raises `ConfigError` with every mistake."""
-    faults = [(f"fault[{at}]", fault) for at, fault in enumerate(config.fault)]
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
-    examined = _Examined(config, faults, commands)
+    examined = _Examined(config, places(config), commands)
     if examined.mistakes:
         raise ConfigError(examined.mistakes)
     return examined.resolved()
@@ -91,7 +89,7 @@ def modules(config: RackConfig) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Resolved:
-    """A config, checked, and everything that follows from it: ready to launch."""
+    """A checked config with everything derived from it, ready to launch."""
 
     config: RackConfig
     layout: Layout
@@ -100,7 +98,7 @@ class Resolved:
     commands: tuple[Request, ...]
 
     def clock(self, seconds: float | None) -> ClockWiring:
-        """Return the wiring of the clock for a run of `seconds` of simulated time; None: until the task ends."""
+        """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task ends."""
         clock, tick_ns = self.config.clock, self.config.clock_ns
         return ClockWiring(
             lockstep=clock.mode == "lockstep",
@@ -120,12 +118,12 @@ class Resolved:
         return round(seconds * 1e9 / self.config.clock_ns)
 
     def _on_loss(self, board: str) -> Demand:
-        """Return what the loss of a board demands of the arm; nothing where the level below holds."""
+        """Return the demand on the arm while a board is lost; none if the level below holds."""
         return {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}[self.config.board[board].on_loss]
 
     @property
     def ends_run(self) -> str | None:
-        """The status mailbox whose state ends the run; None: no level does."""
+        """The status mailbox whose state ends the run; None: no level ends it."""
         return next((f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None)
 
     @property
@@ -134,17 +132,17 @@ class Resolved:
 
     @property
     def crate_priority(self) -> int:
-        """SCHED_FIFO priority of the crate: below that of every real-time board, above all ordinary processes."""
+        """SCHED_FIFO priority of the crate: below all real-time boards, above all ordinary processes."""
         priorities = [task.priority for task in self.layout.tasks if task.priority and task.role == "executor"]
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:
-        """Return what the launch must report: cores shared out, real-time priorities refused."""
+        """Return notes for the launch to report: cores replaced, real-time priorities refused."""
         refused = self._refused(segment)
-        return shared_out(self.config) + ([f"{refused}; misses are likely. {PERMIT}"] if refused else [])
+        return shared_out(self.config) + ([f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else [])
 
     def check_realtime(self, segment: Segment) -> None:
-        """Raise `LaunchError` if a task was refused its real-time priority and the config insists on it."""
+        """Raise `LaunchError` if a real-time priority was refused and the config requires it."""
         if self.config.clock.on_no_realtime == "refuse" and (refused := self._refused(segment)):
             raise LaunchError(f'{refused}, and clock.on_no_realtime is "refuse". {PERMIT}')
 
@@ -154,9 +152,9 @@ class Resolved:
 
 
 class _Examined:
-    """A config with everything that was found while checking it.
+    """A config with the findings of its check.
 
-    `broken` names tables that the config lacks, because of mistakes already known: what depends on them is not checked.
+    `broken` names tables that were removed for mistakes already known; nothing that depends on them is checked.
     """
 
     def __init__(
@@ -183,7 +181,7 @@ class _Examined:
         self.mistakes += command_mistakes(commands, config, boards)
 
     def resolved(self) -> Resolved:
-        """Return everything that follows from a config without mistakes."""
+        """Return everything derived from a config without mistakes."""
         config, layout = self._config, self._layout
         assert layout is not None, "no mistakes"
         faults = injections(config, layout)
@@ -217,7 +215,7 @@ class _Examined:
             within_cycles=board.within_cycles,
             clock_ns=config.clock_ns,
             seed=config.seed,
-            # The levels of a rack without an arm do not ask for one.
+            # In a rack without an arm no level uses it.
             robot=cast(RobotConfig, config.robot),
             scene=config.scene,
             task=config.task,
@@ -242,7 +240,7 @@ def _validated(tables: Tables) -> RackConfig:
 
 
 def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
-    """Yield place and table for the valid tables of a list; the mistakes of the others are known."""
+    """Yield place and table for the valid tables of a list; the mistakes of the others are already known."""
     entries = tables.get(key)
     for at, entry in enumerate(entries if isinstance(entries, list) else []):
         with suppress(ValidationError):
@@ -256,7 +254,7 @@ def _broken(error: ValidationError) -> frozenset[str]:
 
 
 def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
-    """Return a config of the tables without mistakes."""
+    """Return a config made of the tables without mistakes."""
     kept = {key: value for key, value in tables.items() if key in RackConfig.model_fields and key not in broken}
     boards = {name: table for name, table in kept.get("board", {}).items() if f"board.{name}" not in broken}
     # Stand-ins for required tables; nothing that depends on a broken table is checked.

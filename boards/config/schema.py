@@ -1,8 +1,8 @@
 """The tables of a rack's config: every key with its unit, range and meaning.
 
 `[robot]` and `[scene]` are declared in `rack.levels.robot` and `rack.levels.scene`; what `[task]` and
-`[board.<name>.params]` may hold is declared by the classes of the levels. A description names the unit after a comma:
-`rack schema` shows it in a column of its own.
+`[board.<name>.params]` may hold is declared by the classes of the levels. In a description the unit
+follows a comma; `rack schema` shows it in a separate column.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from rack.backplane.layout import Protocol, Role
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
-from rack.boards.operating.command import CommandConfig
-from rack.levels.tables import Positive, RobotConfig, SceneConfig, Table
+from rack.levels.operator import Goal, Operation
+from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
@@ -38,6 +38,7 @@ Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
+Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
@@ -48,32 +49,45 @@ LONGEST_EVERY = 1_000_000
 class ClockConfig(Table):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
-    period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False, description="one tick, ms; in whole ns")
-    mode: Mode = Field("realtime", description="realtime: ticks by time; lockstep: as soon as every task has finished")
-    speed: float = Field(
-        1.0, ge=0.001, le=1000, allow_inf_nan=False, description="simulated time per real time; 2 runs twice as fast"
+    period_ms: float = Field(
+        ge=SHORTEST_MS, le=1000, allow_inf_nan=False, description="tick period, ms; a whole number of ns"
     )
-    wake: Wake = Field("signal", description="how boards wait for their cycle: on a semaphore each, or by busy-waiting")
+    mode: Mode = Field(
+        "realtime",
+        description="realtime: ticks follow wall-clock time; lockstep: each tick comes once every task is done",
+    )
+    speed: float = Field(
+        1.0,
+        ge=0.001,
+        le=1000,
+        allow_inf_nan=False,
+        description="simulated time divided by real time; 2 runs twice as fast",
+    )
+    wake: Wake = Field(
+        "signal", description="how boards wait for their next cycle: signal: on a semaphore; poll: busy-wait"
+    )
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
     on_no_realtime: OnNoRealtime = Field(
-        "warn", description="if a SCHED_FIFO priority is refused: continue with a warning, or refuse the launch"
+        "warn", description="if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch"
     )
 
 
 class TimingConfig(Table):
     """`[timing]`: assumptions of the timing model about the processors."""
 
-    context_switch_ms: Milliseconds = Field(0.1, description="one switch between tasks (t_cs), ms; 0.1 is the paper's")
+    context_switch_ms: Milliseconds = Field(
+        0.1, description="time of one context switch (t_cs), ms; the paper takes 0.1"
+    )
     response_ms: float | None = Field(
         None,
         ge=SHORTEST_MS,
         le=1e9,
-        description="goal: the system responds within R_s of simulated time (eqs 3.2, 3.3), ms; R_max is R_s / n",
+        description="goal for the response time R_s of the system (eqs 3.2, 3.3), ms; simulated time; R_max is R_s / n",
     )
-    clock_ms: Milliseconds = Field(0.0, description="processor time of the system clock's board in one tick, ms")
+    clock_ms: Milliseconds = Field(0.0, description="processor time of the system clock's board per tick, ms")
     small_share: float = Field(
-        0.1, gt=0, le=1, description="fraction of a cycle that counts as much smaller than it (eq. 3.10)"
+        0.1, gt=0, le=1, description="largest fraction of a cycle that counts as much smaller than it (eq. 3.10)"
     )
 
 
@@ -87,12 +101,12 @@ class BudgetConfig(Table):
     plan_ms: Milliseconds = Field(0.0, description="P: plan, per plan, ms")
     update_ms: Milliseconds = Field(0.0, description="U: write the plan, per plan, ms")
     plan_within_ms: float | None = Field(
-        None, gt=0, le=1e7, description="longest acceptable time for a new plan, ms; the upper limit of within_cycles"
+        None, gt=0, le=1e7, description="longest acceptable time for a new plan, ms; an upper limit on within_cycles"
     )
 
 
 class TransferConfig(Table):
-    """`[board.<name>.transfer]`: emulates a slower bus: minimum processor times of accesses."""
+    """`[board.<name>.transfer]`: minimum processor times of bus accesses, to emulate a slower bus."""
 
     read_ms: Milliseconds = Field(0.0, description="R: the executor reads commands and statuses, per cycle, ms")
     write_ms: Milliseconds = Field(0.0, description="W: the executor writes commands and statuses, per cycle, ms")
@@ -103,17 +117,19 @@ class TransferConfig(Table):
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
-    default: Protocol = Field("time-slice", description="protocol of every mailbox not listed in mailbox")
+    default: Protocol = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
     mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
 
 
 class SupervisionConfig(Table):
-    """`[supervision]`: boards that die or hang are restarted. Once restarts are used up, the arm stays braked."""
+    """`[supervision]`: restarts of boards that die or hang. When none are left, the brakes stay engaged."""
 
-    restarts: Restarts = Field(5, description="most restarts of one task within within_s; 0: never")
-    within_s: Positive = Field(10.0, description="window of simulated time in which restarts are counted, s")
+    restarts: Restarts = Field(
+        5, description="maximum number of restarts of one task within within_s; 0: never restart"
+    )
+    within_s: Positive = Field(10.0, description="time window in which restarts are counted, s; simulated time")
     lockstep_restart_s: Positive = Field(
-        0.5, description="in lockstep, simulated time from a task's loss to its return, s; real time takes as it takes"
+        0.5, description="in lockstep, simulated time until a lost task returns, s; in real time it returns when ready"
     )
 
 
@@ -121,21 +137,23 @@ class BoardConfig(Table):
     """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
 
     slot: Slot = Field(description="slot in the crate; slot 1 is the clock's")
-    core: Core = Field(0, description="core of the board; cores that the machine lacks are shared out")
+    core: Core = Field(0, description="core of the board; if the machine lacks it, another core is used")
     rate_hz: Positive | None = Field(
-        None, ge=1e-6, description="rate of the executor, Hz; must divide the clock's; exactly one of rate_hz and every"
+        None, ge=1e-6, description="rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"
     )
     every: int | None = Field(
         None, ge=1, le=LONGEST_EVERY, description="instead of rate_hz: period of the executor, ticks"
     )
     priority: Priority = Field(0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling")
-    wake: Wake | None = Field(None, description="how this board waits for its cycle; default: clock.wake")
-    above: str | None = Field(None, description="board of the level above, whose commands are read")
-    below: str | None = Field(None, description="board of the level below, whose status is read")
+    wake: Wake | None = Field(None, description="how this board waits for its next cycle; default: clock.wake")
+    above: str | None = Field(None, description="board of the level above, whose commands this level reads")
+    below: str | None = Field(None, description="board of the level below, whose status this level reads")
     executor: ClassName = Field(description="class of the executor, package.module:Class")
     planner: ClassName | None = Field(None, description="class of the planner, package.module:Class")
-    coupling: Coupling = Field("none", description="planner on this board (tight), on its own board (loose), or none")
-    within_cycles: int = Field(1, ge=1, le=10_000, description="time that one plan may take, cycles")
+    coupling: Coupling = Field(
+        "none", description="tight: planner on this board; loose: on its own board; none: no planner"
+    )
+    within_cycles: int = Field(1, ge=1, le=10_000, description="time allowed for one plan, cycles")
     planner_slot: Slot | None = Field(None, description="slot of a loosely coupled planner")
     planner_core: Core | None = Field(None, description="core of a loosely coupled planner; default: the board's")
     planner_priority: Priority = Field(0, description="SCHED_FIFO priority of the planner; 0: ordinary scheduling")
@@ -143,21 +161,58 @@ class BoardConfig(Table):
     planner_reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the planner, likewise")
     params: dict[str, Any] = Field({}, description="parameters of the level, declared by its class")
     budget: BudgetConfig | None = Field(None, description="worst-case processor times, for the timing model")
-    transfer: TransferConfig = Field(TransferConfig(), description="a slower bus for this board")
-    ends_run: bool = Field(False, description="the run ends when this level's status is done or error")
-    restarts: Restarts | None = Field(None, description="for this board's tasks, overrides supervision.restarts")
+    transfer: TransferConfig = Field(TransferConfig(), description="emulation of a slower bus for this board")
+    ends_run: bool = Field(False, description="end the run when this level's status is done or error")
+    restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board's tasks")
     restarts_within_s: Positive | None = Field(
-        None, description="for this board's tasks, overrides supervision.within_s, s"
+        None, description="overrides supervision.within_s for this board's tasks, s"
     )
     on_loss: OnLoss = Field(
         "hold",
-        description="while this board is lost: hold: the level below holds; stop: the arm ramps to rest and brakes; "
-        "brake: it brakes at once",
+        description="while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then brakes; "
+        "brake: the arm brakes at once",
     )
 
 
+class CommandConfig(Table):
+    """`[[command]]`: one operator command to one level."""
+
+    level: str = Field(description="board whose level is commanded, as in servo or task")
+    what: Literal["hold", "resume", "setpoint", "goto"] = Field(
+        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there"
+    )
+    tick: int | None = Field(
+        None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"
+    )
+    at: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
+        None, description="instead of tick: simulated time, s"
+    )
+    joints: tuple[Finite, ...] | None = Field(None, description="goal: one position per joint, rad")
+    position: Vector | None = Field(None, description="goal: tool position, m; with quaternion or direction")
+    quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
+        None, description="goal: tool orientation as w, x, y, z"
+    )
+    direction: Vector | None = Field(
+        None, description="goal: direction of the tool's z axis, rotation about it left free; default: down"
+    )
+    home: bool = Field(False, description="goal: the arm's start position")
+
+    @property
+    def said(self) -> Operation:
+        """The operation commanded."""
+        return Operation[self.what.upper()]
+
+    @property
+    def goals(self) -> list[Goal]:
+        """The goals given; valid are one or none, depending on the operation."""
+        found = [Goal.JOINTS] if self.joints is not None else []
+        if self.position is not None or self.quaternion is not None or self.direction is not None:
+            found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
+        return [*found, Goal.HOME] if self.home else found
+
+
 class TaskPlace(NamedTuple):
-    """Where a config puts a task: slot, core as asked for, and SCHED_FIFO priority."""
+    """A task's place in the config: slot, requested core and SCHED_FIFO priority."""
 
     name: str
     board: str
@@ -173,18 +228,18 @@ class RackConfig(Table):
     name: RackName = Field(description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40")
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of all random numbers")
     python_path: tuple[Annotated[Path, Field(strict=False)], ...] = Field(
-        (), description="folders of your own levels, added to the import path; relative to the file"
+        (), description="folders with your own levels, added to the import path; relative to this file"
     )
     clock: ClockConfig = Field(description="the system clock")
     protocol: ProtocolConfig = Field(ProtocolConfig(), description="how mailboxes are shared")
     timing: TimingConfig = Field(TimingConfig(), description="assumptions of the timing model about the processors")
-    robot: RobotConfig | None = Field(None, description="the arm; only levels that need no arm run without one")
+    robot: RobotConfig | None = Field(None, description="the arm; required by levels that move one")
     scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
     task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")
     board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
-    supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of boards")
+    supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of lost boards")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
-    command: tuple[CommandConfig, ...] = Field((), description="an operator's commands, each at its tick")
+    command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at its tick")
 
     @property
     def clock_ns(self) -> int:
@@ -192,14 +247,14 @@ class RackConfig(Table):
         return round(self.clock.period_ms * 1e6)
 
     def every(self, board: str) -> int:
-        """Return the period of a board's executor, in ticks. Raises `ClockError` when off the grid."""
+        """Return the period of a board's executor, ticks. Raises `ClockError` if it is off the grid."""
         config = self.board[board]
         if config.every is not None:
             return config.every
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
     def tasks(self) -> Iterator[TaskPlace]:
-        """Yield every task in its order: each board's executor, then its planner."""
+        """Yield every task in order: each board's executor, then its planner."""
         for name, board in self.board.items():
             yield TaskPlace(name, name, "executor", board.slot, board.core, board.priority)
             if board.planner is not None:
@@ -208,8 +263,8 @@ class RackConfig(Table):
                 yield TaskPlace(f"{name}.planner", name, "planner", slot, core, board.planner_priority)
 
     def text(self) -> str:
-        """Return the config as TOML that loads again with the same meaning, by itself."""
-        # Not in JSON's mode, which knows no infinity and no NaN: a level's parameters may be such numbers.
+        """Return the config as self-contained TOML that loads to the same config."""
+        # Not in JSON mode, which lacks infinity and NaN: parameters of levels may use them.
         tables = self.model_dump(exclude_none=True, by_alias=True)
         tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:

@@ -1,4 +1,4 @@
-"""From a config to the timing model: its budgets, and the record from which the model computes."""
+"""From a config to the timing model: budgets, and the model's input record."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PARTS = tuple(field.name for field in fields(Budget))
 
 
 def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] | None = None) -> RackTiming:
-    """Return a rack as the timing model sees it, with the budgets `found`, by board, or else the config's own."""
+    """Return the timing model's record of a rack, with the budgets `found`, by board; default: the config's own."""
     found = budgets(config) if found is None else found
     goal_ms, clock_cost_ns = config.timing.response_ms, round(config.timing.clock_ms * NS_PER_MS)
     parts = (Part(Unit.PROCESS, clock_cost_ns),) if clock_cost_ns else ()
@@ -65,7 +65,7 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
 
 
 def budgets(config: RackConfig) -> dict[str, Budget]:
-    """Return the budgets that the config gives, by board; boards without one are left out."""
+    """Return the config's budgets, by board; boards without one are omitted."""
     tables = {name: board.budget for name, board in config.board.items()}
     return {
         name: Budget(**{key: round(getattr(table, f"{key.removesuffix('_ns')}_ms") * NS_PER_MS) for key in PARTS})
@@ -75,7 +75,7 @@ def budgets(config: RackConfig) -> dict[str, Budget]:
 
 
 def with_budgets(config: RackConfig, found: Mapping[str, Budget]) -> RackConfig:
-    """Return the config with these budgets, by board, and no others; each `plan_within_ms` stays."""
+    """Return the config with exactly these budgets, by board; each `plan_within_ms` is kept."""
     boards = {name: _budgeted(board, found.get(name)) for name, board in config.board.items()}
     return config.model_copy(update={"board": boards})
 

@@ -1,4 +1,4 @@
-"""TOML text: parsed within bounds, changed by `--set key.sub=value`, and written."""
+"""TOML text: parsed within limits, modified by `--set key.sub=value`, and written."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ import tomli_w
 from rack.boards.errors import ConfigError, Mistake, shown
 
 MAX_DEPTH = 32
-"""Nesting of tables and lists, and of files that extend each other."""
+"""Limit on the nesting of tables and lists, and on chains of `extends`."""
 INTEGER_BITS = 64
-"""TOML's own bound; Python's integers have none."""
+"""TOML's own limit; Python's integers have none."""
 PART = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[^."'=\s]+)"""
 SETTING = re.compile(rf"\s*({PART}(?:\s*\.\s*{PART})*)\s*=(.*)", re.DOTALL)
 """"key.sub=value"; a key that contains a dot is quoted, as in TOML: protocol.mailbox."level.plan"=lock."""
 TOO_DEEP = f"nested too deeply; permitted: {MAX_DEPTH} levels"
 TOO_LONG = f"integer too long; permitted: {INTEGER_BITS} bits"
 FREE_FORM = ("params", "task")
-"""Tables of the levels: there an empty list is a value like any other."""
+"""Tables of the levels, where an empty list is an ordinary value."""
 
 Tables = dict[str, Any]
 
 
 def parse(text: str, place: str = "config") -> Tables:
-    """Return the tables of TOML text. Raises `ConfigError` with the line that is not TOML, or a value out of bounds."""
+    """Return the tables of TOML text. Raises `ConfigError` with the invalid line, or every value out of bounds."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
     except RecursionError:
         raise ConfigError([Mistake(place, None, TOO_DEEP)]) from None
-    except ValueError:  # Python does not convert integers of thousands of digits
+    except ValueError:  # Python refuses to convert integers of thousands of digits
         raise ConfigError([Mistake(place, None, TOO_LONG)]) from None
     if mistakes := list(_out_of_bounds(tables, place)):
         raise ConfigError(mistakes)
@@ -42,7 +42,7 @@ def parse(text: str, place: str = "config") -> Tables:
 
 
 def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
-    """Yield values that TOML permits and a config does not: nesting without end, long integers, dates."""
+    """Yield mistakes that are valid TOML: deep nesting, long integers, NUL in text, dates."""
     waiting: list[tuple[str, int, Any]] = [(f"{place}: {key}", 1, value) for key, value in tables.items()]
     while waiting:
         where, depth, value = waiting.pop()
@@ -61,7 +61,7 @@ def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
-    """Return tables as TOML; empty ones are left out."""
+    """Return tables as TOML, without empty ones."""
     return tomli_w.dumps(_without_empty(tables))
 
 
@@ -77,7 +77,7 @@ def _lean(value: Any) -> Any:
 
 
 def merge(base: Tables, top: Tables) -> Tables:
-    """Return `base` overlaid with `top`, key by key."""
+    """Return `base` updated with `top`, key by key."""
     merged = dict(base)
     for key, value in top.items():
         is_table = isinstance(value, dict) and isinstance(base.get(key), dict)
@@ -88,8 +88,8 @@ def merge(base: Tables, top: Tables) -> Tables:
 def override(tables: Tables, settings: Sequence[str]) -> Tables:
     """Return the tables with each setting `key.sub=value` applied, in order.
 
-    Values are TOML; text that is not a TOML value is taken as a string. A number in a key is an index into a list,
-    as in `task.action.0.by=30`. Raises `ConfigError` with every mistake.
+    Values are TOML; any other text is taken as a string. A number in a key is an index into a list, as in
+    `task.action.0.by=30`. Raises `ConfigError` with every mistake.
     """
     mistakes: list[Mistake] = []
     for setting in settings:
@@ -131,7 +131,7 @@ def _value(text: str) -> Any:
     except tomllib.TOMLDecodeError:
         return text.strip()
     except (RecursionError, ValueError):
-        pass  # TOML, but out of bounds: `parse` says why
+        pass  # valid TOML, but out of bounds: `parse` gives the reason
     return parse(f"value = {text}")["value"]
 
 

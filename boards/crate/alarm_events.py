@@ -1,4 +1,4 @@
-"""The alarms of tasks and clock as events: with names and units, in words for people and codes for programs."""
+"""Alarms of tasks and clock as events: with names and units, as text for people and codes for programs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
+from rack.boards.config.commands import describe, level_of, message_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
-from rack.boards.faults.describe import board_of, describe_kind, joint_name, subject_of
-from rack.boards.operating.command import describe, level_of, message_of
+from rack.boards.faults.describe import board_of, joint_name, subject_of
+from rack.boards.faults.describe import describe as describe_fault
 from rack.levels.operator import Operation
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]
@@ -36,41 +37,41 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.LATCHED: "reaction",
     **dict.fromkeys(MISSES, "miss"),
 }
-"""Kind of event of each alarm; every other alarm is a detection."""
+"""The kind of event for each alarm; any other alarm is a detection."""
 TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.HANG: ("task", "'{subject}' is not responding: {releases} missed since tick {since}"),
     Alarm.REJOINED: ("task", "'{subject}' rejoined after {span}"),
     Alarm.LATE: ("task", "'{subject}' missed its deadline: still running at its next release"),
-    Alarm.PLAN_LATE: ("task", "'{subject}' missed its deadline: its plan is not finished"),
+    Alarm.PLAN_LATE: ("task", "'{subject}' missed its deadline: its plan was not finished"),
     Alarm.STARVED: ("task", "'{subject}' is not getting its core: {releases} missed since tick {since}"),
     Alarm.STALE: ("mailbox", "'{subject}' is stale, {span}: its writer '{writer}' is dead or stopped"),
     Alarm.MUTE: ("mailbox", "'{subject}' is stale, {span}: '{writer}' is running but not writing"),
-    Alarm.GAP: ("mailbox", "'{subject}': {messages} lost, serials are missing"),
-    Alarm.HELD_BACK: ("mailbox", "'{subject}': a message was held back for {span}"),
-    Alarm.DISORDER: ("mailbox", "'{subject}': messages out of order, the later one is {span} older"),
+    Alarm.GAP: ("mailbox", "'{subject}': {messages} lost, gap in serials"),
+    Alarm.HELD_BACK: ("mailbox", "'{subject}': a message was delayed by {span}"),
+    Alarm.DISORDER: ("mailbox", "'{subject}': messages out of order, the last one by {span}"),
     Alarm.DAMAGED: ("mailbox", "'{subject}': a message failed its CRC"),
-    Alarm.BABBLE: ("mailbox", "'{subject}': '{writer}' writes {value:g} messages a cycle; permitted: 1"),
+    Alarm.BABBLE: ("mailbox", "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1"),
     Alarm.MASQUERADE: ("mailbox", "'{subject}': a message comes from process {value:.0f}, which is not its writer"),
     Alarm.LOCKED: ("mailbox", "'{subject}': a dead or stopped process holds the lock"),
     Alarm.CLOCK_STOPPED: ("nothing", "clock stopped: no tick for {span}"),
     Alarm.CLOCK_SKIPPED: ("nothing", "clock skipped {ticks}"),
-    Alarm.CLOCK_LATE: ("nothing", "clock late: a tick came {late_ms:.3f} ms late"),
+    Alarm.CLOCK_LATE: ("nothing", "clock late: tick {late_ms:.3f} ms late"),
     Alarm.SENSOR_RANGE: ("joint", "sensor {subject} out of range: {value:g} rad"),
     Alarm.SENSOR_STUCK: ("joint", "sensor {subject} stuck: unchanged for {value:.0f} cycles while the arm is driven"),
     Alarm.SENSOR_SILENT: ("nothing", "sensors silent: no new sample for {span}"),
     Alarm.SENSOR_MODEL: ("joint", "sensor {subject} disagrees with the model: off by {value:.3g}"),
-    Alarm.ACTUATOR: ("joint", "actuator {subject} does not follow its torque: off by {value:.3g}"),
+    Alarm.ACTUATOR: ("joint", "actuator {subject} does not produce its commanded torque: off by {value:.3g}"),
     Alarm.COMMAND_INVALID: ("joint", "rejected: torque of {subject} is NaN"),
     Alarm.COMMAND_LIMIT: ("joint", "torque of {subject} cut to its limit: {value:.3g} N m was commanded"),
     Alarm.BRAKES_OPENED: ("nothing", "brakes released after {span}"),
-    Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again, {value:.3g} rad from its estimate"),
+    Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
     Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
 }
 
 
 class RungAlarm(NamedTuple):
-    """One alarm: its code, its subject (see `Alarm`), and the event that it makes."""
+    """An alarm: its code, its subject (see `Alarm`) and its event."""
 
     alarm: Alarm
     subject: int
@@ -78,7 +79,7 @@ class RungAlarm(NamedTuple):
 
 
 class AlarmWatch:
-    """Reads all alarm rings of one rack. `lost` counts alarms that were overwritten before they were read."""
+    """Reads all alarm rings of a rack. `lost` counts alarms overwritten before they were read."""
 
     def __init__(self, segment: Segment, config: RackConfig) -> None:
         self._rings = {name: alarm_ring(segment, name) for name in (CLOCK, *(t.name for t in segment.layout.tasks))}
@@ -86,13 +87,13 @@ class AlarmWatch:
         if robot is None:
             self._events = AlarmEvents(segment)
         else:
-            # The cell is built for the first collision.
+            # The cell is built at the first collision.
             geom = partial(geom_name, robot, config.scene, config.clock_ns)
             self._events = AlarmEvents(segment, robot.joints, geom)
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:
-        """Return the alarms since the last call, in order of time."""
+        """Return the alarms since the last call, by time."""
         found = []
         for owner, ring in self._rings.items():
             if not ring.waiting:
@@ -104,7 +105,7 @@ class AlarmWatch:
 
 
 class AlarmEvents:
-    """Makes events of one rack's alarms. `joints` are the robot's; `geom` returns the name of a geom of the cell."""
+    """Turns a rack's alarms into events. `joints` are the robot's; `geom` returns the name of a geom of the cell."""
 
     def __init__(self, segment: Segment, joints: Sequence[str] = (), geom: Callable[[int], str] = str) -> None:
         self._layout, self._faults, self._operator = segment.layout, FaultTable(segment), OperatorTable(segment)
@@ -113,7 +114,7 @@ class AlarmEvents:
     def of(self, row: np.void, owner: str) -> Event:
         """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring of task `owner`.
 
-        An event's board is the finder; of a fault, the one that has it; of a return or a command, the one concerned.
+        The event's board is the one that raised the alarm; for a fault, restart or command, the one affected.
         """
         alarm, number, value = Alarm(row["code"]), int(row["subject"]), float(row["value"])
         kind, code, board, fault, since = KIND_OF.get(alarm, "detection"), alarm.name.lower(), owner, -1, row["since"]
@@ -121,16 +122,13 @@ class AlarmEvents:
             entry, fault = self._faults.entries[number], number
             subject, board = subject_of(entry, self._layout, self._joints), board_of(entry, self._layout)
             code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
-            text = f"{describe_kind(entry, self._layout, self._joints)} {code}{self._duration(entry, code)}"
+            what = describe_fault(entry, self._layout, self._joints, with_board=False)
+            text = f"{what} {code}{self._duration(entry, code)}"
         elif alarm == Alarm.COMMANDED:
             request = self._operator.entries[number]
-            board, message, kind, since = (
-                level_of(request, self._layout),
-                message_of(request, self._layout),
-                "command",
-                -1,
-            )
-            subject, code = board, Operation(message.what).name.lower()
+            subject = board = level_of(request, self._layout)
+            message, kind, since = message_of(request, self._layout), "command", -1
+            code = Operation(message.what).name.lower()
             text = f"{describe(message)} (command {value:.0f})"
         elif alarm == Alarm.DEMAND:
             subject, demand = self._task(number, EMERGENCY_STOP), Demand(int(value))
@@ -161,7 +159,7 @@ class AlarmEvents:
         return subject, text.format(**named, value=value, span=self._span(value), late_ms=value * 1e-6)
 
     def _duration(self, entry: FaultEntry, code: str) -> str:
-        """Return how long a fault that begins will last, or how often one that ends has acted."""
+        """Return the duration of a fault that begins, or how often a fault that ends has acted."""
         if code == "ends":
             return f"; acted {counting(entry[Entry.COUNT], 'time')}"
         return f", for {self._span(entry[Entry.TICKS])}" if entry[Entry.TICKS] else ""
@@ -174,7 +172,7 @@ class AlarmEvents:
 
 
 def counting(number: float, noun: str) -> str:
-    """Return a number of things, as in "1 tick" or "3 ticks"."""
+    """Return a number with its noun, as in "1 tick" or "3 ticks"."""
     text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
     return f"{text} {noun}{'' if text == '1' else 's'}"
 

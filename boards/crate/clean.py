@@ -1,4 +1,4 @@
-"""Removal of what killed racks have left behind; a rack in use is never removed."""
+"""Removal of the remains of killed racks; a rack in use is never removed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rack.backplane.words import Head
 def remove_dead(rack: str) -> bool:
     """Remove the segment of a rack that is not running; return whether there was one.
 
-    Raises `SegmentError` when its launcher lives, or it is another user's, or not a file.
+    Raises `SegmentError` if its launcher is alive, or the segment is another user's or not a file.
     """
     if rack not in racks():
         return False
@@ -24,7 +24,7 @@ def remove_dead(rack: str) -> bool:
     except SegmentError:
         if stranger(rack) is not None:
             raise
-        # Too small for a head: no process can be running it.
+        # Too small for a head, so no process can be using it.
         unlink(rack)
         return True
     try:
@@ -41,8 +41,8 @@ def _remove(segment: Segment) -> bool:
         )
     removal = ByteLock(segment, 8 * Head.MAGIC)
     try:
-        # If two programs find the same dead rack, one removes it. Without this the slower one would remove the rack
-        # that the faster one has launched under the name since.
+        # If two programs find the same dead rack, only one removes it. Otherwise the slower one would remove the rack
+        # that the faster one has meanwhile launched under the same name.
         if not removal.take() or not segment.has_its_name:
             return False
         semaphores.unlink_all(rack)
@@ -53,7 +53,7 @@ def _remove(segment: Segment) -> bool:
 
 
 def remove_own(rack: str | None = None) -> None:
-    """Remove the racks that this process has launched, or one of them, in any state."""
+    """Remove the racks launched by this process, or one of them, in any state."""
     for name in racks() if rack is None else [rack]:
         with suppress(SegmentError):
             segment = Segment.open(name)
@@ -64,7 +64,7 @@ def remove_own(rack: str | None = None) -> None:
 
 
 def clean() -> tuple[list[str], list[str], list[str]]:
-    """Remove every rack that is not running; return names removed, names in use, and a line for each foreign entry."""
+    """Remove every rack that is not running; return names removed, names in use, and a line per foreign entry."""
     removed, in_use, strange = [], [], []
     for rack in racks():
         try:

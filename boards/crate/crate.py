@@ -1,9 +1,9 @@
-"""The crate: one small process that imports what the boards need, then forks every board from itself.
+"""The crate: a small process that imports the boards' modules, then forks every board from itself.
 
-Importing numpy, MuJoCo and the planning libraries takes a second; forked boards share it. The crate stays
-single-threaded, so that forking is safe at any time, and it is the boards' parent: it reaps them, and the
-kernel kills them if it ends. Started by the Rack as `python -m rack.boards.crate.crate LINE ATTENTION`: descriptors of
-the line and of the eventfd that boards write to.
+Importing numpy, MuJoCo and the planning libraries takes a second; forked boards share the result. The crate stays
+single-threaded, so that forking is safe at any time. As the boards' parent it reaps them, and the kernel kills them if
+it ends. The Rack starts it as `python -m rack.boards.crate.crate LINE ATTENTION`: the descriptors
+of the line and of the eventfd to which boards write.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rack.boards.run.board import enter, run_clock_board, run_task_board
 from rack.boards.wiring import ClockWiring, TaskWiring
 
 LEAVE_S = 0.5
-"""Time for boards to end by themselves when the launcher is gone."""
+"""Time for boards to end by themselves after the launcher has gone."""
 
 
 class Crate:
@@ -43,7 +43,7 @@ class Crate:
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
         self._poll = select.poll()
         self._poll.register(line, select.POLLIN)
-        # The line alone does not show that the launcher is gone: a process forked by it may hold its end open.
+        # The line alone does not show that the launcher is gone: a process that it forked may hold its end open.
         self._launcher = os.pidfd_open(os.getppid())
         self._poll.register(self._launcher, select.POLLIN)
 
@@ -64,7 +64,7 @@ class Crate:
             case Preload(modules, path):
                 sys.path[:] = path
                 for name in modules:
-                    # A module that cannot be imported is a mistake in the config: the Rack reports it.
+                    # A module that cannot be imported is a mistake in the config, which the Rack reports.
                     with suppress(Exception):
                         importlib.import_module(name)
                 gc.collect()
@@ -89,7 +89,7 @@ class Crate:
         pid = os.fork()
         if pid == 0:
             self._line.close()
-            # The only way out of the child: the crate's own code must not run twice.
+            # The only exit of the child: the crate's own code must not run twice.
             status = os.EX_SOFTWARE
             try:
                 status = enter(crate, name, self._segment, board)
@@ -111,7 +111,7 @@ class Crate:
             self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
 
     def _mark_lost(self, name: str) -> int:
-        """Mark a board as dead on the backplane, for the clock and its neighbours; return the tick."""
+        """Mark a board as lost on the backplane, for the clock and the other boards; return the tick."""
         assert self._segment is not None, "boards are forked after the segment is open"
         words = self._segment.words
         tick = words[System.TICK]
@@ -132,7 +132,7 @@ class Crate:
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
     def _leave(self) -> None:
-        """End after the Rack: boards see that it is gone and end; those that do not in time are killed."""
+        """End after the Rack: boards notice that it is gone and end; those that take too long are killed."""
         self._poll.unregister(self._line)
         self._poll.unregister(self._launcher)
         deadline = time.monotonic() + LEAVE_S
@@ -149,7 +149,7 @@ class Crate:
 
 def main() -> None:
     """Serve as the crate of the Rack at the other end of the inherited socket."""
-    # Ctrl-C reaches every process of the group; how the run ends is the Rack's decision.
+    # Ctrl-C reaches every process of the group, but the Rack decides how the run ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     line, attention = (int(fd) for fd in sys.argv[1:])

@@ -1,6 +1,6 @@
-"""The Rack's check for hanging processes: one that has made no progress for much longer than its period.
+"""The Rack's check for hanging processes: those that make no progress for much longer than their period.
 
-In real time it watches the clock alone, since the clock's watchdog watches the tasks. In lockstep it watches all.
+In real time it checks the clock alone, since the clock's watchdog checks the tasks. In lockstep it checks all.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
 HEARTBEATS_MISSED = 4
-"""Cycles without progress: three gave one false trip in 24,000 at 400 Hz."""
+"""Cycles without progress that count as hanging: three gave one false alarm in 24,000 at 400 Hz."""
 LEAST_S = 2.0
-"""Least bound: the launcher is an ordinary process on a machine full of real-time ones, and may itself be late."""
+"""Smallest bound: the launcher is an ordinary process among real-time ones and may itself be late."""
 LOCKSTEP_S = 60.0
-"""Bound in lockstep, where time stands still while a plan is made."""
+"""Bound in lockstep, where time stands still during planning."""
 
 
 class Heartbeat:
-    """Watches the clock, and in lockstep the control blocks of all tasks."""
+    """Checks the clock and, in lockstep, the control blocks of all tasks."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
@@ -34,12 +34,12 @@ class Heartbeat:
         self._waited_at = -1
 
     def hanging(self) -> list[str]:
-        """Return the tasks found hanging since the last call; "clock" is the system clock."""
+        """Return the tasks newly found hanging; "clock" is the system clock."""
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
         for name, block in self._blocks.items():
-            # An idle task is alive: its newest release is finished. A lost one is known already.
+            # An idle task, whose newest release is done, is alive; a lost one is already known.
             idle = block[Block.DONE] == block[Block.RELEASED] or block[Block.LOST]
             if block[Block.DONE] != self._seen[name][0] or idle:
                 self._seen[name] = block[Block.DONE], now
@@ -53,9 +53,9 @@ class Heartbeat:
         return found
 
     def _clock_is_stuck(self) -> bool:
-        """Say whether a silent clock is stopped, dead, or waiting; one that could run is only starved."""
+        """Say whether a silent clock is stopped, dead or waiting; one that is runnable is merely starved."""
         state, tick = state_of(self._words[System.CLOCK_PID]), self._seen[CLOCK][0]
-        # Seen twice: after a pause of the whole machine it is about to be woken.
+        # Must be seen twice: after a pause of the whole machine the clock is about to be woken.
         waits = state in WAITING
         is_stuck = state in STOPPED + GONE or (waits and self._waited_at == tick)
         self._waited_at = tick if waits else -1

@@ -1,14 +1,14 @@
-"""Other racks on this machine, and the cores that their real-time boards hold.
+"""Other racks on this machine, and the cores occupied by their real-time boards.
 
 Two real-time boards on one core starve each other, and each rack sees only its own lateness. Racks in lockstep and
-tasks of ordinary scheduling hold no core: they wait.
+tasks at ordinary priority occupy no core: they can wait.
 """
 
 from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rack.backplane.address_map import CLOCK
@@ -21,19 +21,19 @@ from rack.boards.config.schema import RackConfig
 
 @dataclass(frozen=True)
 class Holder:
-    """A rack that holds a core, and its tasks there."""
+    """A rack that occupies a core, and its tasks there."""
 
     rack: str
     launcher: int
     tasks: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the holder in words."""
-        return f"rack '{self.rack}' (process {self.launcher}) runs {', '.join(self.tasks)} there at real-time priority"
+        """Return the holder as text."""
+        return f"rack '{self.rack}' (process {self.launcher}) runs {', '.join(self.tasks)} on it at real-time priority"
 
 
 def holders(own: str) -> dict[int, Holder]:
-    """Return the holder of each core, except the rack called `own`."""
+    """Return the holder of each core, ignoring the rack `own`."""
     found: dict[int, Holder] = {}
     for name in racks():
         if name == own:
@@ -56,16 +56,16 @@ def _held(segment: Segment) -> dict[int, list[str]]:
     for task in segment.layout.tasks:
         if segment.block(task.name)[Block.PRIORITY]:
             held.setdefault(task.core, []).append(task.name)
-    # Another version of this program may have made the segment: its config is not validated here.
+    # Another version of this program may have created the segment, so its config is not validated here.
     clock = tomllib.loads(segment.config).get("clock", {})
-    # If a board was refused its priority, so was the clock.
+    # If the boards were refused their priority, so was the clock.
     if held and clock.get("priority"):
         held.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
     return held
 
 
 def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
-    """Return the config with boards moved off held cores, unless it names their core; and a note on each move."""
+    """Return the config with boards moved off occupied cores, unless it names their core, and a note on each move."""
     free = [core for core in sorted(os.sched_getaffinity(0)) if core not in held]
     if not free or config.clock.mode == "lockstep":
         return config, []
@@ -80,20 +80,11 @@ def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, 
 
 
 def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
-    """Return a line for every core that another rack holds and a real-time task of this config asks for."""
+    """Return a line for every core that another rack occupies and a real-time task of this config requests."""
+    tasks = [(CLOCK, config.clock.core, config.clock.priority), *((t.name, t.core, t.priority) for t in config.tasks())]
     wanted: dict[int, list[str]] = {}
-    for task, core in _wanted(config):
-        wanted.setdefault(obtained_core(core), []).append(task)
+    for task, core, priority in tasks:
+        if priority:
+            wanted.setdefault(obtained_core(core), []).append(task)
     both = sorted(wanted.keys() & held.keys()) if config.clock.mode == "realtime" else []
-    return [f"core {core}, asked for by {', '.join(wanted[core])}: {held[core]}" for core in both]
-
-
-def _wanted(config: RackConfig) -> Iterator[tuple[str, int]]:
-    """Yield the real-time tasks, each with its core."""
-    if config.clock.priority:
-        yield CLOCK, config.clock.core
-    for name, board in config.board.items():
-        if board.priority:
-            yield name, board.core
-        if board.planner_priority:
-            yield f"{name}.planner", board.core if board.planner_core is None else board.planner_core
+    return [f"core {core}, requested by {', '.join(wanted[core])}: {held[core]}" for core in both]

@@ -1,4 +1,4 @@
-"""The Rack: launches the boards of a config, watches them, and ends them again."""
+"""The Rack: launches the boards of a config, supervises them, and ends them."""
 
 from __future__ import annotations
 
@@ -32,26 +32,25 @@ from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.line import CrateLine, Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
 from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.recovery import Recovery, Supervision
-from rack.boards.ending import Ending
 from rack.boards.errors import ConfigError, LaunchError, Mistake
-from rack.boards.events import Cause, Event, Journal, Outcome
+from rack.boards.events import Cause, Ending, Event, Journal, Outcome
 from rack.boards.faults.kind import KINDS
 
 LAUNCH_S = 60.0
-"""Bound of the launch: a large model with many meshes compiles for a while in every board."""
+"""Time limit of the launch: every board compiles the model, which takes a while if it is large."""
 UP = (TaskState.READY, TaskState.RUNNING)
-TO_SHARE = "stop that rack, choose other cores, or give --share"
+TO_SHARE = "stop that rack, choose other cores, or use --share"
 LEAVE_S = 2.0
 """Time for the boards to end by themselves."""
 STOP_S = 0.8
-"""Time for the clock to end the run after a stop request; then the Rack ends it."""
+"""Time for the clock to end the run after a stop request, before the Rack does so."""
 
 
 class Rack:
     """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
 
-    `on_event` is called with every `Event`, in the process of the caller. Without `share`, a launch is refused if
-    another rack's real-time boards hold a core that this one asks for.
+    `on_event` is called with every `Event`, in the caller's process. Without `share`, a launch is refused if another
+    rack's real-time boards occupy a core that this one requests.
     """
 
     def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None, share: bool = True) -> None:
@@ -87,10 +86,10 @@ class Rack:
         self.close()
 
     def launch(self) -> None:
-        """Power on every board but the clock, and wait until all have passed their self-tests.
+        """Power on every board except the clock, and wait until all have passed their self-tests.
 
-        Raises `ConfigError` for a config or cores that cannot be used, `SegmentError` when the name is in use, and
-        `LaunchError` when a board fails; in each case nothing is left behind.
+        Raises `ConfigError` for an invalid config or occupied cores, `SegmentError` if the name is in use, and
+        `LaunchError` if a board fails; in each case nothing is left behind.
         """
         try:
             self._power_on()
@@ -105,7 +104,7 @@ class Rack:
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
         self._crate = crate = CrateLine()
-        # The crate imports while the config is being wired: on two cores this saves half a second.
+        # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
         crate.send(Preload(modules(self.config), tuple(sys.path)))
         self._plan = plan = resolve(self.config)
         remove_dead(self.config.name)
@@ -115,7 +114,7 @@ class Rack:
         crate.send(Open(self.config.name, plan.crate_priority))
         self._journal.add("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
         self._expect(Opened)
-        # The crate has them open and every board inherits them: without names nothing can be left behind.
+        # The crate has them open and every board inherits them. Without names nothing can be left behind.
         semaphores.unlink(plan.layout)
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
@@ -127,7 +126,7 @@ class Rack:
 
     def _set_words(self) -> None:
         words, clock = self.segment.words, self.config.clock
-        # The latch starts set: until it is reset, the arm's brakes stay engaged.
+        # The latch is set at first: until it is reset, the brakes stay engaged.
         words[System.EMERGENCY_STOP] = 1
         words[System.LOCKSTEP] = clock.mode == "lockstep"
         words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
@@ -153,7 +152,7 @@ class Rack:
             desk.add(wanted)
 
     def start(self, seconds: float | None = None) -> None:
-        """Power on the clock: the run begins. It lasts `seconds` of simulated time, or until the task ends."""
+        """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until the task ends."""
         clock = self._plan.clock(seconds)
         self._ending = Ending(self.segment, clock.ends_run, clock.silent)
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
@@ -166,13 +165,13 @@ class Rack:
         self._journal.add("start", CLOCK, self.config.clock.mode)
 
     def _reset_latch(self) -> None:
-        """Reset the emergency stop on behalf of the caller, as soon as every input is good."""
+        """Reset the emergency stop on behalf of the caller, as soon as all inputs permit it."""
         with suppress(EmergencyStopError):
             UtilityLines(self.segment).reset_emergency_stop()
             self._is_armed = True
 
     def run(self, seconds: float | None = None) -> Outcome:
-        """Run for `seconds` of simulated time, or until the task ends; return how it ended."""
+        """Run for `seconds` of simulated time, or until the task ends; return the outcome."""
         self.start(seconds)
         while self.watch(0.5):
             continue
@@ -180,7 +179,7 @@ class Rack:
         return self.outcome
 
     def watch(self, timeout_s: float) -> bool:
-        """Watch the boards for that long or until the run is over; False when it is over."""
+        """Supervise the boards for `timeout_s` or until the run is over; return False when it is over."""
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
             self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
@@ -203,7 +202,7 @@ class Rack:
         return self.outcome is None
 
     def stop(self, why: str) -> None:
-        """End the run at the next tick. May be called at any moment, even by a signal handler."""
+        """End the run at the next tick. May be called at any time, even from a signal handler."""
         self._why_stopped = self._why_stopped or why
         self._cause = self._cause or "stopped"
         self.segment.words[System.STOP_REQUEST] = 1
@@ -215,16 +214,16 @@ class Rack:
             self._journal.add("stop", "", self._why_stopped)
 
     def command(self, level: str, what: str, tick: int | None = None, **goal: object) -> RequestEntry:
-        """Issue an operator's command to a level, at `tick` or at once; return its entry in the operator table.
+        """Issue an operator command to a level, at `tick` or at once; return its entry in the operator table.
 
         `what` and `goal` are as in a `[[command]]` table: `rack.command("servo", "setpoint", joints=(...))`. Raises
-        `ConfigError` with every mistake, `OperatorTableError` when too many wait.
+        `ConfigError` with every mistake, `OperatorTableError` if too many are pending.
         """
         wanted = asked({"level": level, "what": what, "tick": tick, **goal})
         return OperatorTable(self.segment).add(request(wanted, self.config, self._plan.layout))
 
     def _listen(self, timeout_s: float) -> None:
-        """Wait for the crate or an alarm, at most that long."""
+        """Wait for the crate or an alarm, at most `timeout_s`."""
         line, attention = self._line.line, self._line.attention
         for ready in wait([line, attention], timeout_s):
             if ready == attention:
@@ -250,17 +249,17 @@ class Rack:
                 self._give_up("crate", text)
 
     def _act_on(self, rung: RungAlarm) -> None:
-        """Record the event of an alarm, and act where the Rack must."""
+        """Record the event of an alarm, and kill a process that hangs."""
         self._journal.keep(rung.event)
         if rung.alarm == Alarm.HANG:
             self._recovery.end_hanging(self._plan.layout.tasks[rung.subject].name)
         elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self._pids.get(CLOCK):
-            # Only the clock that was meant: by now another one may have begun.
+            # Only the clock that was reported: its successor may be running by now.
             self._recovery.end_hanging(CLOCK)
 
     def _expect(self, kind: type) -> None:
         if not self._line.line.poll(LAUNCH_S) or not isinstance(self._line.receive(), kind):
-            late = f"the crate did not open the segment in {LAUNCH_S:g} s"
+            late = f"the crate did not open the segment within {LAUNCH_S:g} s"
             raise LaunchError("\n".join(self._line.printed()) or late)
 
     def _lose(self, end: Ended) -> None:
@@ -273,7 +272,7 @@ class Rack:
         restart = self._recovery.lose(end.name, end.tick)
         if restart is None:
             self._is_beyond_help = end.name == CLOCK
-            self._give_up(end.name, f"{text}; its restarts are used up")
+            self._give_up(end.name, f"{text}; no restarts left")
         else:
             nth = f"restart {restart.number} of at most {restart.most} in {restart.within_s:g} s"
             self._journal.add("reaction", end.name, nth, "restart")
@@ -281,16 +280,16 @@ class Rack:
     def _give_up(self, board: str, text: str) -> None:
         self._faults.append(text)
         self._cause = "board lost"
-        self._journal.add("reaction", board, f"'{board}' is given up", "given_up")
+        self._journal.add("reaction", board, f"gave up on '{board}'", "given_up")
 
     def _end(self) -> None:
-        """Record the end of the run: cause, ticks and digest; then let the boards end."""
+        """Record the end of the run (cause, ticks, digest) and let the boards end."""
         for rung in self._alarms.drain():
             self._journal.keep(rung.event)
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
         state, reason = self._ending.final_state()
-        # A stop may also come from outside, by a word in the segment.
+        # A stop may also come from another process, by a word in the segment.
         cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._ending.cause())
         if cause in ("task done", "time over"):
             self._faults += self._ending.latched()
@@ -299,7 +298,7 @@ class Rack:
         self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
 
     def close(self) -> None:
-        """End everything: afterwards no process and no segment of this rack is left."""
+        """End everything: no process and no segment of this rack is left."""
         if self._crate is None:
             return
         crate, self._crate = self._crate, None
@@ -308,16 +307,16 @@ class Rack:
                 self._end_boards()
             if self._cause == "board lost" or self._has_lost():
                 crate.ask(PowerOff())
-            # A crate that has no boards yet may still be importing for them.
+            # A crate without boards may still be importing: do not wait for it.
             crate.close(LEAVE_S if self._pids else 0)
         finally:
-            # By name: the launch may have been interrupted before the segment was known here.
+            # By name: the launch may have been interrupted before `segment` was set.
             remove_own(self.config.name)
             if hasattr(self, "segment"):
                 self.segment.close()
 
     def _has_lost(self) -> bool:
-        """Say whether a board is lost: it may not end by itself."""
+        """Say whether a board is lost, and so may not end by itself."""
         return hasattr(self, "segment") and any(self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks)
 
     def _end_boards(self) -> None:

@@ -1,4 +1,4 @@
-"""Recovery of lost boards: how often each may be restarted, in which order, and their way back."""
+"""Recovery of lost boards: the limit and the order of restarts, and the restart itself."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Restart(NamedTuple):
 
 
 class Supervision:
-    """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have the same end."""
+    """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have the same outcome."""
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self._config, self._layout = config, layout
@@ -33,7 +33,7 @@ class Supervision:
         self._rank[CLOCK] = (0, False)
 
     def admit(self, task: str, tick: int) -> Restart | None:
-        """Count one more restart of a task, lost at `tick`; None when its policy permits no more."""
+        """Count one more restart of a task, lost at `tick`; return None if no more are permitted."""
         most, within_s = self._policy(task)
         since = tick - within_s * 1e9 / self._layout.clock_ns
         recent = [at for at in self._restarts[task] if at > since]
@@ -43,11 +43,11 @@ class Supervision:
         return Restart(len(recent) + 1, most, within_s)
 
     def in_order(self, tasks: list[str]) -> list[str]:
-        """Return the tasks in the order of restart: the clock, lower levels before higher, planners last."""
+        """Return the tasks in order of restart: the clock, then lower levels before higher, executor before planner."""
         return sorted(tasks, key=lambda task: self._rank[task])
 
     def must_wait(self, task: str, absent: list[str]) -> bool:
-        """Say whether a task that this one depends on is still absent: any below it, and a planner's executor."""
+        """Say whether a task on which this one depends is still absent: any below it, or a planner's executor."""
         return any(self._rank[other] < self._rank[task] for other in absent)
 
     def _policy(self, task: str) -> tuple[int, float]:
@@ -60,7 +60,7 @@ class Supervision:
 
 
 def _rank(config: RackConfig, board: str, is_planner: bool) -> tuple[int, bool]:
-    """Return how many levels lie below a board, the clock counted."""
+    """Return the number of levels below a board, including the clock."""
     depth, below = 1, config.board[board].below
     while below is not None:
         depth, below = depth + 1, config.board[below].below
@@ -68,9 +68,9 @@ def _rank(config: RackConfig, board: str, is_planner: bool) -> tuple[int, bool]:
 
 
 class Recovery:
-    """The lost boards of one run, from their loss to their return.
+    """The lost boards of a run, from loss to return.
 
-    A board is powered on again when everything that it depends on is present; it rejoins on the clock's grid.
+    A board is powered on again once everything on which it depends is present; it rejoins on the clock's grid.
     """
 
     def __init__(
@@ -85,29 +85,26 @@ class Recovery:
         self._starting: list[str] = []
 
     def lose(self, board: str, tick: int) -> Restart | None:
-        """Schedule the restart of a board whose process has ended; None when it is given up."""
+        """Schedule the restart of a board whose process has ended; return None if it is given up."""
         self._starting = [name for name in self._starting if name != board]
         restart = self._supervision.admit(board, tick)
         if restart is not None:
             self._waiting.append(board)
         elif board != CLOCK:
-            # The clock sees this: it brakes the arm and ends the run.
+            # The clock reacts to this: it brakes the arm and ends the run.
             self._segment.block(board)[Block.STATE] = TaskState.GIVEN_UP
         return restart
 
     def end_hanging(self, board: str) -> None:
-        """Kill a board that hangs, which is then lost like any other; one that is being restarted is left alone."""
+        """Kill a hanging board, which is then lost like any other; one that is being restarted is left alone."""
         if board not in (*self._waiting, *self._starting):
             self._crate.ask(PowerOff(board))
 
     def advance(self) -> list[str]:
         """Power on the boards that are due; return them."""
         self._starting = [name for name in self._starting if self._is_absent(name)]
-        due = []
-        for board in self._supervision.in_order(self._waiting):
-            absent = [name for name in (*self._waiting, *self._starting) if name != board]
-            if not self._supervision.must_wait(board, absent):
-                due.append(board)
+        absent, in_order = [*self._waiting, *self._starting], self._supervision.in_order(self._waiting)
+        due = [board for board in in_order if not self._supervision.must_wait(board, absent)]
         for board in due:
             self._waiting.remove(board)
             self._starting.append(board)

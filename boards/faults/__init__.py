@@ -1,6 +1,6 @@
 """Faults: their kinds, one record each, and the steps that act them.
 
-`KINDS` holds the kinds that this process knows; see `rack.boards.faults.kind` for how to add one.
+`KINDS` holds the kinds known to this process; `rack.boards.faults.kind` explains how to add one.
 """
 
 import rack.boards.faults.kinds  # noqa: F401  adds the project's own kinds

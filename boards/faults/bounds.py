@@ -1,8 +1,8 @@
-"""Bounds of detection: the ticks within which a fault must be found, counted from the tick at which it first acted.
+"""Detection bounds: the ticks within which a fault must be detected, counted from the tick at which it first acts.
 
-A bound is a sum of terms. Each term has its text and computes its ticks, so that help, judge and tests have one source.
-A cycle is that of the task concerned; a planner's is its time slice. A message is delivered when it is visible, a delay
-after its release, and its reader reads next.
+A bound is a sum of terms. Each term has a text and computes its ticks: one source for help, judgement and tests.
+A cycle is that of the affected task; a planner's is its time slice. A message is delivered at its reader's first read
+after it becomes visible.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.protocols import LOCK_WAIT_S
 
 RACK_NS = 5_000_000
-"""The Rack knows of a death within this time: the kernel reports it by a pidfd."""
+"""The Rack learns of a process's death within this time, from the kernel, by pidfd."""
 MEMORY_NS = 45_000_000
-"""Real time that the kernel may take, before that, to free the memory of a killed process: up to half a millisecond a
-megabyte on a busy machine, and a planner with its libraries has 80."""
+"""Real time that the kernel may first take to free the memory of a killed process: up to 0.5 ms per megabyte on a busy
+machine, and a planner with its libraries has 80 MB."""
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
-    """Return the cycle of a task, in ticks: a planner's is its time slice, the clock's is one tick."""
+    """Return the cycle of a task, in ticks; a planner's is its time slice, the clock's one tick."""
     if board == CLOCK:
         return 1
     task = layout.task(board)
@@ -40,7 +40,7 @@ def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
 
 @dataclass(frozen=True)
 class BoundCase:
-    """One fault, as its bound depends on it. `reader` is the task that finds it; None: whichever finds it first."""
+    """The facts about a fault that decide its bound. `reader` is the task that detects it; None: the first to do so."""
 
     layout: Layout
     injection: Injection
@@ -54,14 +54,14 @@ class BoundCase:
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
-        """The mailboxes concerned that the reader reads, or that anybody reads."""
+        """The affected mailboxes that the reader reads; without a `reader`, those that any task reads."""
         at, reader = self.injection.mailbox, self.reader
         chosen = self.layout.mailboxes if at < 0 else self.layout.mailboxes[at : at + 1]
         return tuple(m for m in chosen if m.writer == self.board and (reader in m.readers if reader else m.readers))
 
     @property
     def is_planner(self) -> bool:
-        """Whether it strikes a planner, whose messages have no period."""
+        """Whether it strikes a planner, which writes at no fixed period."""
         return self.board != CLOCK and self.layout.task(self.board).role == "planner"
 
     @property
@@ -71,22 +71,22 @@ class BoundCase:
 
     @property
     def period(self) -> int:
-        """Ticks from one release of the task to the next: a planner's are within its time slice."""
+        """Ticks from one release of the task to the next; a planner has several in its time slice."""
         return 1 if self.board == CLOCK else self.layout.task(self.board).every
 
     @property
     def write(self) -> int:
-        """Ticks from one message to the next, of the slowest mailbox."""
+        """Ticks between messages in the slowest mailbox."""
         return max(mailbox.every for mailbox in self.mailboxes)
 
     @property
     def delivery(self) -> int:
-        """Ticks from a release of the writer until what it wrote has been read."""
+        """Ticks from the writer's release until its message has been read."""
         return max(mailbox.delay for mailbox in self.mailboxes) + self.read
 
     @property
     def read(self) -> int:
-        """Longest time from one read to the next: of the reader, or of the fastest reader of each mailbox."""
+        """Longest time between reads, ticks: by the reader, or by the fastest reader of each mailbox."""
         if self.reader:
             return cycle_ticks(self.layout, self.reader)
         fastest = (min(cycle_ticks(self.layout, reader) for reader in m.readers) for m in self.mailboxes)
@@ -95,7 +95,7 @@ class BoundCase:
 
 @dataclass(frozen=True)
 class Bound:
-    """A bound of detection: as text, and in ticks. `ticks` returns None where there is no bound."""
+    """A detection bound, as text and in ticks. `ticks` returns None if there is no bound."""
 
     text: str
     ticks: Callable[[BoundCase], int | None]
@@ -112,42 +112,42 @@ class Bound:
 
 
 def cycles(count: int) -> Bound:
-    """Return so many cycles of the task; none is the cycle in which it strikes."""
+    """Return a bound of `count` cycles of the task; 0 is the cycle in which the fault strikes."""
     return Bound(_counted(count, "cycle") if count else "the same cycle", lambda case: count * case.cycle)
 
 
 def clock_ticks(count: int) -> Bound:
-    """Return so many ticks."""
+    """Return a bound of `count` ticks."""
     return Bound(_counted(count, "tick"), lambda case: count)
 
 
 def writes(count: int) -> Bound:
-    """Return so many periods of the mailbox's writer."""
+    """Return a bound of `count` periods of the mailbox's writer."""
     return Bound(_counted(count, "write"), lambda case: count * case.write)
 
 
 def missing_writes(count: int) -> Bound:
-    """Return so many periods in which no message comes; a planner's messages have no period."""
+    """Return a bound of `count` periods without a message; none for a planner, which writes at no fixed period."""
     return Bound(_counted(count, "write"), lambda case: None if case.is_planner else count * case.write)
 
 
 def delayed(parameter: str) -> Bound:
-    """Return as many periods of the mailbox's writer as a parameter says."""
+    """Return a bound of as many periods of the writer as the parameter says."""
     return Bound("the delay", lambda case: int(case.parameters[parameter]) * case.write)
 
 
 def skipped(parameter: str) -> Bound:
-    """Return as many ticks as a parameter says: seen at the first tick that is not skipped."""
+    """Return a bound of as many ticks as the parameter says; the first tick that is not skipped shows the fault."""
     return Bound("the next tick", lambda case: int(case.parameters[parameter]))
 
 
 def by_rack_or(count: int) -> Bound:
-    """Return the bound of a death: at the Rack, or at a reader, whose message is then so many cycles old."""
+    """Return the bound of a death: seen by the Rack, or by a reader whose message is then `count` cycles old."""
 
     def ticks(case: BoundCase) -> int:
         return ceil(RACK_NS / case.layout.clock_ns) if case.reader is None else count * case.cycle + case.read
 
-    return Bound(f"{RACK_NS * 1e-6:g} ms by the Rack; {count} cycles + 1 read by a reader", ticks)
+    return Bound(f"{RACK_NS * 1e-6:g} ms (Rack), {count} cycles + 1 read (reader)", ticks)
 
 
 READ = Bound("1 read", lambda case: case.read)
@@ -155,8 +155,8 @@ DELIVERY = Bound("1 delivery", lambda case: case.delivery)
 SLICE = Bound("1 time slice", lambda case: case.cycle)
 RELEASE = Bound("1 cycle", lambda case: case.period)
 LOCK_WAIT = Bound("the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns))
-BY_SIZE = Bound("depends on its size", lambda case: None)
-NOT_ARMED = Bound("the rack does not arm", lambda case: None)
+BY_SIZE = Bound("depends on size", lambda case: None)
+NOT_ARMED = Bound("the launch fails", lambda case: None)
 
 
 def _counted(count: int, unit: str) -> str:

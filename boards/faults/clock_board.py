@@ -1,6 +1,6 @@
-"""Faults as the clock's board directs them: each waits, is active, and is over, at ticks.
+"""Faults as directed by the clock's board: each waits, becomes active and ends, at ticks.
 
-The board also acts the faults that no task can act itself: signals to processes, forged messages, its own ticks.
+The board itself acts the faults that no task can: signals to processes, forged messages, faults of its own ticks.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from rack.boards.faults.messages import forge
 
 OPEN = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
-"""Parts of a tick in which a phase is given."""
+"""Resolution of a phase, per tick."""
 LEAST_LATE = 0.6
-"""Least lateness of a tick that is moved, in ticks: a board calls a tick late from half a tick on."""
+"""Smallest delay of a tick, in ticks; boards call a tick late from 0.5 on."""
 
 
 class StruckRack:
-    """The rack, as the steps of the clock's board reach it.
+    """The rack as seen by the steps of the clock's board.
 
-    In lockstep a process is struck between two cycles, when it has finished its release, and the run continues when its
-    end is known: so a run repeats with its faults.
+    In lockstep a process is struck between two cycles, once it has finished its release, and the run continues once its
+    end is known. So a run with faults is repeatable.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
@@ -44,11 +44,11 @@ class StruckRack:
         self.clock = SystemClock(segment)
 
     def target(self, entry: FaultEntry) -> ReleasedTask | None:
-        """Return the task that a fault strikes; None for the clock."""
+        """Return the task that a fault strikes; None: the clock."""
         return next((task for task in self.driver.tasks if task.index == entry[Entry.TASK]), None)
 
     def send(self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals) -> bool:
-        """Send a signal to a task's process; return False when the process is not there."""
+        """Send a signal to a task's process; return False if there is no such process."""
         if task.lost_tick >= 0:
             return False
         entry.acted(tick, time.monotonic_ns())
@@ -68,9 +68,9 @@ def _nothing(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
 
 @dataclass(frozen=True)
 class ClockStep:
-    """A step of the clock's board: as the fault begins, in each of its ticks, as it ends.
+    """A step of the clock's board: as the fault begins, in each of its ticks, and as it ends.
 
-    `is_void` says whether nothing is left of a fault before its time.
+    `is_void` says whether a fault has lost its object and ends early.
     """
 
     begin: Strike = _nothing
@@ -82,7 +82,7 @@ class ClockStep:
 def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     task = rack.target(entry)
     if task is None:
-        # The clock itself: the next clock finds the entry struck.
+        # The clock kills itself: its successor finds the entry struck.
         entry.acted(tick, time.monotonic_ns())
         os.kill(os.getpid(), signal.SIGKILL)
     elif rack.send(entry, tick, task, signal.SIGKILL):
@@ -128,7 +128,7 @@ def _delay(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     entry.acted(tick, time.monotonic_ns())
     part = random.Random(entry[Entry.SEED] + tick).uniform(LEAST_LATE, entry.parameters[0])
     until = rack.clock.time_of(tick) + int(part * rack.clock.period_ns)
-    # Ticks are moved by less than a tick: the grid itself stays.
+    # A tick is delayed by less than a tick period, so the grid itself stays.
     time.sleep(max(0, until - time.monotonic_ns()) * 1e-9)
 
 
@@ -139,7 +139,7 @@ CLOCK_STOP = ClockStep(_stop_clock)
 CLOCK_SKIP = ClockStep(_skip)
 CLOCK_JITTER = ClockStep(during=_delay)
 ELSEWHERE = ClockStep()
-"""The step of a fault that another process acts."""
+"""The step of a fault that acts in another process."""
 
 
 def _step(entry: FaultEntry) -> ClockStep:
@@ -148,7 +148,7 @@ def _step(entry: FaultEntry) -> ClockStep:
 
 
 class FaultStage:
-    """Begins faults and ends them, at ticks, before anything of the tick is released.
+    """Begins and ends faults at ticks, before any task of the tick is released.
 
     In real time a fault with a phase strikes within its tick, after the releases.
     """
@@ -163,17 +163,17 @@ class FaultStage:
 
     @property
     def is_quiet(self) -> bool:
-        """True when no fault waits or is active: there is nothing to do in this tick."""
+        """Whether no fault waits or is active: nothing to do in this tick."""
         return not self._open and self._words[System.INJECTED] == self._injected
 
     def advance(self, tick: int) -> None:
-        """Begin the faults that are due at `tick`, and end those that are over."""
+        """Begin the faults due at `tick`, and end those that are over."""
         self._injected = self._words[System.INJECTED]
         self._open = self._table.staged(OPEN)
         over = [entry for entry in self._open if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)]
         due = [entry for entry in self._open if entry.stage == Stage.WAITING and self._is_due(entry, tick)]
         if over or due:
-            # Every cycle under way ends as it began, with the faults of its beginning.
+            # A running cycle finishes with the faults with which it began.
             self._rack.driver.settle()
         for entry in over:
             self._finish(entry, tick)
@@ -184,7 +184,7 @@ class FaultStage:
                 _step(entry).during(self._rack, entry, tick)
 
     def within(self, tick: int) -> None:
-        """Strike the faults that have a phase in `tick`, at their times; to be called after the releases."""
+        """Let the faults with a phase in `tick` strike at their times; call it after the releases."""
         clock = self._rack.clock
         for entry in sorted(self._phased, key=lambda e: e[Entry.PHASE]):
             at = clock.time_of(tick) + entry[Entry.PHASE] * clock.period_ns // PHASES
@@ -198,7 +198,7 @@ class FaultStage:
         return entry[Entry.UNTIL] <= tick or has_acted or _step(entry).is_void(self._rack, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
-        """Say whether a fault begins; its condition is read in every tick, so that each read sees what is new."""
+        """Say whether a fault begins. Its condition is read in every tick, so that no message is missed."""
         if entry[Entry.WHEN_BOX] < 0:
             return entry[Entry.FROM] <= tick
         box = entry[Entry.WHEN_BOX]
@@ -213,7 +213,7 @@ class FaultStage:
         words, kind = entry.words, KINDS[entry[Entry.KIND]]
         words[Entry.FROM] = tick
         lasts = entry[Entry.TICKS]
-        # A task acts such a fault in its next cycle, whenever that comes.
+        # Such a fault of a task stays active until the task's next cycle.
         is_over_at_once = kind.once and not kind.is_of_task
         words[Entry.UNTIL] = tick + 1 if is_over_at_once else tick + lasts if lasts else NEVER
         words[Entry.STAGE] = Stage.ACTIVE

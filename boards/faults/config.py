@@ -1,4 +1,4 @@
-"""`[[fault]]` tables: a fault as a user writes it, and the condition on which it begins."""
+"""`[[fault]]` tables: a fault as a user writes it, and the condition that starts it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _seconds(value: Any) -> Any:
 
 
 def _number(value: Any) -> Any:
-    """Return a switch as 0 or 1: parameters are numbers, `random = true` is 1."""
+    """Return a boolean as 0 or 1: all parameters are numbers, so `random = true` means 1."""
     return float(value) if isinstance(value, bool) else value
 
 
@@ -35,35 +35,45 @@ Seconds = Annotated[float, BeforeValidator(_seconds), Field(gt=0, le=1e6, allow_
 
 
 class FaultConfig(Table):
-    """`[[fault]]`: one fault. Any other key is a parameter of its kind, a number."""
+    """`[[fault]]`: one fault. Any other key is a numeric parameter of its kind."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     __pydantic_extra__: dict[str, Parameter]
 
     kind: str = Field(description="kind of fault; 'rack inject --help' lists the kinds")
-    board: str = Field(description="task to strike: a board, as in servo, its planner, as in servo.planner, or clock")
+    board: str = Field(description="task to strike: a board (servo), its planner (servo.planner), or clock")
     tick: int | None = Field(
-        None, ge=0, le=LAST_TICK, description="first tick; at most one of tick, at and when; without any: at the start"
+        None,
+        ge=0,
+        le=LAST_TICK,
+        description="first tick; give at most one of tick, at, when; default: the first of the run",
     )
-    at: float | None = Field(None, ge=0, le=1e9, allow_inf_nan=False, description="instead of tick: simulated time, s")
+    at: float | None = Field(
+        None, ge=0, le=1e9, allow_inf_nan=False, description="instead of tick: start in simulated time, s"
+    )
     when: str | None = Field(
-        None, description='instead of tick: once a field has a value, as in "elemental_move.status.verb == grasp"'
+        None, description='instead of tick: start once this holds, as in "elemental_move.status.verb == grasp"'
     )
     lasts: Seconds | None = Field(
-        None, alias="for", description='duration in simulated time, as in "0.5s", "20ms" or 0.5; or give cycles'
+        None, alias="for", description='duration in simulated time, as in "0.5s", "20ms" or 0.5 (s); or give cycles'
     )
     cycles: int | None = Field(None, ge=1, le=10**6, description="instead of for: duration in cycles of the task")
-    phase: float = Field(0.0, ge=0, lt=1, description="part of its first tick after which it strikes; real time only")
+    phase: float = Field(
+        0.0, ge=0, lt=1, description="fraction of the first tick that passes before it strikes; real time only"
+    )
     mailbox: str | None = Field(
-        None, description="mailbox to strike; default: all that the task writes, for masquerade the first"
+        None, description="mailbox to affect; default: all that the task writes; for masquerade, the first"
     )
     seed: int | None = Field(
-        None, ge=0, le=2**31 - 1, description="seed; default: from the rack's seed and the fault's place in the config"
+        None,
+        ge=0,
+        le=2**31 - 1,
+        description="seed of its random choices; default: derived from the rack's seed and the fault's place",
     )
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The parameters given, by name; not yet checked against the kind."""
+        """The given parameters by name, not yet checked against the kind."""
         return dict(self.__pydantic_extra__ or {})
 
 
@@ -74,7 +84,7 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
         raise LookupError('must be mailbox.field == value, as in "elemental_move.status.verb == grasp"')
     mailboxes = {mailbox.name: at for at, mailbox in enumerate(layout.mailboxes)}
     if found[1] not in mailboxes:
-        raise LookupError(f"there is no mailbox '{found[1]}'; mailboxes: {', '.join(mailboxes)}")
+        raise LookupError(f"no mailbox '{found[1]}'; mailboxes: {', '.join(mailboxes)}")
     mailbox = layout.mailboxes[mailboxes[found[1]]]
     fields = _integers(mailbox)
     if found[2] not in fields:
@@ -94,7 +104,7 @@ def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
 
 
 def _integers(mailbox: MailboxSpec) -> dict[str, FieldSpec]:
-    """Return the fields that a condition can be on: single integers."""
+    """Return the fields that a condition may test: scalar integers."""
     return {f.name: f for f in mailbox.fields if not f.fields and not f.shape and np.dtype(f.kind).kind in "iu"}
 
 

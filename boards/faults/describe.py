@@ -19,7 +19,7 @@ def board_of(entry: FaultEntry, layout: Layout) -> str:
 
 
 def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
-    """Return the mailbox or the joint that a fault is about; empty when it is about its task alone."""
+    """Return the mailbox or the joint that a fault affects; empty if it affects its task alone."""
     if entry[Entry.MAILBOX] >= 0:
         return layout.mailboxes[entry[Entry.MAILBOX]].name
     joint = KINDS[entry[Entry.KIND]].values(entry).get("joint")
@@ -27,14 +27,14 @@ def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
 
 
 def joint_name(at: int, joints: Sequence[str]) -> str:
-    """Return the name of the joint at that place; -1 is all of them."""
+    """Return the name of a joint by its index; -1 is all joints."""
     if at < 0:
         return ALL_JOINTS
     return joints[at] if at < len(joints) else f"joint {at}"
 
 
 def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
-    """Return an entry as plain data: unknown ticks are -1, an unknown `until` is None."""
+    """Return an entry as plain data. Unknown ticks are -1, an unknown `until` is None."""
     kind, stage = KINDS[entry[Entry.KIND]], entry.stage
     has_begun = stage in (Stage.ACTIVE, Stage.OVER)
     return {
@@ -53,18 +53,10 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     }
 
 
-def describe(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
-    """Return a fault as one line: its kind, target and parameters."""
-    return _text(entry, layout, joints, f" of {board_of(entry, layout)}")
-
-
-def describe_kind(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
-    """Return a fault as one line without its target: its kind and parameters."""
-    return _text(entry, layout, joints, "")
-
-
-def _text(entry: FaultEntry, layout: Layout, joints: Sequence[str], target: str) -> str:
+def describe(entry: FaultEntry, layout: Layout, joints: Sequence[str], with_board: bool = True) -> str:
+    """Return a fault as one line: its kind, board and parameters."""
     kind = KINDS[entry[Entry.KIND]]
+    target = f" of {board_of(entry, layout)}" if with_board else ""
     about = [subject_of(entry, layout, joints)]
     for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
         if parameter.name != "joint":

@@ -1,10 +1,10 @@
-"""A kind of fault is one record, `Kind`. Help, check, injection, judgement and campaigns all read this record alone.
+"""A kind of fault is one record, `Kind`: help, checks, injection, judgement and campaigns use nothing else.
 
 The project's own kinds are in `rack.boards.faults.kinds`. A level's author adds one next to the level:
 
     KINDS.add(Kind(name="gauge-stuck", where="writer", ...))
 
-Every process of a rack imports the levels' modules, so all of them know the kind.
+Every process of a rack imports the modules of its levels, so all of them know the kind.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks
 from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
-"""The place at which a step acts. `process`, `clock`, `bus`: the clock's board, at the beginning of a tick. `load`,
-`writer`, `lock`: the task itself. `core`: another process on the task's core. `arm`: the level that drives the arm.
-`start`: the board, as it starts."""
+"""The place where a step acts. `process`, `clock`, `bus`: the clock's board, at the start of a tick. `load`, `writer`,
+`lock`: the task itself. `core`: another process on the task's core. `arm`: the level that drives the arm. `start`: the
+board, as it starts."""
 Struck = Literal["executor", "planner", "clock"]
 Died = Literal["died"]
 DIED: Died = "died"
-"""As a detection: the Rack has seen the process die."""
+"""Detection by the Rack: the process died."""
 RECOVERY_S = 0.25
-"""Simulated time after a fault within which reactions are undone, where a kind does not say otherwise."""
+"""Default time after a fault within which reactions are undone, s of simulated time."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that a kind takes: unit, range and meaning. `default` None: it must be given.
+    """A numeric parameter of a kind: unit, range and meaning. `default` None: it must be given.
 
-    Its name must not be a key of every fault: see `rack.boards.faults.config.FaultConfig`. `drawn` draws it for a
-    campaign; None: a campaign leaves it at its default.
+    Its name must not be a key of every fault: see `rack.boards.faults.config.FaultConfig`. A campaign
+    draws its value with `drawn`; None: it keeps the default.
     """
 
     name: str
@@ -52,15 +52,19 @@ class Parameter:
     is_whole: bool = False
     drawn: Draw | None = None
 
+    def __str__(self) -> str:
+        """Return its meaning, with its unit."""
+        return self.meaning if self.unit == "1" else f"{self.meaning}, {self.unit}"
+
 
 @dataclass(frozen=True)
 class Consequence:
-    """The effects of a kind besides its detection. An alarm that no fault explains in this way is a false one.
+    """The effects of a kind besides its detection. Any alarm that these do not explain is a false alarm.
 
     `own`: further alarms about the fault's task, mailboxes or joint. `arm`: alarms about any joint. `reactions`: codes
-    of events, all of which must follow. `recovery_s`: simulated time from the end of the fault, or its detection,
-    within which every reaction is undone. `ends_process`: its task's process ends, which allows for a restart as well.
-    `latches`: it may end the task with an error instead of being undone.
+    of events that must all follow. `recovery_s`: simulated time from the end of the fault, or its detection, within
+    which every reaction is undone. `ends_process`: the task's process ends; recovery includes its restart. `latches`:
+    the task may end with an error instead of recovering.
     """
 
     own: tuple[Alarm, ...] = ()
@@ -75,14 +79,14 @@ class Consequence:
 class Kind:
     """One kind of fault.
 
-    `step` is what acts, of the class that `where` asks for: a `ClockStep`, a class of `MessageStep`s, a `LoadStep`, a
-    function that a process of its own runs (`core`), a step of `rack.levels.faults` (`arm`); none for `start`.
-    `tasks` can be struck. `detected_as`: alarms, or "died", that count as its detection, within `bound`. `lasts` draws
-    how long it lasts in a campaign, in ticks.
+    `step` does the damage. Its type depends on `where`: a `ClockStep`, a subclass of `MessageStep`, a `LoadStep`, a
+    function run by a separate process (`core`), a step of `rack.levels.faults` (`arm`); `start` needs none. `tasks`
+    lists the roles that can be struck. `detected_as`: alarms, or "died", that count as its detection, within `bound`.
+    `lasts` draws its duration in a campaign, ticks.
 
-    `realtime`: it does not exist in lockstep, where time waits for every task. `once`: it strikes and is over; others
-    last for a time, or until the end of the run. `within_tick`: it can strike within a tick; others begin with a cycle.
-    `visible_from`: the value of its parameter `size` from which it must be found.
+    `realtime`: impossible in lockstep, where time waits for every task. `once`: it strikes once; other kinds last for a
+    time or until the run ends. `within_tick`: it can strike within a tick; other kinds begin with a cycle.
+    `visible_from`: the smallest value of its parameter `size` that must be detected.
     """
 
     name: str
@@ -102,22 +106,22 @@ class Kind:
 
     @property
     def number(self) -> int:
-        """The kind in the fault table: from its name alone, so that all processes agree."""
+        """Number of the kind in the fault table, derived from its name so that all processes agree."""
         return crc32(self.name.encode())
 
     @property
     def takes_mailbox(self) -> bool:
-        """Whether it is about messages: of one mailbox, or of all that the task writes."""
+        """Whether it affects messages: of one mailbox, or of all that the task writes."""
         return self.where in ("writer", "bus", "lock")
 
     @property
     def is_of_task(self) -> bool:
-        """Whether the task's own process acts it, in its cycles."""
+        """Whether it acts in the task's own process, during its cycles."""
         return self.where in ("load", "writer", "lock", "arm")
 
     @property
     def is_over_when_found(self) -> bool:
-        """Whether a fault that lasts is over when it is found, because the Rack then ends its process."""
+        """Whether detection ends a lasting fault, because the Rack then kills the process."""
         return self.consequence.ends_process and not self.once
 
     @property
@@ -132,7 +136,7 @@ class Kind:
 
     @property
     def size(self) -> Parameter | None:
-        """The parameter that decides whether the fault can be seen; None when it always can."""
+        """The parameter that decides whether the fault is detectable; None if it always is."""
         return None if self.visible_from is None else next(p for p in self.parameters if p.name == "size")
 
     def values(self, entry: FaultEntry) -> dict[str, float]:
@@ -140,10 +144,10 @@ class Kind:
         return {p.name: value for p, value in zip(self.parameters, entry.parameters, strict=False)}
 
     def bound_ticks(self, injection: Injection, layout: Layout, reader: str | None = None) -> int | None:
-        """Return the ticks from the tick at which a fault first acted to its detection; None: there is no bound.
+        """Return the bound from the tick at which a fault first acts to its detection, ticks; None: no bound.
 
-        `reader` is the task that finds it; None: whichever finds it first, for a death the Rack. A mailbox without
-        readers has no bound.
+        `reader` is the task that detects it; None: the first to do so, for a death the Rack. A mailbox without readers
+        has no bound.
         """
         given = {p.name: value for p, value in zip(self.parameters, injection.parameters, strict=False)}
         case = BoundCase(layout, injection, given, reader)
@@ -151,10 +155,10 @@ class Kind:
         return None if needs_reader and not case.mailboxes else self.bound.ticks(case)
 
     def recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
-        """Return the ticks from the end of a fault, or its detection, within which all reactions must be undone.
+        """Return the time from the end of a fault, or its detection, within which all reactions must be undone, ticks.
 
-        `restart_s`: simulated time that a restart may take. A restarted board is back at its next release; a planner's
-        executor continues when its first plan is there.
+        `restart_s`: simulated time that a restart may take. A restarted board rejoins at its next release; the executor
+        of a restarted planner continues with its first plan.
         """
         ends = self.consequence.ends_process
         cycle = cycle_ticks(layout, board) if ends and board != CLOCK else 0
@@ -165,19 +169,19 @@ UNKNOWN = Kind("unknown fault", "process", "added by a module that is not import
 
 
 class Kinds:
-    """The kinds that this process knows, in the order in which they were added."""
+    """The kinds known to this process, in the order of their addition."""
 
     def __init__(self) -> None:
         self._by_name: dict[str, Kind] = {}
         self._by_number: dict[int, Kind] = {}
 
     def add(self, *kinds: Kind) -> None:
-        """Add kinds. Raises `ValueError` for a name or number in use, or more parameters than an entry holds."""
+        """Add kinds. Raises `ValueError` for a name or number in use, or for too many parameters."""
         for kind in kinds:
             if kind.number in self._by_number:
-                raise ValueError(f"kind '{kind.name}': there is one already: '{self._by_number[kind.number].name}'")
+                raise ValueError(f"kind '{kind.name}': already taken by '{self._by_number[kind.number].name}'")
             if len(kind.parameters) > PARAMETERS:
-                raise ValueError(f"kind '{kind.name}': {len(kind.parameters)} parameters; at most {PARAMETERS}")
+                raise ValueError(f"kind '{kind.name}': {len(kind.parameters)} parameters; permitted: {PARAMETERS}")
             self._by_name[kind.name] = self._by_number[kind.number] = kind
 
     def __iter__(self) -> Iterator[Kind]:

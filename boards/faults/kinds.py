@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import bounds, clock_board, messages, tasks
 from rack.boards.faults import drawing as draw
@@ -16,22 +18,33 @@ SENSOR = Consequence(
     recovery_s=1.0,
     latches=True,
 )
-# A motor is tried again every half second: the brakes are released, and engage again within 12 cycles if it still
-# fails. An alarm about another motor is a false one.
+# A failed motor is retried every 0.5 s: the brakes are released, and engage again within 12 cycles if it still fails.
+# An alarm about any other motor is a false one.
 MOTOR = Consequence(reactions=BRAKED, recovery_s=0.6, latches=True)
 COMMAND = Consequence(reactions=BRAKED)
-# The damage may be in any word of the message's head: its serial, its ticks, its writer.
+# Any word of the message's head may be damaged: its serial, its ticks, its writer.
 DAMAGE = Consequence(own=(Alarm.GAP, Alarm.HELD_BACK, Alarm.DISORDER, Alarm.MASQUERADE, Alarm.MUTE))
 BIAS_RAD, NOISE_RAD = 0.02, 0.005
-"""Sizes from which a wrong sensor must be found."""
+"""Sensor errors of at least this size must be detected."""
+
+
+# Kinds that act in the same place, with the same consequences.
+_clock = partial(Kind, where="clock", tasks=("clock",))
+_message = partial(Kind, where="writer")
+_sensor = partial(Kind, where="arm", consequence=SENSOR)
+_motor = partial(Kind, where="arm", consequence=MOTOR)
+# The limit gate finds a bad torque in the same cycle: it never reaches the arm.
+_torque = partial(Kind, where="arm", consequence=COMMAND, bound=bounds.cycles(0), lasts=draw.seconds(0.01, 0.2))
 
 
 def _joint(drawn: draw.Draw = draw.joint, default: float = 0) -> Parameter:
-    return Parameter("joint", "1", "joint concerned, from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn)
+    return Parameter("joint", "1", "joint, counted from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn)
 
 
 def _probability(default: float, most: float) -> Parameter:
-    return Parameter("probability", "1", "of each message to be hit", default, 0.001, 1.0, drawn=draw.number(0.5, most))
+    return Parameter(
+        "probability", "1", "probability that a message is affected", default, 0.001, 1.0, drawn=draw.number(0.5, most)
+    )
 
 
 def _size(meaning: str, visible: float, least: float, most: float) -> Parameter:
@@ -42,7 +55,7 @@ KINDS.add(
     Kind(
         name="kill",
         where="process",
-        means="SIGKILL of the task's process",
+        means="SIGKILL kills the task's process",
         step=clock_board.KILL,
         tasks=("executor", "planner", "clock"),
         detected_as=(DIED,),
@@ -54,10 +67,10 @@ KINDS.add(
     Kind(
         name="hang",
         where="process",
-        means="SIGSTOP of the task's process",
+        means="SIGSTOP stops the task's process",
         step=clock_board.HANG,
         detected_as=(Alarm.HANG,),
-        # Four releases without an answer, and the release at which that is seen.
+        # Four releases missed, plus the release at which that is noticed.
         bound=bounds.cycles(4 + 1),
         consequence=DEATH,
         lasts=draw.cycles(7, 10),
@@ -66,15 +79,15 @@ KINDS.add(
     Kind(
         name="overrun",
         where="load",
-        means="the executor computes for longer",
+        means="the executor computes longer",
         step=tasks.overrun,
         tasks=("executor",),
         parameters=(
-            Parameter("by", "cycles", "additional computing time", 1.5, 0.0, 100.0, drawn=draw.number(1.2, 2.5)),
-            Parameter("random", "1", "1: uniformly between 0 and that", 0, 0, 1, is_whole=True),
+            Parameter("by", "cycles", "extra computing time", 1.5, 0.0, 100.0, drawn=draw.number(1.2, 2.5)),
+            Parameter("random", "1", "1: uniform between 0 and by; 0: always by", 0, 0, 1, is_whole=True),
         ),
         detected_as=(Alarm.LATE, Alarm.STARVED),
-        # The next release comes before the end of the cycle.
+        # The cycle is still running at its next release.
         bound=bounds.cycles(1),
         lasts=draw.cycles(1, 4),
         realtime=True,
@@ -85,7 +98,7 @@ KINDS.add(
         means="the planner exceeds its time slice",
         step=tasks.slow_plan,
         tasks=("planner",),
-        parameters=(Parameter("by", "cycles", "time beyond the slice", 2.0, 0.5, 100.0, drawn=draw.number(1.5, 4.0)),),
+        parameters=(Parameter("by", "cycles", "time beyond its slice", 2.0, 0.5, 100.0, drawn=draw.number(1.5, 4.0)),),
         detected_as=(Alarm.PLAN_LATE,),
         bound=bounds.SLICE + bounds.RELEASE,
         lasts=draw.longest(draw.cycles(3, 6), draw.seconds(1.0, 2.0)),
@@ -94,82 +107,78 @@ KINDS.add(
     Kind(
         name="hog",
         where="core",
-        means="a process of higher priority takes the board's core",
+        means="a higher-priority process takes the board's core",
         step=tasks.take_core,
         detected_as=(Alarm.STARVED,),
         bound=bounds.cycles(4 + 1),
         lasts=draw.longest(draw.cycles(7, 9), draw.seconds(0.1, 0.3)),
         realtime=True,
     ),
-    Kind(
+    _message(
         name="mute",
-        where="writer",
-        means="no message is written",
+        means="the task runs but writes no messages",
         step=messages.Mute,
         detected_as=(Alarm.MUTE,),
-        # Age alone would show after two periods, but proves nothing: the writer must have finished a release since.
+        # A message is stale after two periods, but that proves nothing until its writer has finished another release.
         bound=bounds.missing_writes(2) + bounds.READ,
         lasts=draw.silence(1.2, 2.0),
     ),
-    Kind(
+    _message(
         name="drop",
-        where="writer",
         means="messages are lost",
         step=messages.Drop,
         parameters=(_probability(0.3, 0.9),),
         detected_as=(Alarm.GAP,),
-        # The next message shows that one is missing.
+        # The next message reveals the gap in serials.
         bound=bounds.writes(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
         lasts=draw.messages(4, 8),
     ),
-    Kind(
+    _message(
         name="delay",
-        where="writer",
-        means="messages are held back",
+        means="messages are delayed",
         step=messages.Delay,
         parameters=(
-            Parameter("by", "cycles", "the writer's cycles of delay", 2, 1, 50, is_whole=True, drawn=draw.whole(1, 5)),
+            Parameter("by", "cycles", "delay, in the writer's cycles", 2, 1, 50, is_whole=True, drawn=draw.whole(1, 5)),
         ),
-        # Until the first message comes there is none.
+        # Until the first delayed message arrives, the mailbox is silent.
         detected_as=(Alarm.HELD_BACK, Alarm.MUTE),
         bound=bounds.delayed("by") + bounds.DELIVERY,
-        # The first messages on time overtake the last ones held back.
+        # Afterwards the first punctual messages overtake the last delayed ones.
         consequence=Consequence(own=(Alarm.DISORDER,)),
         lasts=draw.messages(9, 13),
     ),
-    Kind(
+    _message(
         name="reorder",
-        where="writer",
-        means="two messages change places",
+        means="consecutive messages are swapped",
         step=messages.Reorder,
         parameters=(_probability(0.3, 0.9),),
-        # The last message held back may find none to change places with.
+        # The last message may have no successor to be swapped with: it is only late.
         detected_as=(Alarm.DISORDER, Alarm.HELD_BACK),
         bound=bounds.writes(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
         lasts=draw.messages(4, 8),
     ),
-    Kind(
+    _message(
         name="corrupt",
-        where="writer",
-        means="bits of a message are flipped in its slot",
+        means="bits of a message are flipped",
         step=messages.Corrupt,
         parameters=(
             _probability(1.0, 1.0),
-            Parameter("bits", "1", "bits flipped", 3, 1, 64, is_whole=True, drawn=draw.whole(1, 16)),
+            Parameter("bits", "1", "number of bits flipped", 3, 1, 64, is_whole=True, drawn=draw.whole(1, 16)),
         ),
         detected_as=(Alarm.DAMAGED,),
         bound=bounds.DELIVERY,
         consequence=DAMAGE,
         lasts=draw.messages(4, 8),
     ),
-    Kind(
+    _message(
         name="babble",
-        where="writer",
-        means="messages are written without pause",
+        means="the task floods its mailboxes",
         step=messages.Babble,
-        parameters=(Parameter("writes", "1", "messages a cycle", 32, 3, 1000, is_whole=True, drawn=draw.whole(8, 64)),),
+        parameters=(
+            Parameter("writes", "1", "messages per cycle", 32, 3, 1000, is_whole=True, drawn=draw.whole(8, 64)),
+        ),
         detected_as=(Alarm.BABBLE,),
         bound=bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP)),
@@ -178,7 +187,7 @@ KINDS.add(
     Kind(
         name="masquerade",
         where="bus",
-        means="a second writer forges a message",
+        means="another process forges a message",
         step=clock_board.MASQUERADE,
         detected_as=(Alarm.MASQUERADE,),
         bound=bounds.DELIVERY,
@@ -189,7 +198,7 @@ KINDS.add(
     Kind(
         name="lock-held",
         where="lock",
-        means="the holder of a lock is stopped or killed",
+        means="the task is stopped or killed while it holds a lock",
         step=messages.HoldLock,
         parameters=(Parameter("killed", "1", "1: killed; 0: stopped", 0, 0, 1, is_whole=True, drawn=draw.whole(0, 1)),),
         detected_as=(Alarm.LOCKED, DIED),
@@ -198,12 +207,10 @@ KINDS.add(
         realtime=True,
         once=True,
     ),
-    Kind(
+    _clock(
         name="clock-stop",
-        where="clock",
-        means="SIGSTOP of the clock's process",
+        means="SIGSTOP stops the clock's process",
         step=clock_board.CLOCK_STOP,
-        tasks=("clock",),
         detected_as=(Alarm.CLOCK_STOPPED,),
         bound=bounds.clock_ticks(3),
         consequence=Consequence(reactions=("restart",), ends_process=True),
@@ -212,26 +219,30 @@ KINDS.add(
         once=True,
         within_tick=True,
     ),
-    Kind(
+    _clock(
         name="clock-skip",
-        where="clock",
-        means="ticks are skipped",
+        means="the clock skips ticks",
         step=clock_board.CLOCK_SKIP,
-        tasks=("clock",),
-        parameters=(Parameter("ticks", "ticks", "how many", 1, 1, 20, is_whole=True, drawn=draw.whole(1, 20)),),
+        parameters=(
+            Parameter("ticks", "ticks", "number of ticks skipped", 1, 1, 20, is_whole=True, drawn=draw.whole(1, 20)),
+        ),
         detected_as=(Alarm.CLOCK_SKIPPED,),
         bound=bounds.skipped("ticks"),
         once=True,
     ),
-    Kind(
+    _clock(
         name="clock-jitter",
-        where="clock",
-        means="ticks are late",
+        means="the clock ticks late",
         step=clock_board.CLOCK_JITTER,
-        tasks=("clock",),
         parameters=(
             Parameter(
-                "late", "ticks", "largest lateness; at least 0.6", 0.9, 0.65, 0.95, drawn=draw.number(0.75, 0.95)
+                "late",
+                "ticks",
+                "largest delay of a tick; the smallest is 0.6",
+                0.9,
+                0.65,
+                0.95,
+                drawn=draw.number(0.75, 0.95),
             ),
         ),
         detected_as=(Alarm.CLOCK_LATE,),
@@ -239,123 +250,100 @@ KINDS.add(
         lasts=draw.seconds(0.2, 0.6),
         realtime=True,
     ),
-    Kind(
+    _sensor(
         name="sensor-nan",
-        where="arm",
-        means="a position is NaN",
+        means="a joint position is NaN",
         step=arm.SensorStep(arm.position_nan),
         parameters=(_joint(),),
         detected_as=(Alarm.SENSOR_RANGE,),
         bound=bounds.cycles(1),
-        consequence=SENSOR,
         lasts=draw.seconds(0.02, 0.3),
     ),
-    Kind(
+    _sensor(
         name="sensor-stuck",
-        where="arm",
-        means="position and velocity do not change",
+        means="joint position and velocity freeze",
         step=arm.SensorStep(arm.sample_stuck),
-        # A joint at rest does not show that its sensor is stuck: in some faults all are stuck, for long enough.
+        # A stuck sensor does not show on a joint at rest, so some draws freeze all joints for long enough.
         parameters=(_joint(draw.joint_or_all),),
-        # Torques that move a joint whose velocity does not change look like a motor that gives nothing.
+        # A joint that is driven but shows no velocity looks like one whose motor produces no torque.
         detected_as=(Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL, Alarm.ACTUATOR),
         bound=bounds.cycles(20),
-        consequence=SENSOR,
         lasts=draw.seconds(0.5, 1.5),
     ),
-    Kind(
+    _sensor(
         name="sensor-dropout",
-        where="arm",
-        means="no new sample comes",
+        means="no new samples arrive",
         step=arm.SensorStep(arm.sample_missing),
         detected_as=(Alarm.SENSOR_SILENT,),
         bound=bounds.cycles(2),
-        consequence=SENSOR,
         lasts=draw.seconds(0.02, 0.3),
     ),
-    Kind(
+    _sensor(
         name="sensor-bias",
-        where="arm",
-        means="a position has an offset",
+        means="a joint position has an offset",
         step=arm.SensorStep(arm.position_biased),
-        parameters=(_joint(), _size("the offset", BIAS_RAD, 1e-5, 3.0)),
+        parameters=(_joint(), _size("offset", BIAS_RAD, 1e-5, 3.0)),
         detected_as=(Alarm.SENSOR_MODEL,),
         bound=bounds.BY_SIZE,
-        consequence=SENSOR,
         lasts=draw.seconds(0.1, 0.5),
         visible_from=BIAS_RAD,
     ),
-    Kind(
+    _sensor(
         name="sensor-noise",
-        where="arm",
-        means="a position has noise",
+        means="a joint position is noisy",
         step=arm.SensorStep(arm.position_noisy),
         parameters=(_joint(), _size("standard deviation", NOISE_RAD, 1e-6, 1.0)),
         detected_as=(Alarm.SENSOR_MODEL,),
         bound=bounds.BY_SIZE,
-        consequence=SENSOR,
         lasts=draw.seconds(0.1, 0.5),
         visible_from=NOISE_RAD,
     ),
-    Kind(
+    _motor(
         name="actuator-off",
-        where="arm",
-        means="a motor gives no torque",
+        means="a motor produces no torque",
         step=arm.MotorStep(lambda fault: 0.0),
         parameters=(_joint(default=1),),
         detected_as=(Alarm.ACTUATOR,),
         bound=bounds.cycles(5),
-        consequence=MOTOR,
         lasts=draw.seconds(0.05, 0.4),
     ),
-    Kind(
+    _motor(
         name="actuator-saturated",
-        where="arm",
-        means="a motor gives only a part of its torque",
+        means="a motor produces only part of its torque",
         step=arm.MotorStep(lambda fault: fault["part"]),
         parameters=(
             _joint(default=1),
-            Parameter("part", "1", "of its largest torque", 0.1, 0.0, 0.9, drawn=draw.number(0.0, 0.05)),
+            Parameter("part", "1", "fraction of its maximum torque", 0.1, 0.0, 0.9, drawn=draw.number(0.0, 0.05)),
         ),
         detected_as=(Alarm.ACTUATOR,),
-        # The motor acts like a load that pulls, until more torque is asked for and no more comes. The joint loop asks
-        # for more by 0.3 of the missing torque in a cycle (twice its bandwidth, 60 rad/s, times the cycle), and a sound
-        # motor gives at least 0.3 of that. Dry friction that reverses may replace all that is missing when the fault
-        # strikes: 1 / (0.3 * 0.3) cycles.
+        # At first this looks like an external load; it shows once the commanded torque rises and the motor's does not.
+        # Each cycle the joint loop commands 0.3 of the missing torque more (twice its bandwidth, 60 rad/s, times the
+        # cycle), of which a sound motor delivers at least 0.3. In the worst case reversing dry friction hides all of
+        # the missing torque at first: 1 / (0.3 * 0.3) cycles.
         bound=bounds.cycles(12),
-        consequence=MOTOR,
         lasts=draw.seconds(0.05, 0.4),
     ),
-    Kind(
+    _torque(
         name="command-nan",
-        where="arm",
-        means="a torque is NaN",
+        means="a commanded torque is NaN",
         step=arm.CommandStep(arm.torque_nan),
         parameters=(_joint(),),
         detected_as=(Alarm.COMMAND_INVALID,),
-        # At the limit gate, in the same cycle: the torque never reaches the arm.
-        bound=bounds.cycles(0),
-        consequence=COMMAND,
-        lasts=draw.seconds(0.01, 0.2),
     ),
-    Kind(
+    _torque(
         name="command-limit",
-        where="arm",
-        means="a torque is far beyond its limit",
+        means="a commanded torque is far beyond its limit",
         step=arm.CommandStep(arm.torque_excessive),
         parameters=(
             _joint(),
-            Parameter("factor", "1", "times the limit", 5.0, 1.1, 1e6, drawn=draw.magnitude(3.0, 1000.0)),
+            Parameter("factor", "1", "multiple of the torque limit", 5.0, 1.1, 1e6, drawn=draw.magnitude(3.0, 1000.0)),
         ),
         detected_as=(Alarm.COMMAND_LIMIT,),
-        bound=bounds.cycles(0),
-        consequence=COMMAND,
-        lasts=draw.seconds(0.01, 0.2),
     ),
     Kind(
         name="self-test",
         where="start",
-        means="the start-up test fails",
+        means="the start-up self-test fails",
         detected_as=(),
         bound=bounds.NOT_ARMED,
         once=True,

@@ -1,8 +1,7 @@
-"""Faults of a task's messages: each message passes through one step a fault, then into its mailbox, or not.
+"""Faults of a task's messages: each message passes through one step per fault on its way to the mailbox.
 
-Faults compose: each step hands on to the next as many messages as it likes, at once or in a later cycle. A step finds
-the content in the writer's own message. Random choices depend only on the fault's seed and on the message's release
-tick, so they repeat.
+Faults compose: each step passes any number of messages on to the next, at once or in a later cycle. The content is in
+the writer's own message. Random choices depend only on the fault's seed and the message's release tick, so they repeat.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from rack.boards.faults.kind import KINDS
 
 
 class Outgoing(NamedTuple):
-    """A message on its way: written in the cycle of tick `at`, made in that of `released`; bits to flip in its slot."""
+    """A message in transit: written in the cycle of tick `at`, made in that of `released`; `damage`: bits to flip."""
 
     at: int
     released: int
@@ -37,13 +36,13 @@ Send = Callable[[Outgoing], None]
 
 
 class Held(NamedTuple):
-    """A message that is held back, with its content."""
+    """A delayed message with its content."""
 
     message: Outgoing
     content: bytes
 
     def send(self, writer: Writer, at: int, visible_at: int, onward: Send) -> None:
-        """Hand it on in the cycle of tick `at`; the writer's own message keeps the level's content."""
+        """Pass it on in the cycle of tick `at`; the writer's own message keeps the level's content."""
         present = bytes(writer.message.raw)
         writer.message.raw[:] = self.content
         onward(self.message._replace(at=at, visible_at=visible_at))
@@ -51,7 +50,7 @@ class Held(NamedTuple):
 
 
 class MessageStep:
-    """One fault on one mailbox, the layout's at `index`; this class changes nothing. `held` are messages held back."""
+    """One fault on one mailbox, at `index` in the layout; this base class changes nothing. `held`: delayed messages."""
 
     def __init__(self, entry: FaultEntry, writer: Writer, index: int) -> None:
         self.entry, self.writer = entry, writer
@@ -60,22 +59,22 @@ class MessageStep:
         self._seed = f"{entry[Entry.SEED]} {index}"
 
     def send(self, message: Outgoing) -> None:
-        """Take a message, and hand on the result."""
+        """Take a message and pass on the result."""
         self.onward(message)
 
     def flush(self, tick: int, visible_at: int) -> None:
-        """Hand on messages that were held back until `tick`."""
+        """Pass on the messages delayed until `tick`."""
 
     def acts(self, message: Outgoing) -> None:
-        """Count that the fault acts, in the cycle in which the message is written."""
+        """Count that the fault acts, in the cycle that writes the message."""
         self.entry.acted(message.at, monotonic_ns())
 
     def chance(self, message: Outgoing) -> random.Random:
-        """Return the generator for a message."""
+        """Return the random generator for a message."""
         return random.Random(f"{self._seed} {message.released}")
 
     def hold(self, message: Outgoing) -> None:
-        """Keep a message with its content."""
+        """Delay a message: keep it with its content."""
         self.held.append(Held(message, bytes(self.writer.message.raw)))
 
 
@@ -88,10 +87,10 @@ class Mute(MessageStep):
 
 
 class Drop(MessageStep):
-    """Loses messages on their way: their serials are taken, their slots are not filled."""
+    """Loses messages in transit: their serials are used, their slots stay unfilled."""
 
     def send(self, message: Outgoing) -> None:
-        """Lose a message, or hand it on."""
+        """Lose a message, or pass it on."""
         if self.chance(message).random() < self.entry.parameters[0]:
             self.acts(message)
             self.writer.lose()
@@ -100,15 +99,15 @@ class Drop(MessageStep):
 
 
 class Delay(MessageStep):
-    """Holds every message back for so many cycles."""
+    """Delays every message by a number of cycles."""
 
     def send(self, message: Outgoing) -> None:
-        """Hold a message back."""
+        """Delay a message."""
         self.acts(message)
         self.hold(message)
 
     def flush(self, tick: int, visible_at: int) -> None:
-        """Hand on the messages that have waited long enough."""
+        """Pass on the messages whose delay is over."""
         span = round(self.entry.parameters[0]) * self.writer.spec.every
         due = [held for held in self.held if held.message.at + span <= tick]
         self.held = self.held[len(due) :]
@@ -117,10 +116,10 @@ class Delay(MessageStep):
 
 
 class Reorder(MessageStep):
-    """Exchanges a message with the next one."""
+    """Swaps a message with the next one."""
 
     def send(self, message: Outgoing) -> None:
-        """Hand on a message and then the one held back, or hold it back."""
+        """Pass on a message and then the delayed one, or delay it."""
         if self.held:
             self.onward(message)
             self.held.pop().send(self.writer, message.at, message.visible_at, self.onward)
@@ -135,21 +134,21 @@ class Corrupt(MessageStep):
     """Flips bits of a message in its slot."""
 
     def send(self, message: Outgoing) -> None:
-        """Damage a message, or hand it on."""
+        """Damage a message, or pass it on unchanged."""
         probability, bits, *_ = self.entry.parameters
         chance, size = self.chance(message), 8 * self.writer.spec.size
         if chance.random() < probability:
             self.acts(message)
-            # Each bit once: flipped twice it would be as before.
+            # Each bit at most once: a second flip would restore it.
             message = message._replace(damage=tuple(chance.sample(range(size), min(size, round(bits)))))
         self.onward(message)
 
 
 class Babble(MessageStep):
-    """Writes a message again and again."""
+    """Writes each message many times."""
 
     def send(self, message: Outgoing) -> None:
-        """Hand a message on so many times."""
+        """Pass a message on repeatedly."""
         self.acts(message)
         for _ in range(round(self.entry.parameters[0])):
             self.onward(message)
@@ -159,7 +158,7 @@ class HoldLock(MessageStep):
     """Stops or kills the process while it holds the mailbox's lock, once."""
 
     def send(self, message: Outgoing) -> None:
-        """Take the lock and end inside it; a stopped process that continues gives it back."""
+        """Stop or die while holding the lock; a stopped process releases it when it continues."""
         writer, is_killed = self.writer, bool(self.entry.parameters[0])
         if isinstance(writer, LockWriter) and not self.entry[Entry.COUNT] and writer.lock.acquire():
             self.acts(message)
@@ -169,7 +168,7 @@ class HoldLock(MessageStep):
 
 
 class FaultyWriter:
-    """Stands in for the writer of a mailbox while it has faults. `index` is the mailbox's in the layout."""
+    """Replaces the writer of a mailbox that has faults. `index` is the mailbox's in the layout."""
 
     def __init__(self, writer: Writer, index: int) -> None:
         self._writer, self._index = writer, index
@@ -179,7 +178,7 @@ class FaultyWriter:
         self._written = True
 
     def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Write with these faults, by kind, from now on; those that continue keep the messages they hold back."""
+        """Apply these faults, by kind, from now on; those that continue keep their delayed messages."""
         steps = {entry.index: self._steps.get(entry.index) or self._step(kind, entry) for kind, entry in faults}
         for index, step in self._steps.items():
             if index not in steps:
@@ -199,14 +198,14 @@ class FaultyWriter:
 
     @property
     def is_over(self) -> bool:
-        """Whether no fault is left, and no message held back by one."""
+        """Whether no fault and no delayed message is left."""
         return not self._steps and not self._late
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Write `message` as its faults leave it; return False when the message itself comes too late.
+        """Write the message as its faults leave it; return False if the message itself is too late.
 
-        A message that a fault has held back is visible from when that of the cycle is, or would be: reads depend on
-        ticks alone, with faults too.
+        A delayed message becomes visible together with that of the cycle in which it is written, so that reads depend
+        on ticks alone, even with faults.
         """
         self.flush(tick, now)
         spec, self._written = self._writer.spec, True
@@ -215,7 +214,7 @@ class FaultyWriter:
         return self._written and (now is None or now < tick + spec.delay)
 
     def flush(self, tick: int, now: int | None = None) -> None:
-        """Publish messages that faults have held back until now."""
+        """Publish the delayed messages that are due."""
         visible_at = self._writer.visible_at(tick, now)
         late, self._late = self._late, []
         for held in late:
@@ -229,10 +228,10 @@ class FaultyWriter:
 
 
 def forge(segment: Segment, mailbox: str, tick: int) -> None:
-    """Publish a message as a second writer, which holds no claim; it is visible at `tick`.
+    """Publish a message as a second writer, which has not claimed the mailbox; it is visible at `tick`.
 
-    It is sound but for its writer. Its content is the newest message's with every bit inverted, so that it shows
-    wherever it is believed.
+    Only its writer is wrong. Its content is the newest message with every bit inverted, so that any reader that
+    accepts it is noticed.
     """
     slots = Slots(segment, segment.layout.mailbox(mailbox))
     head = slots.box[Box.HEAD]

@@ -1,4 +1,4 @@
-"""Faults of one task: on its messages, in its computing time, in what it drives, and on its core."""
+"""Faults of one task: in its messages, its computing time, its hardware, and on its core."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from rack.boards.faults.kind import KINDS
 from rack.levels.level import Executor, Fault, Planner
 
 LEAST_S = 0.001
-"""Least time between two looks of a hog that waits."""
+"""Shortest polling interval of a waiting hog."""
 LOOK_S = 0.05
-"""Longest time until a hog that waits for its tick looks whether it is still wanted."""
+"""Longest polling interval of a waiting hog, which must notice that the run has stopped."""
 
 
 @dataclass(frozen=True)
 class ExtraComputing:
-    """Computing time beyond a task's own, added to its cycle. `until` is the kind's step."""
+    """Extra computing time in a task's cycle. `until` is the kind's step."""
 
     entry: FaultEntry
     spec: TaskSpec
@@ -35,7 +35,7 @@ class ExtraComputing:
     until: LoadStep
 
     def burn(self, tick: int) -> None:
-        """Compute for as long as the fault says."""
+        """Compute until the time that the step returns."""
         now = monotonic_ns()
         self.entry.acted(tick, now)
         end = self.until(self, tick, now)
@@ -43,23 +43,23 @@ class ExtraComputing:
             pass
 
     def cycles_ns(self, cycles: float) -> int:
-        """Return the length of so many cycles of the task."""
+        """Return the length of `cycles` cycles of the task, ns."""
         return int(cycles * self.spec.every * self.clock.period_ns)
 
 
 LoadStep = Callable[[ExtraComputing, int, int], int]
-"""Takes the tick and the time now, CLOCK_MONOTONIC; returns the time at which computing ends."""
+"""From the tick and the present time, the time at which computing ends; times are CLOCK_MONOTONIC, ns."""
 
 
 def overrun(load: ExtraComputing, tick: int, now: int) -> int:
-    """Let an executor take so many cycles longer, or a random part of that."""
+    """Make an executor take `by` cycles longer, or a random part of that."""
     by, is_random, *_ = load.entry.parameters
     part = random.Random(load.entry[Entry.SEED] + tick).random() if is_random else 1.0
     return now + load.cycles_ns(part * by)
 
 
 def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
-    """Let a planner exceed its time slice by so many cycles."""
+    """Make a planner exceed its time slice by `by` cycles."""
     slice_end = load.clock.time_of(tick + load.spec.every * load.spec.within_cycles)
     return max(now, slice_end) + load.cycles_ns(load.entry.parameters[0])
 
@@ -68,11 +68,11 @@ class Outputs(Protocol):
     """The ports through which a task writes."""
 
     def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Write with these faults, by kind, from now on."""
+        """Apply these faults to writes, by kind, from now on."""
 
 
 class TaskFaults:
-    """Keeps a task's active faults in force. `loads` are those of its computing time."""
+    """Applies a task's active faults. `loads` are those of its computing time."""
 
     def __init__(self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner) -> None:
         self._table = FaultTable(segment)
@@ -82,7 +82,7 @@ class TaskFaults:
         self.loads: list[ExtraComputing] = []
 
     def refresh(self) -> int:
-        """Take over the faults that are active now; return the generation of the table that was seen."""
+        """Apply the faults that are active now; return the generation of the fault table."""
         generation = self._table.generation
         active = [(KINDS[entry[Entry.KIND]], entry) for entry in self._table.active(self._spec.name)]
         self.loads = [
@@ -99,22 +99,22 @@ class TaskFaults:
         return generation
 
     def burn(self, tick: int) -> None:
-        """Compute for as long as the faults of computing time say."""
+        """Spend the extra computing time of all active faults."""
         for load in self.loads:
             load.burn(tick)
 
     def count(self, places: Sequence[int], tick: int) -> None:
-        """Count that the arm's faults at these places of the injected sequence have acted."""
+        """Count that the arm's faults at these indices of the injected sequence have acted."""
         now = monotonic_ns()
         for place in places:
             self._arm[place].acted(tick, now)
 
 
 def take_core(segment: Segment, entry: FaultEntry) -> None:
-    """Wait until the clock begins the fault, then keep the core of its board busy until the fault is over: a hog.
+    """Wait until the clock begins the fault, then keep the board's core busy until the fault is over: a hog.
 
-    To be called in a process of its own. Raises `PermissionError` where real-time priorities are refused: an ordinary
-    process takes no core from a board.
+    Call it in a separate process. Raises `PermissionError` where real-time priorities are refused: an ordinary process
+    cannot take a core from a board.
     """
     task = segment.layout.tasks[entry[Entry.TASK]]
     block, clock = segment.block(task.name), SystemClock(segment)
@@ -122,8 +122,8 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(99, block[Block.PRIORITY] + 1)))
     while entry.stage == Stage.WAITING and not clock.is_stopped:
         wait_ns = clock.time_of(max(entry[Entry.FROM], clock.tick + 1)) - time.monotonic_ns()
-        # On the clock's grid: the first tick at which the fault can begin, or the next one. Where that has passed
-        # already, and before the start, it sleeps: at this priority no other process would get to run.
+        # Wake on the clock's grid, at the first tick at which the fault can begin or at the next one. If that tick has
+        # passed, or the run has not started, sleep briefly: at this priority a busy wait would starve all others.
         time.sleep(min(wait_ns * 1e-9 if wait_ns > 0 else LEAST_S, LOOK_S))
     end = clock.time_of(entry[Entry.UNTIL])
     entry.acted(clock.now(), time.monotonic_ns())
@@ -133,13 +133,13 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
 
 
 def act_on_core(segment: Segment, entry: FaultEntry) -> None:
-    """Run the step of a fault that acts from another process on the task's core."""
+    """Run the step of a fault that takes the task's core, from this process."""
     step = KINDS[entry[Entry.KIND]].step
     assert callable(step), "a fault of a core has a function"
     step(segment, entry)
 
 
 def hog(segment: Segment, index: int) -> int:
-    """Act the fault at that place of the fault table, in a process forked by the crate; return the exit status."""
+    """Act the fault at `index` of the fault table, in a process forked by the crate; return the exit status."""
     act_on_core(segment, FaultTable(segment).entries[index])
     return 0

@@ -25,9 +25,9 @@ SELF_TEST_FAILED = 3
 
 
 def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
-    """Run `board` in the forked child of the crate; return its exit status."""
+    """Run `board` in a process forked by the crate; return its exit status."""
     die_with_parent(crate)
-    # Boards do not keep the crate's priority: each takes its own when it is ready.
+    # A board drops the crate's priority and takes its own when it is ready.
     set_priority(0)
     name_process(f"{segment.rack}:{name}")
     try:
@@ -43,7 +43,7 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
 def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
     """Build a task's level, test it, take the processor, and cycle until the run is over.
 
-    `attention` is an eventfd that the Rack waits on: a board writes to it when it is ready or rings an alarm.
+    `attention` is an eventfd on which the Rack waits: a board writes to it when it is ready or raises an alarm.
     """
     block = segment.block(wiring.task)
     block[Block.PID] = os.getpid()
@@ -66,7 +66,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
     try:
         level.self_test()
         if wiring.fails_self_test:
-            raise LevelError("self-test failed: a fault in the config asks for it")
+            raise LevelError("self-test failed: injected by a fault in the config")
         UtilityLines(segment).release_sysfail(spec.slot)
         block[Block.PRIORITY] = take_processor(spec)
         block[Block.CORE] = spec.core
@@ -76,7 +76,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         task.stopwatch.notify_clock()
         task.run()
     finally:
-        # Ordinary scheduling from here: closing files must not delay another board's cycle.
+        # From here at ordinary priority: closing files must not delay another board's cycle.
         set_priority(0)
         level.close()
 

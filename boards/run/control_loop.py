@@ -1,8 +1,9 @@
 """A level in execution: `procedure level()` of the paper (section 2).
 
-`VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin` is two processes: on
-one core, by priority (tightly coupled), or on two (loosely coupled). `lock` and `unlock` are left to the mailboxes:
-only protocol `lock` needs them. Stamps, trace and counts are kept by the stopwatch; faults take effect between cycles.
+`VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin` becomes two processes:
+on one core, by priority (tightly coupled), or on two cores (loosely coupled). `lock` and `unlock` are inside the
+mailboxes, since only protocol `lock` needs them. The stopwatch keeps time stamps, trace and counts; faults take effect
+between cycles.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class VirtualControlLoop(Task):
             lock; write_command; unlock; lock; write_status; unlock
         until forever
 
-    Before it reads, the exchange (C of fig. 4) brings a plan over the bus, from the processor of its planner.
+    First, the exchange (C of fig. 4) transfers the plan over the bus from the planner's processor.
     """
 
     def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None) -> None:
@@ -67,7 +68,7 @@ class VirtualControlLoop(Task):
         watch.finish(in_time, deadline=tick + self.spec.every, done=tick)
 
     def process(self, tick: int) -> None:
-        """Let the level process, with the demand on the arm; ring what it has found, and count faults that acted."""
+        """Let the level process, given the demand on the arm; then report its findings and the faults that acted."""
         executor = self.executor
         executor.demand = _DEMANDS[self.words[_DEMAND]]
         executor.process(self.inputs.values, self.outputs.messages, tick)
@@ -85,15 +86,15 @@ class VirtualControlLoop(Task):
 
 
 class PlannerLoop(Task):
-    """The planner of `procedure level()`: plans in the background, each plan within its cycles.
+    """The planner of `procedure level()`: plans in the background, each plan within its time slice.
 
         repeat
             plan
             lock; write_plan; unlock
         until forever
 
-    It asks in every cycle whether a plan is wanted. Tightly coupled under protocol `lock`, writing the plan is the
-    paper's critical section, which the executor cannot preempt.
+    In every cycle it asks the level whether it wants a plan. If it is tightly coupled under protocol `lock`, writing
+    the plan is the paper's critical section, which the executor cannot preempt.
     """
 
     def __init__(self, segment: Segment, wiring: TaskWiring, planner: Planner, attention: int | None = None) -> None:
@@ -125,10 +126,10 @@ class PlannerLoop(Task):
         watch.processed()
         with self._critical_section():
             in_time = self.write_plan(tick, self.clock.now(), self.inputs)
-            # Stamped inside: after the section the executor may run first.
+            # Stamped inside: on leaving the section the executor may run first.
             watch.written()
         self.block[Block.PLANS] += 1
-        # A plan begun late has its whole slice: a release within it is answered by this plan.
+        # A plan begun late gets its whole slice, and answers any release within it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
         watch.finish(in_time, tick + self.slice, done, Flag.PLANNED)
 
@@ -138,13 +139,13 @@ class PlannerLoop(Task):
         self.faults.burn(tick)
 
     def _take_time_slice(self, tick: int) -> None:
-        """Claim the slice of a plan: the clock releases nothing until its end."""
+        """Claim the slice of a plan: the clock does not release this task until its end."""
         self.next_cycle.hold_until(tick + self.slice)
         self.block[Block.DEADLINE] = tick + self.slice
         self.stopwatch.notify_clock()
 
     def _pass(self, tick: int) -> None:
-        """Let a release pass without a plan; trace it when it came too late, or others were skipped."""
+        """Let a release pass without a plan; trace it if it came too late or others were skipped."""
         self.outputs.flush(tick, self.clock.now())
         in_time = self.clock.now() < tick + self.slice
         if in_time and not self.next_cycle.skipped:

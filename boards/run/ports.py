@@ -1,4 +1,4 @@
-"""A task's ports on the bus: the readers and writers of its mailboxes, used once a cycle."""
+"""A task's ports on the bus: the readers and writers of its mailboxes, used once per cycle."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from rack.backplane.fault_table import Entry, FaultEntry
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
@@ -39,7 +38,7 @@ class InputPorts:
         self.read_plan()
 
     def exchange(self, tick: int) -> None:
-        """Begin a cycle released at `tick`: bring the plan over the bus, where the task reads one."""
+        """Begin the cycle released at `tick`; if the task reads a plan, transfer it over the bus."""
         self._task.reads(tick)
         if self._plan:
             self._exchanged = [(port, read(tick)) for port, read in self._plan]
@@ -51,32 +50,32 @@ class InputPorts:
             values[port] = read(tick)
 
     def read_plan(self) -> None:
-        """Take the plan that the exchange has brought."""
+        """Take the plan from the exchange."""
         for port, reading in self._exchanged:
             self._by_port[port] = reading
 
     @property
     def bad_reads(self) -> int:
-        """Reads so far with anything wrong."""
+        """Number of failed reads."""
         return sum([statistics.bad_reads for statistics in self._statistics])
 
     @property
     def bus_errors(self) -> int:
-        """Reads so far that their bound cut off."""
+        """Number of reads that timed out."""
         return sum([statistics.bus_errors for statistics in self._statistics])
 
     @property
     def corrupt(self) -> int:
-        """Reads so far that found a damaged message."""
+        """Number of reads that found a damaged message."""
         return sum([statistics.corrupt for statistics in self._statistics])
 
     def basis(self, port: str, tick: int) -> int:
-        """Return the tick of the oldest information that a port's message rests on; `tick` where there is none."""
+        """Return the tick of the oldest information behind a port's message; `tick` if there is no message."""
         reader = self.readers.get(port)
         return reader.basis if reader is not None and reader.serial else tick
 
     def take_traffic(self) -> tuple[int, int]:
-        """Return the accesses, and the bytes read, since the last call."""
+        """Return the number of accesses and of bytes read since the last call."""
         before, self._counted = self._counted, self._traffic
         return self._counted[0] - before[0], self._counted[1] - before[1]
 
@@ -102,7 +101,7 @@ class OutputPorts:
         self._route()
 
     def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Write with these faults, by kind, from now on; what earlier ones held back goes out with the next write."""
+        """Apply these faults, by kind, from now on; messages delayed by earlier ones go out with the next write."""
         for port, writer in self.writers.items():
             index = self._indices[writer.spec.name]
             chosen = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
@@ -114,21 +113,16 @@ class OutputPorts:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [(port, w, getattr(self._faulty.get(port), "write", w.write)) for port, w in self.writers.items()]
 
-    def message(self, port: str) -> Message | None:
-        """Return the outgoing message of a port, if there is such a port."""
-        writer = self.writers.get(port)
-        return writer.message if writer else None
-
     @property
     def bus_errors(self) -> int:
-        """Writes so far that their bound cut off."""
+        """Number of writes that timed out."""
         return sum([writer.bus_errors for writer in self._writers])
 
     def write(self, tick: int, now: int, inputs: InputPorts) -> bool:
-        """Write every mailbox; False when a message came too late.
+        """Write every mailbox; return False if a message was too late.
 
-        Each message carries the tick of the oldest information it rests on: a command that of the command it follows,
-        a status that of the status below it. So the response of the whole system can be measured.
+        Each message carries the tick of the oldest information behind it: a command that of the command it follows, a
+        status that of the status below it. This makes the response time of the whole system measurable.
         """
         in_time = True
         for port, writer, write in self._lines:
@@ -140,14 +134,14 @@ class OutputPorts:
         return in_time
 
     def flush(self, tick: int, now: int) -> None:
-        """Publish what a fault has held back and is due, in a cycle that writes nothing."""
+        """Publish delayed messages that are due, in a cycle that writes nothing."""
         if self._faulty:
             for faulty in self._faulty.values():
                 faulty.flush(tick, now)
             self._drop_faulty_writers()
 
     def _drop_faulty_writers(self) -> None:
-        """Write directly again where no fault is left and nothing is held back."""
+        """Write directly again where no fault and no delayed message is left."""
         over = [port for port, faulty in self._faulty.items() if faulty.is_over]
         for port in over:
             del self._faulty[port]
@@ -155,7 +149,7 @@ class OutputPorts:
             self._route()
 
     def _report(self, port: str, writer: Writer, tick: int) -> None:
-        """Ring an alarm for what a writer has found in its own mailbox."""
+        """Raise an alarm for a writer's findings in its own mailbox."""
         if writer.intruder:
             self._episodes[port].find(Alarm.MASQUERADE, writer.serial, tick, writer.intruder)
             writer.intruder = 0
@@ -164,7 +158,7 @@ class OutputPorts:
             self._episodes[port].find(Alarm.LOCKED, writer.serial, tick)
 
     def take_traffic(self) -> tuple[int, int]:
-        """Return the messages, and the bytes, written since the last call."""
+        """Return the number of messages and of bytes written since the last call."""
         before, self._counted = self._counted, self._traffic
         return self._counted[0] - before[0], self._counted[1] - before[1]
 

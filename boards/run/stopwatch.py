@@ -1,7 +1,7 @@
-"""The stopwatch of a task: times each cycle, traces it, and keeps the counts of the task's control block.
+"""The stopwatch of a task: times and traces each cycle, and keeps the counts in the task's control block.
 
-Everything around the paper's procedure is here: time stamps (R, X, W, C of eqs. 3.5 and 3.9), the trace record, missed
-deadlines, skipped releases, failed accesses, and the report to the clock that a release is done.
+It holds all bookkeeping around the paper's procedure: time stamps (R, X, W, C of eqs. 3.5 and 3.9), the trace record,
+missed deadlines, skipped releases, failed accesses, and the report to the clock that a release is done.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ER
 )
 _MISS, _SKIP, _BUS_ERROR, _DAMAGED = (int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT))
 BUS_COUNT_CYCLES = 64
-"""Cycles between two updates of the bus accounts."""
+"""Cycles between updates of the bus counters."""
 
 
 class Stopwatch:
@@ -33,25 +33,25 @@ class Stopwatch:
         self._block = segment.block(task)
         self._clock = SystemClock(segment)
         self._inputs, self._outputs = inputs, outputs
-        self._status = outputs.message("status")
+        self._status = getattr(outputs.messages, "status", None)
         self._trace = TraceWriter(segment, task)
         self._record = self._trace.record
         self._lockstep_clock = clock_semaphore(segment.rack) if self._clock.is_lockstep else None
         self._troubles = self._bus_errors = self._corrupt = self._skipped = 0
-        self._processor_ns = 0  # used before the next record begins
+        self._processor_ns = 0  # processor time used before the current record
 
     def begin(self) -> None:
         """Count processor time from here on."""
         self._processor_ns = process_time_ns()
 
     def start(self, tick: int, skipped: int) -> None:
-        """Begin the cycle released at `tick`, after `skipped` releases that passed."""
+        """Begin the cycle released at `tick`, after `skipped` missed releases."""
         self._skipped = skipped
         self._record[_TICK] = tick
         self._record[_START] = self._record[_PLAN] = monotonic_ns()
 
     def exchanged(self) -> None:
-        """Stamp: the plan has come over the bus (C of fig. 4)."""
+        """Stamp: the plan has been transferred over the bus (C of fig. 4)."""
         self._record[_PLAN] = monotonic_ns()
 
     def read(self) -> None:
@@ -69,7 +69,7 @@ class Stopwatch:
     def finish(self, in_time: bool, deadline: int, done: int, flags: int = 0) -> None:
         """Close the cycle: trace it, count it, and report all releases up to tick `done` as done.
 
-        `in_time`: no message came too late. `deadline` is a tick.
+        `in_time`: no message was too late. `deadline` is a tick.
         """
         block, record, skipped = self._block, self._record, self._skipped
         tick, missed = record[_TICK], not in_time
@@ -101,8 +101,8 @@ class Stopwatch:
             self.count_bus()
 
     def idle(self) -> None:
-        """Close a cycle in which a planner had nothing to plan: it is counted, and not traced."""
-        # Its processor time is no part of the next plan's record.
+        """Close a cycle in which a planner had nothing to plan: count it, but do not trace it."""
+        # Exclude its processor time from the next plan's record.
         self._processor_ns = process_time_ns()
         self._block[_CYCLES] += 1
         self._block[_DONE] = self._record[_TICK]
@@ -114,7 +114,7 @@ class Stopwatch:
             self._lockstep_clock.release()
 
     def _count_troubles(self) -> int:
-        """Count the failed accesses since the last cycle; return them as trace flags."""
+        """Count failed accesses since the last cycle; return trace flags."""
         bus_errors, corrupt = self._inputs.bus_errors + self._outputs.bus_errors, self._inputs.corrupt
         new_errors, new_corrupt = bus_errors - self._bus_errors, corrupt - self._corrupt
         self._bus_errors, self._corrupt = bus_errors, corrupt
@@ -123,7 +123,7 @@ class Stopwatch:
         return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
 
     def count_bus(self) -> None:
-        """Bring the bus accounts of the control block up to date; every cycle would be too often."""
+        """Update the bus counters of the control block; doing so in every cycle would cost too much."""
         reads, writes, block = self._inputs.take_traffic(), self._outputs.take_traffic(), self._block
         block[Block.READS] += reads[0]
         block[Block.READ_BYTES] += reads[1]

@@ -1,7 +1,7 @@
 """The board in slot 1: the system controller, which runs the clock.
 
-At every tick, besides releasing the tasks, it begins and ends faults, issues operators' commands, lets restarted boards
-rejoin the grid, and tells the arm to stop or to brake.
+At every tick it releases the tasks, begins and ends faults, issues operator commands, lets restarted boards rejoin the
+grid, and demands that the arm stop or brake.
 """
 
 from __future__ import annotations
@@ -14,23 +14,25 @@ from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import State
+from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, Run, System
 from rack.boards.faults.clock_board import FaultStage
-from rack.boards.operating.desk import OperatorDesk
 from rack.boards.wiring import ClockWiring
 
 HEAD_START_NS = 20_000_000
-"""Time from the start of the clock board to tick 0, so that its start-up is not a late tick."""
+"""Time from the start of the clock's board to tick 0, so that its start-up does not delay a tick."""
 # Plain integers for the hot path.
-_LOSSES, _EMERGENCY = int(System.LOSSES), int(System.EMERGENCY_STOP)
+_LOSSES, _EMERGENCY, _REQUESTED, _COMMANDED = (
+    int(word) for word in (System.LOSSES, System.EMERGENCY_STOP, System.REQUESTED, System.COMMANDED)
+)
 
 
 class SystemController:
-    """What the clock does at every tick besides releasing tasks: see `rack.backplane.clock.driver.Controller`."""
+    """The clock's duties at every tick besides releasing tasks; see `rack.backplane.clock.driver.Controller`."""
 
     def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
         self._words, self._wiring, self._driver = segment.words, wiring, driver
@@ -54,7 +56,7 @@ class SystemController:
         self._faults.within(tick)
 
     def _handle_losses(self, tick: int) -> None:
-        """Let returned boards rejoin, latch for those given up, and put the demand of the other losses on the arm."""
+        """Let restarted boards rejoin, latch for those given up, and set the demand for all other losses."""
         words = self._words
         seen = words[_LOSSES], self._driver.watchdog.losses
         lost = [task for task in self._driver.tasks if task.lost_tick >= 0]
@@ -93,8 +95,52 @@ class SystemController:
             self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
 
 
+class OperatorDesk:
+    """Issues operator commands at the start of a tick, each into its level's mailbox, before any task is released."""
+
+    def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
+        self._words, self._alarms = segment.words, alarms
+        self._table, self._clock = OperatorTable(segment), SystemClock(segment)
+        boxes = segment.layout.mailboxes
+        self._writers = {at: open_writer(segment, box.name) for at, box in enumerate(boxes) if box.writer == CLOCK}
+        self._requested = -1
+        self._waiting: list[RequestEntry] = []
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether no command waits: nothing to do in this tick."""
+        return not self._waiting and self._words[_REQUESTED] == self._requested
+
+    def advance(self, tick: int) -> None:
+        """Issue all commands due at `tick`."""
+        if self._words[_REQUESTED] != self._requested:
+            self._requested = self._words[_REQUESTED]
+            self._waiting = self._table.waiting()
+        for entry in [entry for entry in self._waiting if entry[RequestWord.TICK] <= tick]:
+            self._waiting.remove(entry)
+            # Mark first, then check that it still waits; a client that withdraws it uses the opposite order.
+            entry.words[RequestWord.GIVEN_TICK] = tick
+            if self._table.is_waiting(entry):
+                self._give(entry, tick)
+            else:
+                entry.words[RequestWord.GIVEN_TICK] = -1
+
+    def _give(self, entry: RequestEntry, tick: int) -> None:
+        words, writer = entry.words, self._writers[entry[RequestWord.MAILBOX]]
+        if not words[RequestWord.SERIAL]:
+            # If the clock dies after this line, its successor issues the command again, under the same serial.
+            self._words[_COMMANDED] += 1
+            words[RequestWord.SERIAL] = self._words[_COMMANDED]
+        message = writer.message
+        message.raw[:] = entry.message[: len(message.raw)]
+        message.id = words[RequestWord.SERIAL]
+        writer.write(tick, self._clock.now())
+        words[RequestWord.STAGE] = RequestStage.GIVEN
+        self._alarms.ring(tick, Alarm.COMMANDED, entry.index, words[RequestWord.SERIAL])
+
+
 class EndOfRun:
-    """Decides, by ticks alone, where a run ends."""
+    """Decides at which tick a run ends, by ticks alone."""
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
         self._stop_tick = wiring.stop_tick or None
@@ -117,7 +163,7 @@ class EndOfRun:
 
 
 def run_clock(segment: Segment, wiring: ClockWiring, attention: int | None = None) -> None:
-    """Run the clock until the run is over; a restarted clock continues on the grid that it finds."""
+    """Run the clock until the run is over; a restarted clock continues on the existing grid."""
     words = segment.words
     words[System.CLOCK_PID] = os.getpid()
     alarms = AlarmWriter(segment, CLOCK, attention)

@@ -1,4 +1,4 @@
-"""A task on its board: what the executor's and the planner's loop have in common, and the fast tasks' clock guard."""
+"""A task on its board: the common part of the executor's and the planner's loop, and the clock guard of fast tasks."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _FAULTS, _TICK_NS, _TICK, _CLOCK_SKIPPED = (
     int(word) for word in (System.FAULTS, System.TICK_NS, System.TICK, System.CLOCK_SKIPPED)
 )
 PUNCTUAL_TICKS = 20
-"""Punctual ticks that end an episode of late ones."""
+"""Number of punctual ticks that ends an episode of late ones."""
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 
 class Task(ABC):
-    """One task, around a level's executor or planner: its ports, its clock, its stopwatch, its faults."""
+    """One task around a level's executor or planner: ports, clock, stopwatch and faults."""
 
     def __init__(
         self, segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int | None = None
@@ -49,14 +49,14 @@ class Task(ABC):
         self._guard = ClockGuard(segment, self.alarms) if wiring.guards_clock else None
 
     def begin(self) -> None:
-        """Report on the backplane that the task runs, and start to count its processor time."""
+        """Mark the task as running on the backplane, and start to count its processor time."""
         self.block[Block.STATE] = TaskState.RUNNING
         self.stopwatch.begin()
 
     def wait_until_next_cycle(self) -> int | None:
         """Wait for the next release and return its tick; None when the run is over.
 
-        Faults take effect here, between two cycles, and the clock is checked.
+        Between cycles, here, faults take effect and the clock is checked.
         """
         tick = self.next_cycle.wait()
         if tick is None:
@@ -73,9 +73,9 @@ class Task(ABC):
 
 
 class ClockGuard:
-    """A fast task's check of the clock: compares, at every release, the clock's ticks with monotonic time.
+    """A fast task's check of the clock: at every release it compares the tick with monotonic time.
 
-    A missing release was skipped by the clock, not by the task, if the clock has counted it so.
+    A missing release counts as skipped by the clock, not by the task, if the clock has counted it as skipped.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -87,14 +87,14 @@ class ClockGuard:
         self._quiet_from = 0
 
     def check(self, tick: int, skipped: int) -> None:
-        """Check the clock in the cycle released at `tick`, before which `skipped` releases passed."""
+        """Check the clock in the cycle released at `tick`, after `skipped` missed releases."""
         words = self._words
         if skipped and words[_CLOCK_SKIPPED] != self._skipped:
             by_clock = words[_CLOCK_SKIPPED] - self._skipped
             self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=by_clock, since=tick - by_clock)
         self._skipped = words[_CLOCK_SKIPPED]
         late_ns = words[_TICK_NS] - self._clock.time_of(tick)
-        # Only now: the time belongs to this tick as long as the clock has not come to the next.
+        # Checked after the read: the time is this tick's only if the clock has not advanced meanwhile.
         if self._clock.is_lockstep or words[_TICK] != tick:
             return
         if late_ns > self._late_ns:
@@ -104,9 +104,9 @@ class ClockGuard:
 
 
 def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
-    """Return `access`, made to take at least `time_ns` of processor time; `access` itself where that is 0.
+    """Return `access`, extended to at least `time_ns` of processor time; `access` itself if that is 0.
 
-    This emulates a slower bus: programmed transfers over VME took the processor's time.
+    This emulates a slower bus: programmed transfers over VME occupied the processor.
     """
     if not time_ns:
         return access

@@ -1,4 +1,4 @@
-"""Two levels without an arm that an operator can command; their output depends on when a command arrives."""
+"""Two levels without an arm that take operator commands; their output depends on a command's tick."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from rack.backplane.message import Field, Message, State, command, status
 from rack.levels.level import Executor, Input, Ports
 from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, Operation, Orders
 
-STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: do not go on"))
+STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: hold"))
 COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that were not held"))
 
 
 class Upper(Executor):
-    """Says hold when an operator does; refuses to go home."""
+    """Passes an operator's hold down; refuses to go home."""
 
     inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "status": Input(COUNTED, "below.status")}
     outputs = {"command": STEP, "status": COUNTED}
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.HOME,)}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take up what is said, and hand it down."""
+        """Take commands and pass them down."""
         orders = self.orders
         orders.take(read.operator, self._judge)
         write.command.hold = orders.standing is Operation.HOLD
@@ -45,7 +45,7 @@ class Lower(Executor):
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take up what is said; count."""
+        """Take commands and count."""
         self.orders.take(read.operator)
         held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
         write.status.count += not held

@@ -1,4 +1,4 @@
-"""A rack to try an operator's commands on: two levels that count."""
+"""A rack for tests of operator commands: two levels that count."""
 
 from __future__ import annotations
 

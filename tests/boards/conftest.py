@@ -1,4 +1,4 @@
-"""Racks of waves for tests, and the proof that nothing of them is left."""
+"""Racks of waves for tests, and the check that they leave nothing behind."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ coupling = "tight"
 within_cycles = 4""",
 )
 LOOSE = ("board.wave.coupling=loose", "board.wave.planner_slot=9")
-"""Settings that give the planner of the wave a board of its own."""
+"""Settings that give the wave's planner its own board."""
 
 NEVER = "supervision.restarts=0"
 """Setting with which the loss of a board ends the run."""
@@ -60,7 +60,7 @@ def wave_file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def config(rack_name: str, tmp_path: Path) -> Iterator[MakeConfig]:
-    """Configs of this test's own rack, with settings; afterwards nothing of it is left."""
+    """Configs of this test's own rack, with settings; checks that it leaves nothing behind."""
 
     def make(*settings: str, text: str = PLANNED) -> RackConfig:
         path = tmp_path / "waves.toml"

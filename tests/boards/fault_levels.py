@@ -1,4 +1,4 @@
-"""Levels for tests of faults: one drives something that sensors and motors can fail of, one follows a wave."""
+"""Levels for tests of faults: one has sensors and motors that can fail, one follows a wave."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ PLACE = status("place", 1, Field("position", "f8", "rad", "where it is"), Field(
 
 
 class Driven(Executor):
-    """Says that it stands."""
+    """Reports that it stands still."""
 
     outputs = {"status": PLACE}
     faults = (SensorStep, MotorStep, CommandStep)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Say where it is."""
+        """Report its position."""
         write.status.position = 0.5
 
 
 class Follower(Watch):
-    """Holds while it hears nothing of the wave, and fails when its patience, in ticks, is over."""
+    """Holds while the wave is silent, and fails after `patience` ticks."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -32,7 +32,7 @@ class Follower(Watch):
         self._latched = ""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Follow the wave, wait for it, or give it up for good."""
+        """Follow the wave, wait for it, or give up."""
         super().process(read, write, tick)
         self._since = (self._since or tick) if read.status.is_there and read.status.is_lost else None
         if self._since is not None and tick - self._since > self._patience:

@@ -1,4 +1,4 @@
-"""The rack that faults are tried on: a wave with its planner, who watches it, and what is driven."""
+"""The rack for tests of faults: a wave with its planner, a watch on it, and a driven board."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FOLLOWED = PLANNED.replace(
 )
 LOCKED = "protocol.default=lock"
 TARGETS = {"overrun": "wave", "planner-slow": "wave.planner", "clock": "clock", "arm": "driven"}
-"""A task that can have a fault, by kind or by where the kind strikes; for any other it is the wave."""
+"""A task to strike, by kind or by the kind's `where`; for all others it is the wave."""
 
 
 def rack(config: MakeConfig, *faults: Mapping[str, Any], settings: tuple[str, ...] = ()) -> RackConfig:

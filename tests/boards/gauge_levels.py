@@ -1,4 +1,4 @@
-"""A user's own level, with an enum of its own in its status and a kind of fault of its own: one record."""
+"""A user's own level, with its own enum in its status and its own kind of fault: one record."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class LoseEvery(MessageStep):
     """Loses every n-th message."""
 
     def send(self, message: Outgoing) -> None:
-        """Lose a message whose turn it is."""
+        """Lose every n-th message."""
         if message.released // self.writer.spec.every % round(self.entry.parameters[0]) == 0:
             self.acts(message)
             self.writer.lose()
@@ -56,7 +56,7 @@ class Gauge(Executor):
     outputs = {"status": status("gauge", 1, Field("valve", "u1", Valve, "its valve"), Field("value", "f8", "1", "0"))}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Say how the valve is."""
+        """Report the valve's state."""
         write.status.state = State.EXECUTING
         write.status.valve = Valve.OPEN if tick >= OPENS_AT else Valve.SHUT
 

@@ -1,4 +1,4 @@
-"""A user's program that runs a rack: `python launcher.py CONFIG [--fork] [KEY=VALUE]...`; says when it has launched."""
+"""A user's program that runs a rack: `python launcher.py CONFIG [--fork] [KEY=VALUE]...`; prints once launched."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from rack.boards import Rack
 
 
 def main(config: str, *settings: str) -> None:
-    """Launch the rack, say so, and run it to its end."""
+    """Launch the rack, report it, and run it to its end."""
     with Rack.from_file(config, [s for s in settings if s != "--fork"]) as rack:
         if "--fork" in settings and os.fork() == 0:
-            # A child that has every descriptor of the launcher and outlives it.
+            # A child that inherits every descriptor of the launcher and outlives it.
             time.sleep(60)
             os._exit(0)
         rack.start()

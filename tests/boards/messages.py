@@ -1,4 +1,4 @@
-"""Everything that two runs wrote, side by side."""
+"""Everything that a run wrote, to compare runs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ WHAT = ("serial", "tick", "visible_at", "basis", "chain")
 
 @dataclass(frozen=True)
 class Written:
-    """The messages of a run by mailbox, and its cycles by task; a run shorter than the rings loses none."""
+    """The messages of a run by mailbox, and its cycles by task; complete if the run is shorter than the rings."""
 
     messages: dict[str, np.ndarray]
     cycles: dict[str, np.ndarray]
 
     @classmethod
     def on(cls, segment: Segment) -> Written:
-        """Take what is on a segment."""
+        """Read everything from a segment."""
         messages, cycles = {}, {}
         for mailbox in segment.layout.mailboxes:
             messages[mailbox.name], lost = MailboxRing(segment, mailbox.name).drain()
@@ -37,7 +37,7 @@ class Written:
         found = [otherwise]
         for rows in self.cycles.values():
             late = np.flatnonzero(rows["flags"] & (Flag.MISSED | Flag.SKIPPED))
-            # What was skipped lies behind the cycle before.
+            # Skipped releases follow the cycle before.
             found += [int(rows["tick"][at - 1]) + 1 if at else 0 for at in late[:1]]
         return min(found)
 

@@ -1,4 +1,4 @@
-"""Launchers as programs of their own, and everything that descends from them."""
+"""Launchers as separate programs, and all their descendants."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROOT = HERE.parents[1]
 
 
 class Program:
-    """A launcher that runs in a session of its own."""
+    """A launcher in its own session."""
 
     def __init__(self, config: Path, *settings: str) -> None:
         self._process = subprocess.Popen(
@@ -45,7 +45,7 @@ class Program:
 
     @property
     def descendants(self) -> list[int]:
-        """The processes that the launcher has left running."""
+        """The processes of the launcher's session that still run."""
         found = []
         for path in Path("/proc").glob("[0-9]*/stat"):
             with suppress(FileNotFoundError, ProcessLookupError):
@@ -55,11 +55,11 @@ class Program:
         return found
 
     def wait_for_descendants(self) -> None:
-        """Wait until none of them runs any more."""
+        """Wait until none of them runs."""
         wait_until(lambda: not self.descendants)
 
     def close(self) -> None:
-        """Kill what is left of it."""
+        """Kill whatever still runs."""
         for pid in [self.pid, *self.descendants]:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -70,7 +70,7 @@ class Program:
 
 @contextmanager
 def launcher(config: Path, *settings: str) -> Iterator[Program]:
-    """Start a launcher; at the end nothing of it runs."""
+    """Start a launcher; at the end, kill what remains of it."""
     program = Program(config, *settings)
     try:
         yield program

@@ -1,4 +1,4 @@
-"""From config to layout: who writes, who reads, how long it takes, how much is kept."""
+"""From config to layout: writers, readers, delays and depths."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_message_is_delayed_by_its_writers_slice(small: Path) -> None:
     }
 
 
-def test_mailboxes_keep_two_seconds_and_never_less_than_their_readers_slice(small: Path) -> None:
+def test_mailboxes_keep_two_seconds_and_at_least_their_readers_slice(small: Path) -> None:
     layout = wire(load(small, ["board.lower.within_cycles=9000"]))
     assert layout.mailbox("lower.status").depth == depth_for(800, 1)
     assert layout.mailbox("upper.command").depth == depth_for(9008, 8)
@@ -73,7 +73,7 @@ def test_a_port_can_be_wired_to_another_mailbox(small: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [TASK_COMMAND, TASK_PLAN], ids=lambda kind: kind.name)
-def test_field_specs_describe_the_very_bytes_of_a_message(kind) -> None:
+def test_field_specs_describe_the_exact_bytes_of_a_message(kind) -> None:
     dtype = kind.dtype(SIZES)
     described = message_dtype(field_specs(kind, SIZES), dtype.itemsize)
     assert described.itemsize == dtype.itemsize
@@ -83,11 +83,11 @@ def test_field_specs_describe_the_very_bytes_of_a_message(kind) -> None:
     assert described["moves"].base.fields["position"][1] == dtype["moves"].base.fields["position"][1]
 
 
-def test_cores_that_the_machine_lacks_are_shared_out_and_reported(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_cores_are_replaced_and_reported(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
     assert [obtained_core(core) for core in range(6)] == [2, 3, 2, 3, 2, 3]
     assert shared_out(load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])) == [
-        "core 5 is not available (available: 2, 3): upper on core 3"
+        "core 5 is not available (available: 2, 3): core 3 runs upper"
     ]
 
 
@@ -99,7 +99,7 @@ def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
     assert lower.params == {"gain": 2}
 
 
-def test_all_that_a_launch_needs_is_resolved_and_checked_once(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_launch_resolves_and_checks_everything_once(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checked = []
     monkeypatch.setattr(resolved, "disagreements", lambda *of: checked.append(of) or disagreements(*of))
     settings = ["fault=[{ kind = 'self-test', board = 'upper' }]", "board.lower.transfer.read_ms=0.5"]

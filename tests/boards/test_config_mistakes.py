@@ -41,17 +41,20 @@ MISTAKES = {
         'board.lower.below = "upper": the levels form a circle, upper -> lower -> upper; the lowest level has no below',
     ),
     "circle above": ("board.upper.above=lower", "a circle, upper -> lower -> upper; the highest level has no above"),
-    "truth for a number": ("clock.period_ms=true", "clock.period_ms = true: should be a valid number; one tick, ms"),
+    "truth for a number": ("clock.period_ms=true", "clock.period_ms = true: should be a valid number; tick period, ms"),
     "text for a number": ("board.upper.core='1'", 'board.upper.core = "1": should be a valid integer'),
     "number for a truth": ("board.upper.ends_run=1", "board.upper.ends_run = 1: should be a valid boolean"),
-    "very short tick": ("clock.period_ms=1e-6", "should be greater than or equal to 0.01; one tick, ms"),
+    "very short tick": ("clock.period_ms=1e-6", "should be greater than or equal to 0.01; tick period, ms"),
     "very fast": ("clock.speed=1e300", "clock.speed = 1e+300: should be less than or equal to 1000; simulated time"),
     "very slow": ("clock.speed=1e-300", "clock.speed = 1e-300: should be greater than or equal to 0.001"),
     "short tick in real time": (
         "clock={ mode = 'realtime', speed = 500 }",
-        "clock.speed = 500.0: makes a tick of 0.005 ms in real time; permitted: 0.01 ms or more",
+        "clock.speed = 500.0: a tick would take 0.005 ms of real time; permitted: 0.01 ms or more",
     ),
-    "very long cycle": ("board.lower={ rate_hz = 1e-5 }", "makes a cycle of 40000000 ticks; permitted: 1000000"),
+    "very long cycle": (
+        "board.lower={ rate_hz = 1e-5 }",
+        "a cycle would take 40000000 ticks; permitted: up to 1000000",
+    ),
     "rate near zero": ("board.lower={ rate_hz = 5e-324 }", "board.lower.rate_hz = 5e-324: should be greater than or"),
     "own neighbour": ("board.lower.above=lower", "no other board has this name"),
     "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose" with a planner'),
@@ -63,7 +66,7 @@ MISTAKES = {
         "board.upper.wake=poll",
         "needs a core of its own, but shares core 0 with: clock, lower, lower.planner",
     ),
-    "two ends": ("board.lower.ends_run=true", "only one board can end the run, and 'upper' does"),
+    "two ends": ("board.lower.ends_run=true", "only one board can end the run; 'upper' already does"),
     "board name": (
         "board.own={ slot = 4, every = 1, executor = 'two_levels:Upper', below = 'lower' }",
         "invalid name for a board",
@@ -143,7 +146,7 @@ what = "hold"
 home = true
 """
     found = {mistake.place: mistake.why for mistake in mistakes(write("mine.toml", text))}
-    # What a mistake of its own hides: nothing of the world board, of the first fault, of the first command follows.
+    # No further mistakes of tables that are broken: the world board, the first fault, the first command.
     assert set(found) == {
         "clock.wake",
         "robot.joints",
@@ -181,12 +184,12 @@ def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
     assert all(line.isprintable() and len(line) < 500 for line in lines)
 
 
-def test_a_segment_that_no_machine_has_room_for_is_refused(small: Path) -> None:
-    with pytest.raises(ConfigError, match=r"^mailbox upper.command: keeps \d+ messages .*; permitted: 1073741824; "):
+def test_a_segment_too_large_for_any_machine_is_refused(small: Path) -> None:
+    with pytest.raises(ConfigError, match=r"^mailbox upper.command: \d+ messages are kept .*; permitted: 1073741824; "):
         resolve(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
 
 
-def test_a_broken_board_does_not_make_its_neighbours_wrong(small: Path) -> None:
+def test_a_broken_board_causes_no_mistakes_in_its_neighbours(small: Path) -> None:
     assert [mistake.place for mistake in mistakes(small, "board.lower.slot=99")] == ["board.lower.slot"]
 
 
@@ -199,7 +202,7 @@ def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "place"), [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")]
 )
-def test_a_value_of_several_kinds_makes_one_mistake(setting: str, place: str) -> None:
+def test_a_value_of_several_possible_types_makes_one_mistake(setting: str, place: str) -> None:
     (mistake,) = mistakes("nasrem", f"robot.sensors.{setting}")
     assert (mistake.place, mistake.value) == (f"robot.sensors.{place}", -1)
 

@@ -110,6 +110,6 @@ def test_tables_are_found_by_the_names_that_a_config_uses(name: str, found: list
     assert [table.name for table in find_tables(name, load("nasrem"))] == found
 
 
-def test_an_unknown_table_is_refused_with_those_there_are() -> None:
+def test_an_unknown_table_is_refused_with_the_known_tables() -> None:
     with pytest.raises(LookupError, match=r"no such table; tables: rack, clock, protocol, .*task"):
         find_tables("bord", load("nasrem"))

@@ -20,11 +20,11 @@ def test_budgets_are_whole_nanoseconds_by_board(small: Path) -> None:
     assert budgets(config) == {"lower": Budget(read_ns=100_000, process_ns=1_250_000, update_ns=1)}
 
 
-def test_how_soon_a_plan_is_wanted_is_no_part_of_what_it_takes(small: Path) -> None:
+def test_plan_within_ms_is_not_part_of_the_budget(small: Path) -> None:
     assert budgets(load(small, [WITHIN])) == {"lower": Budget(process_ns=1_500_000, plan_ns=3_000_000)}
 
 
-def test_other_budgets_go_into_a_config_and_come_out_as_they_were(small: Path) -> None:
+def test_budgets_survive_being_put_into_a_config(small: Path) -> None:
     upper = Budget(process_ns=3, exchange_ns=5)
     changed = loads(with_budgets(load(small, [WITHIN]), {"lower": MEASURED, "upper": upper}).text())
     # The upper level has no planner, and so no plan to read.
@@ -36,7 +36,7 @@ def test_other_budgets_go_into_a_config_and_come_out_as_they_were(small: Path) -
 
 @pytest.mark.parametrize("table", ["budget", "transfer"])
 @pytest.mark.parametrize("key", ["exchange_ms", "update_ms"])
-def test_what_a_planner_would_take_is_a_mistake_without_one(small: Path, table: str, key: str) -> None:
+def test_planner_times_without_a_planner_are_a_mistake(small: Path, table: str, key: str) -> None:
     with pytest.raises(ConfigError, match=rf"board\.upper\.{table}\.{key} = 1\.5: the board has no planner"):
         wire(load(small, [f"board.upper.{table}.{key}=1.5"]))
     assert wire(load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"]))

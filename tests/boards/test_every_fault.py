@@ -53,7 +53,7 @@ def rack_with(config: MakeConfig, kind: Kind, length: dict[str, Any]) -> Rack:
 
 
 @pytest.mark.parametrize(("kind", "length"), cases(realtime=False))
-def test_a_fault_is_found_and_over_or_latched_within_its_bound(
+def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
     config: MakeConfig, kind: Kind, length: dict[str, Any]
 ) -> None:
     with rack_with(config, kind, length) as rack:
@@ -87,9 +87,7 @@ def test_a_fault_is_found_and_over_or_latched_within_its_bound(
 
 
 @pytest.mark.parametrize(("kind", "length"), cases(realtime=True))
-def test_a_fault_that_takes_real_time_is_over_or_latched_in_the_end(
-    config: MakeConfig, kind: Kind, length: dict[str, Any]
-) -> None:
+def test_a_fault_in_real_time_finally_ends_or_latches(config: MakeConfig, kind: Kind, length: dict[str, Any]) -> None:
     with rack_with(config, kind, length) as rack:
         rack.start()
         entry, watch = FaultTable(rack.segment).entries[0], rack.segment.block("watch")
@@ -122,7 +120,7 @@ def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> 
         assert rack.watch(0.02)
 
 
-def test_a_run_ends_when_nothing_is_heard_any_more_of_the_level_that_ends_it(config: MakeConfig) -> None:
+def test_a_run_ends_when_the_level_that_ends_it_falls_silent(config: MakeConfig) -> None:
     slow = FOLLOWED.replace("rate_hz = 400", "rate_hz = 40").replace("rate_hz = 50", "rate_hz = 5")
     fault = FaultConfig(kind="mute", board="watch", tick=FIRST)
     with Rack(config("clock.period_ms=25", text=slow).model_copy(update={"fault": (fault,)})) as rack:

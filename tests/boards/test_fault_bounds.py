@@ -34,13 +34,13 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
     "reorder": ({"kind": "reorder", "board": "wave"}, "watch", 1 + 1 + 8),
     "delay": ({"kind": "delay", "board": "wave", "by": 3}, "watch", 3 + 1 + 8),
     "corrupt": ({"kind": "corrupt", "board": "wave"}, "watch", 1 + 8),
-    "corrupt plan, visible behind its slice": ({"kind": "corrupt", "board": "wave.planner"}, "wave", 4 + 1),
+    "corrupt plan, visible after its slice": ({"kind": "corrupt", "board": "wave.planner"}, "wave", 4 + 1),
     "babble": ({"kind": "babble", "board": "wave"}, None, 1 + 4),
     "masquerade": ({"kind": "masquerade", "board": "wave"}, None, 1 + 4),
     "clock stops": ({"kind": "clock-stop", "board": "clock"}, None, 3),
     "clock skips": ({"kind": "clock-skip", "board": "clock", "ticks": 4}, None, 4),
     "clock jitters": ({"kind": "clock-jitter", "board": "clock"}, None, 2),
-    # What is driven has a cycle of two ticks.
+    # The driven board has a cycle of two ticks.
     "sensor-nan": ({"kind": "sensor-nan", "board": "driven"}, None, 2),
     "sensor-stuck": ({"kind": "sensor-stuck", "board": "driven"}, None, 40),
     "sensor-dropout": ({"kind": "sensor-dropout", "board": "driven"}, None, 4),
@@ -60,23 +60,23 @@ def bound(config: MakeConfig, fault: dict[str, Any], reader: str | None, *settin
 
 
 @pytest.mark.parametrize(("fault", "reader", "ticks"), CASES.values(), ids=CASES)
-def test_a_fault_must_be_found_within(
+def test_a_fault_must_be_detected_within(
     config: MakeConfig, fault: dict[str, Any], reader: str | None, ticks: int | None
 ) -> None:
     assert bound(config, fault, reader) == ticks
 
 
-def test_a_lock_that_is_held_is_found_by_the_bound_of_a_wait(config: MakeConfig) -> None:
+def test_a_held_lock_is_detected_within_the_bound_of_a_wait(config: MakeConfig) -> None:
     # 2 ms of 2.5 ms ticks, and the cycle of the first reader.
     assert bound(config, {"kind": "lock-held", "board": "wave"}, None, "protocol.default=lock") == 1 + 4
 
 
-def test_every_kind_has_a_bound_but_those_that_say_why_not() -> None:
+def test_every_kind_has_a_bound_or_says_why_not() -> None:
     without = {kind.name for kind in KINDS if kind.bound in (BY_SIZE, NOT_ARMED)}
     assert without == {"sensor-bias", "sensor-noise", "self-test"}
 
 
-def test_a_bound_says_in_words_how_it_is_computed() -> None:
+def test_the_text_of_a_bound_matches_its_computation() -> None:
     words = {name: str(KINDS[name].bound) for name in ("hang", "mute", "planner-slow", "clock-stop", "command-nan")}
     assert words == {
         "hang": "5 cycles",

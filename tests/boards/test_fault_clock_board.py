@@ -20,7 +20,7 @@ CYCLE_S = 0.05
 """Longer than the clock takes for all ticks of the slow task's period."""
 
 
-def test_no_fault_begins_or_ends_while_a_cycle_is_under_way(make_bus: MakeBus) -> None:  # noqa: F811
+def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:  # noqa: F811
     segment = make_bus(task("writer", every=8), mailbox(every=8, delay=8))
     segment.words[System.LOCKSTEP] = 1
     table = FaultTable(segment)

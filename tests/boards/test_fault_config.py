@@ -18,7 +18,7 @@ Write = Callable[[str, str], Path]
 SCRIPT = '[[fault]]\nkind = "kill"\nboard = "lower"\ntick = 8\n'
 
 
-def test_no_parameter_is_called_as_a_key_of_every_fault_is() -> None:
+def test_no_parameter_has_the_name_of_a_common_fault_key() -> None:
     keys = {field.alias or name for name, field in FaultConfig.model_fields.items()}
     assert not [(kind.name, p.name) for kind in KINDS for p in kind.parameters if p.name in keys]
 
@@ -39,7 +39,7 @@ def test_the_resolved_text_of_a_config_with_faults_loads_again(config: MakeConfi
     assert (again.fault[0].lasts, again.fault[1].parameters) == (0.02, {"size": 0.1, "joint": -1.0})
 
 
-def test_the_faults_of_a_script_come_behind_those_of_the_config(small: Path, write: Write) -> None:
+def test_the_faults_of_a_script_come_after_those_of_the_config(small: Path, write: Write) -> None:
     own = 'fault=[{ kind = "hang", board = "upper" }]'
     path = write("mine.toml", small.read_text() + '\n[[fault]]\nkind = "hang"\nboard = "upper"\n')
     script = write("script.toml", SCRIPT + '\n[[fault]]\nkind = "mute"\nboard = "upper"\n')
@@ -56,7 +56,7 @@ def test_every_bundled_script_fits_the_nasrem_rack(name: str) -> None:
     assert loads(config.text()) == config
 
 
-def test_an_unknown_script_lists_those_there_are(small: Path) -> None:
+def test_an_unknown_script_lists_the_known_scripts(small: Path) -> None:
     with pytest.raises(ConfigError) as error:
         load(small, faults="noisy")
     assert str(error.value) == f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'
@@ -87,7 +87,7 @@ def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "expected"),
     [
         ("supervision.restarts=-1", "supervision.restarts = -1: should be greater than or equal to 0"),
         ("supervision.within_s=0", "supervision.within_s = 0: should be greater than 0"),
@@ -97,8 +97,8 @@ def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
         ("supervision.restart=1", "unknown key; did you mean 'restarts'?"),
     ],
 )
-def test_load_tells_a_mistake_of_supervision(small: Path, setting: str, told: str) -> None:
+def test_load_reports_a_mistake_of_supervision(small: Path, setting: str, expected: str) -> None:
     with pytest.raises(ConfigError) as error:
         load(small, [setting])
-    assert told in str(error.value)
+    assert expected in str(error.value)
     assert len(error.value.mistakes) == 1

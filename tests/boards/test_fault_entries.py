@@ -73,7 +73,7 @@ def test_a_forged_message_goes_to_the_first_mailbox_that_is_read(config: MakeCon
 
 
 @pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
-def test_a_condition_is_a_number_or_the_name_of_one(config: MakeConfig, value: str) -> None:
+def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, value: str) -> None:
     (found,) = injected(config, {"kind": "kill", "board": "wave", "when": f"watch.status.state=={value}"})
     layout = wire(rack(config))
     assert found.when is not None
@@ -99,12 +99,12 @@ def test_parameters_stand_in_the_order_of_their_kind(config: MakeConfig) -> None
     assert found.parameters == (1.5, 1.0)
 
 
-def test_a_phase_is_cut_to_thousandths_of_a_tick(config: MakeConfig) -> None:
+def test_a_phase_is_rounded_down_to_thousandths_of_a_tick(config: MakeConfig) -> None:
     (found,) = injected(config, {"kind": "kill", "board": "wave", "phase": 0.2505})
     assert found.phase == 250
 
 
-def test_faults_throw_dice_of_their_own_that_the_racks_seed_repeats(config: MakeConfig) -> None:
+def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(config: MakeConfig) -> None:
     drop = {"kind": "drop", "board": "wave"}
     first, second, given = injected(config, drop, drop, {**drop, "seed": 7})
     assert first.seed != second.seed
@@ -114,14 +114,14 @@ def test_faults_throw_dice_of_their_own_that_the_racks_seed_repeats(config: Make
     assert injections(other, wire(other))[0].seed != first.seed
 
 
-def test_one_fault_outside_a_config_is_checked_alike(config: MakeConfig) -> None:
+def test_a_fault_injected_live_is_checked_in_the_same_way(config: MakeConfig) -> None:
     found = rack(config)
     fault = FaultConfig.model_validate({"kind": "hang", "board": "wave", "for": 0.1, "size": 1})
     with pytest.raises(ConfigError, match=r"^size = 1: hang has no such parameter; parameters: none$"):
         injection(fault, found, wire(found))
 
 
-def test_the_table_holds_and_tells_what_was_asked_for(config: MakeConfig, rack_name: str) -> None:
+def test_the_fault_table_returns_the_faults_added(config: MakeConfig, rack_name: str) -> None:
     faults = [
         {"kind": "corrupt", "board": "wave", "mailbox": "wave.status", "tick": 8, "cycles": 2, "bits": 5},
         {"kind": "sensor-bias", "board": "driven", "joint": 1, "size": 0.1},
@@ -138,8 +138,8 @@ def test_the_table_holds_and_tells_what_was_asked_for(config: MakeConfig, rack_n
         assert describe(entries[1], layout, ("a", "b")) == "sensor-bias of driven (b, size 0.1 rad)"
         assert document(entries[0], layout, ())["until"] is None
         entries[1].words[Entry.STAGE], entries[1].words[Entry.UNTIL] = Stage.ACTIVE, NEVER
-        told = document(entries[1], layout, ("a", "b"))
-        assert (told["stage"], told["until"], told["parameters"]) == ("active", None, {"joint": 1.0, "size": 0.1})
+        entry = document(entries[1], layout, ("a", "b"))
+        assert (entry["stage"], entry["until"], entry["parameters"]) == ("active", None, {"joint": 1.0, "size": 0.1})
     finally:
         segment.close()
         unlink(rack_name)

@@ -1,4 +1,4 @@
-"""Faults of a writer: really done to its messages, found by who reads them within their bounds, and over when over."""
+"""Faults of a writer: they act on its messages, are detected by the reader within their bounds, and end."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FAULTS: dict[str, tuple[float, ...]] = {
     "babble": (16,),
 }
 ALSO = {"delay": {Alarm.MUTE}, "reorder": {Alarm.HELD_BACK}}
-"""What else may be rung: a message that will come late has not come yet; the last to be exchanged comes late."""
+"""Other permitted alarms: a delayed message is at first missing; the last swapped message is late."""
 BEGIN, END, LAST = 64, 160, 320
 
 
@@ -42,14 +42,14 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 def forge(rack: Link, tick: int) -> None:
-    """Publish a forged message from a process of its own."""
+    """Publish a forged message from another process."""
     assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 
 @pytest.mark.parametrize("reader_first", [False, True])
 @pytest.mark.parametrize("rates", RATES)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_without_a_fault_nobody_rings(
+def test_without_a_fault_no_alarm_is_raised(
     link: MakeLink, protocol: Protocol, rates: tuple[int, int], reader_first: bool
 ) -> None:
     rack = link(protocol, rates, reader_first)
@@ -62,7 +62,7 @@ def test_without_a_fault_nobody_rings(
 @pytest.mark.parametrize("rates", RATES)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("kind", FAULTS)
-def test_a_fault_is_found_within_its_bound_and_for_what_it_is(
+def test_a_fault_is_detected_within_its_bound_and_identified(
     link: MakeLink, kind: str, protocol: Protocol, rates: tuple[int, int], reader_first: bool
 ) -> None:
     rack = link(protocol, rates, reader_first)
@@ -85,7 +85,7 @@ def test_a_fault_is_found_within_its_bound_and_for_what_it_is(
 
 @pytest.mark.parametrize("rates", RATES)
 @pytest.mark.parametrize("kind", [*FAULTS, "masquerade"])
-def test_what_is_read_with_a_fault_depends_on_ticks_alone(link: MakeLink, kind: str, rates: tuple[int, int]) -> None:
+def test_reads_with_a_fault_depend_on_ticks_alone(link: MakeLink, kind: str, rates: tuple[int, int]) -> None:
     runs = []
     for reader_first in (False, True):
         rack = link("time-slice", rates, reader_first)
@@ -101,11 +101,11 @@ def test_what_is_read_with_a_fault_depends_on_ticks_alone(link: MakeLink, kind: 
     (seen, alarms, written), (seen_again, alarms_again, written_again) = runs
     assert seen == seen_again
     assert written == written_again
-    # A forged message is there until the true writer's next: whoever comes first sees it.
+    # A forged message lasts until the true writer's next one: only a reader that comes before sees it.
     assert alarms == alarms_again or kind == "masquerade"
 
 
-def test_mute_writes_nothing_and_says_it_did(link: MakeLink) -> None:
+def test_mute_writes_nothing_and_reports_success(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 8)
     entry = rack.fault("mute")
@@ -117,7 +117,7 @@ def test_mute_writes_nothing_and_says_it_did(link: MakeLink) -> None:
     assert [tick for tick, *_ in rack.written()] == [*range(8), *range(12, 16)]
 
 
-def test_a_dropped_message_takes_a_serial_and_fills_no_slot(link: MakeLink) -> None:
+def test_a_dropped_message_uses_a_serial_but_fills_no_slot(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 8)
     entry = rack.fault("drop", 0.5)
@@ -131,7 +131,7 @@ def test_a_dropped_message_takes_a_serial_and_fills_no_slot(link: MakeLink) -> N
 
 
 @pytest.mark.parametrize("every", [1, 4])
-def test_a_delayed_message_comes_so_many_cycles_later_as_of_its_own_tick(link: MakeLink, every: int) -> None:
+def test_a_delayed_message_keeps_its_tick_and_comes_cycles_later(link: MakeLink, every: int) -> None:
     rack = link(rates=(every, 1))
     rack.run(0, 8 * every)
     rack.fault("delay", 3)
@@ -145,7 +145,7 @@ def test_a_delayed_message_comes_so_many_cycles_later_as_of_its_own_tick(link: M
     assert rack.reader.seen[-1].released // every == 18
 
 
-def test_what_is_held_back_comes_in_a_cycle_without_a_message_too(link: MakeLink) -> None:
+def test_delayed_messages_come_even_in_a_cycle_without_a_message(link: MakeLink) -> None:
     rack = link()
     rack.fault("delay", 2)
     rack.writer.cycle(0)
@@ -155,7 +155,7 @@ def test_what_is_held_back_comes_in_a_cycle_without_a_message_too(link: MakeLink
     assert [(tick, visible) for tick, _, visible in rack.written()] == [(0, 3)]
 
 
-def test_reordered_messages_change_places(link: MakeLink) -> None:
+def test_reordered_messages_are_swapped(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 4)
     rack.fault("reorder", 1.0)
@@ -167,7 +167,7 @@ def test_reordered_messages_change_places(link: MakeLink) -> None:
     assert [seen.released for seen in rack.reader.seen] == [-1, 0, 1, 2, 3, 3, 4, 4, 6, 8]
 
 
-def test_a_damaged_message_is_not_handed_out_and_the_next_whole_one_is(link: MakeLink) -> None:
+def test_a_damaged_message_is_skipped_and_the_next_intact_one_is_read(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 8)
     entry = rack.fault("corrupt", 1.0, 1)
@@ -180,7 +180,7 @@ def test_a_damaged_message_is_not_handed_out_and_the_next_whole_one_is(link: Mak
 
 
 @pytest.mark.parametrize("bits", [1, 2, 16, 64])
-def test_every_damage_is_found(link: MakeLink, bits: int) -> None:
+def test_every_damage_is_detected(link: MakeLink, bits: int) -> None:
     rack = link()
     rack.fault("corrupt", 1.0, bits)
     rack.run(0, 50)
@@ -188,7 +188,7 @@ def test_every_damage_is_found(link: MakeLink, bits: int) -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_babble_writes_so_many_messages_a_cycle(link: MakeLink, protocol: Protocol) -> None:
+def test_babble_writes_the_given_number_of_messages_per_cycle(link: MakeLink, protocol: Protocol) -> None:
     rack = link(protocol)
     rack.run(0, 4)
     rack.fault("babble", 40)
@@ -196,7 +196,7 @@ def test_babble_writes_so_many_messages_a_cycle(link: MakeLink, protocol: Protoc
     assert [tick for tick, *_ in rack.written()] == [0, 1, 2, 3] + [4] * 40 + [5] * 40
 
 
-def test_the_least_and_the_wildest_babble_are_found(link: MakeLink) -> None:
+def test_the_smallest_and_the_largest_babble_are_detected(link: MakeLink) -> None:
     for writes in (3, 1000):
         rack = link(depth=256)
         rack.run(0, 20)
@@ -218,7 +218,7 @@ def test_faults_of_one_mailbox_compose(link: MakeLink) -> None:
     assert rack.reader.seen[-1] == (98, 97, "NEW", False)
 
 
-def test_a_fault_that_goes_on_keeps_what_it_holds_back_when_another_begins(link: MakeLink) -> None:
+def test_a_fault_keeps_its_delayed_messages_when_another_begins(link: MakeLink) -> None:
     rack = link()
     rack.fault("delay", 2)
     rack.run(0, 8)
@@ -227,7 +227,7 @@ def test_a_fault_that_goes_on_keeps_what_it_holds_back_when_another_begins(link:
     assert [tick for tick, *_ in rack.written()] == [*range(10)]
 
 
-def test_a_fault_of_another_mailbox_is_none_here(link: MakeLink) -> None:
+def test_a_fault_of_another_mailbox_has_no_effect(link: MakeLink) -> None:
     rack = link()
     entry = rack.fault("mute", mailbox=1)
     rack.run(0, 8)
@@ -235,7 +235,7 @@ def test_a_fault_of_another_mailbox_is_none_here(link: MakeLink) -> None:
     assert entry[Entry.COUNT] == 0
 
 
-def test_what_is_random_repeats_with_its_seed(link: MakeLink) -> None:
+def test_random_faults_repeat_with_their_seed(link: MakeLink) -> None:
     def hits(seed: int) -> list[int]:
         rack = link()
         rack.fault("drop", 0.5, seed=seed)
@@ -246,7 +246,7 @@ def test_what_is_random_repeats_with_its_seed(link: MakeLink) -> None:
     assert first == hits(1) != hits(2)
 
 
-def test_a_late_cycle_is_late_with_a_fault_too(link: MakeLink) -> None:
+def test_a_late_cycle_is_late_even_with_a_fault(link: MakeLink) -> None:
     rack = link()
     rack.fault("corrupt", 0.001)
     assert rack.writer.cycle(0, now=0)
@@ -255,14 +255,14 @@ def test_a_late_cycle_is_late_with_a_fault_too(link: MakeLink) -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_forged_message_is_never_handed_out(link: MakeLink, protocol: Protocol) -> None:
+def test_a_forged_message_is_never_delivered(link: MakeLink, protocol: Protocol) -> None:
     rack = link(protocol, reader_first=True)
     rack.run(0, 8)
     forge(rack, 8)
     reading = rack.reader.cycle(8)
     assert (reading.value.id, reading.verdict) == (7, Verdict.NEW)
     assert rack.alarms() == [(8, Alarm.MASQUERADE)]
-    # The true writer takes the place back, and tells.
+    # The true writer takes its mailbox back, and reports it.
     rack.writer.cycle(8)
     assert rack.alarms("writer") == [(8, Alarm.MASQUERADE)]
     rack.run(9, 12)
@@ -270,7 +270,7 @@ def test_a_forged_message_is_never_handed_out(link: MakeLink, protocol: Protocol
     assert [seen.verdict for seen in rack.reader.seen[9:]] == ["NEW"] * 3
 
 
-def test_a_forged_message_in_a_mailbox_that_nobody_writes_now_stays_unread(link: MakeLink) -> None:
+def test_a_forged_message_in_an_idle_mailbox_stays_unread(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 8)
     for tick in range(8, 12):
@@ -281,14 +281,14 @@ def test_a_forged_message_in_a_mailbox_that_nobody_writes_now_stays_unread(link:
     assert rack.reader.cycle(13).value.id == 12
 
 
-def test_a_forged_first_message_is_no_message(link: MakeLink) -> None:
+def test_a_forged_first_message_is_ignored(link: MakeLink) -> None:
     rack = link()
     forge(rack, 0)
     assert not rack.reader.cycle(0).is_there
 
 
 @pytest.mark.parametrize("is_killed", [False, True])
-def test_a_process_that_ends_inside_the_critical_section_is_found_by_the_next_wait(
+def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wait(
     link: MakeLink, is_killed: bool
 ) -> None:
     rack = link("lock")
@@ -305,7 +305,7 @@ def test_a_process_that_ends_inside_the_critical_section_is_found_by_the_next_wa
         wait_until(lambda: state_of(pid) in ("Z" if is_killed else "T"))
         assert (struck(entry), entry[Entry.COUNT]) == (4, 1)
         reading = rack.reader.cycle(5)
-        # A dead process leaves its lock to the one who waits, a stopped one keeps it.
+        # The lock of a dead process goes to the waiter; a stopped process keeps it.
         assert reading.verdict is (Verdict.OLD if is_killed else Verdict.BUS_ERROR)
         assert reading.value.id == 3
         assert rack.alarms() == [(5, Alarm.LOCKED)]
@@ -315,7 +315,7 @@ def test_a_process_that_ends_inside_the_critical_section_is_found_by_the_next_wa
             assert rack.reader.cycle(6).value.id == 4
 
 
-def test_the_accounts_of_a_port_go_on_from_call_to_call(link: MakeLink) -> None:
+def test_the_counters_of_a_port_continue_from_call_to_call(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 8)
     size = rack.segment.layout.mailbox(NAME).size

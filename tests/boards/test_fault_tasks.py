@@ -22,7 +22,7 @@ LEAST_S = 0.5
 
 @needs_fifo
 @pytest.mark.filterwarnings(FORKS)
-def test_a_hog_that_waits_for_the_start_leaves_the_core_to_those_who_do_it(make_bus: MakeBus) -> None:  # noqa: F811
+def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(make_bus: MakeBus) -> None:  # noqa: F811
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = 2_500_000
     segment.block("level")[Block.CORE] = 0

@@ -44,7 +44,7 @@ def test_a_level_that_cannot_be_made_is_reported_with_its_error(config: MakeConf
     assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
 
 
-def test_a_board_that_leaves_without_a_word_is_no_ready_board(config: MakeConfig) -> None:
+def test_a_board_that_exits_silently_fails_the_launch(config: MakeConfig) -> None:
     assert refusal(Rack(config("board.wave.params.trouble='leave early'"))) == "board 'wave' ended: exit status 0"
 
 
@@ -73,7 +73,7 @@ def command_of(pid: int) -> bytes:
 
 
 @pytest.mark.parametrize("trouble", ["refuse", "leave early"])
-def test_failed_launches_leave_nothing_open_and_nobody_running(config: MakeConfig, trouble: str) -> None:
+def test_failed_launches_leave_no_file_open_and_no_process_running(config: MakeConfig, trouble: str) -> None:
     children, before = children_of(os.getpid()), descriptors()
     for _ in range(2):
         refusal(Rack(config(f"board.wave.params.trouble='{trouble}'")))
@@ -81,7 +81,7 @@ def test_failed_launches_leave_nothing_open_and_nobody_running(config: MakeConfi
     assert descriptors() == before
 
 
-def test_a_config_that_cannot_be_wired_starts_nobody(config: MakeConfig, rack_name: str) -> None:
+def test_a_config_that_cannot_be_wired_starts_no_process(config: MakeConfig, rack_name: str) -> None:
     good = config()
     board = good.board["watch"].model_copy(update={"executor": "wave_levels:Nobody"})
     bad = good.model_copy(update={"board": {**good.board, "watch": board}})

@@ -33,7 +33,7 @@ def fault(kind: str, board: str, tick: int, ticks: int = 80) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", KINDS_OF_WRITERS)
-def test_a_fault_of_an_executor_is_found_and_the_run_repeats(config: MakeConfig, kind: str) -> None:
+def test_a_fault_of_an_executor_is_detected_and_the_run_repeats(config: MakeConfig, kind: str) -> None:
     runs = [run(config(), fault(kind, "wave", 101)) for _ in range(2)]
     outcomes, found = zip(*runs, strict=True)
     assert outcomes[0].digest == outcomes[1].digest
@@ -56,7 +56,7 @@ def test_a_run_with_a_fault_of_a_planner_repeats(config: MakeConfig, kind: str, 
 
 
 @pytest.mark.parametrize("victim", ["wave", "wave.planner", "watch"])
-def test_a_lost_board_rings_for_its_own_silence_alone(config: MakeConfig, victim: str) -> None:
+def test_a_lost_board_raises_alarms_for_its_own_silence_alone(config: MakeConfig, victim: str) -> None:
     _, found = run(config(), {"kind": "kill", "board": victim, "tick": 100})
     # Nobody reads the watch, and plans have no period.
     assert {(event.code, event.subject) for event in found} == (
@@ -70,7 +70,7 @@ def test_without_a_fault_nothing_is_detected(config: MakeConfig, protocol: str) 
     assert found == []
 
 
-def test_the_bus_accounts_go_on_behind_a_restart(config: MakeConfig) -> None:
+def test_the_bus_counters_continue_after_a_restart(config: MakeConfig) -> None:
     given = config().model_copy(update={"fault": (FaultConfig(kind="kill", board="watch", tick=804),)})
     with Rack(given) as rack:
         rack.run(3.0)

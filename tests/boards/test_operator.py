@@ -15,11 +15,11 @@ from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, 
 from rack.backplane.words import Run, System
 from rack.boards import Rack
 from rack.boards.config import load, wire
+from rack.boards.config.commands import message_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
-from rack.boards.operating.command import message_of
 from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
@@ -48,7 +48,7 @@ def first(rows: np.ndarray, serial: int) -> int:
     return int(rows["tick"][np.argmax(rows["message"]["operator"] >= serial)])
 
 
-def test_a_command_is_given_at_its_tick_and_goes_down_level_by_level(commanded: Callable[..., RackConfig]) -> None:
+def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(commanded: Callable[..., RackConfig]) -> None:
     _, events, boxes = run(commanded(HELD))
     given = boxes["upper.operator"]
     assert given["tick"].tolist() == [101, 203]
@@ -76,13 +76,13 @@ def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., Ra
 @pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
 def test_commands_reach_their_level_under_any_protocol(commanded: Callable[..., RackConfig], protocol: str) -> None:
     config = commanded(HELD, f"protocol.default={protocol}")
-    # The clock waits for nobody.
+    # The clock must never wait.
     assert wire(config).mailbox("upper.operator").protocol == "double-buffer"
     _, _, boxes = run(config)
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
 
 
-def test_serials_rise_over_all_levels_in_the_order_of_giving(commanded: Callable[..., RackConfig]) -> None:
+def test_serials_rise_over_all_levels_in_order_of_issue(commanded: Callable[..., RackConfig]) -> None:
     setting = commands(
         "level='lower', what='hold', at=0.5",
         "level='upper', what='hold', tick=50",
@@ -133,7 +133,7 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, Operation.HOLD, 1)
 
 
-def test_a_command_overtaken_by_one_that_is_refused_stands(commanded: Callable[..., RackConfig]) -> None:
+def test_a_command_stays_in_force_when_the_next_one_is_refused(commanded: Callable[..., RackConfig]) -> None:
     # Both come within one cycle of the level.
     setting = commands("level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52")
     _, _, boxes = run(commanded(setting))
@@ -150,7 +150,7 @@ def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackCo
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
 
 
-def test_a_program_commands_its_rack_while_it_runs(commanded: Callable[..., RackConfig]) -> None:
+def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., RackConfig]) -> None:
     with Rack(commanded("clock.mode=realtime")) as rack:
         rack.start(20.0)
         entry = rack.command("lower", "hold")
@@ -167,7 +167,7 @@ def test_a_program_commands_its_rack_while_it_runs(commanded: Callable[..., Rack
 
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("is_killed", [False, True])
-def test_a_command_is_given_only_while_its_client_lives(commanded: Callable[..., RackConfig], is_killed: bool) -> None:
+def test_a_command_is_issued_only_while_its_client_lives(commanded: Callable[..., RackConfig], is_killed: bool) -> None:
     with Rack(commanded(commands("level='upper', what='hold', tick=50"))) as rack:
         table = OperatorTable(rack.segment)
         wanted = Request(table.entries[0][RequestWord.MAILBOX], bytes(table.entries[0].message), 100)
@@ -207,7 +207,7 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 MISTAKES = {
     "no such level": (
         "level='uper', what='hold'",
-        'command[0].level = "uper": no such level takes commands; levels: upper, lower',
+        'command[0].level = "uper": no level of this name takes commands; levels that do: upper, lower',
     ),
     "not for this level": (
         "level='lower', what='goto', home=true",

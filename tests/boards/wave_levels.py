@@ -1,6 +1,6 @@
-"""Levels for tests of boards: a wave that a planner scales, somebody who watches it, and trouble on request.
+"""Levels for tests of boards: a wave scaled by a planner, a level that watches it, and trouble on request.
 
-`trouble` in a level's parameters names what goes wrong and `at` the tick; `ticks` is how long it takes.
+A level's parameter `trouble` selects the trouble, `at` its tick and `ticks` its duration.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ GAIN = MessageType("gain", 1, (Field("gain", "f8", "1", "factor"), Field("made_a
 
 
 class Trouble:
-    """What a level does wrong, and when."""
+    """The trouble that a level makes."""
 
     def __init__(self, context: LevelContext) -> None:
         params: Mapping[str, Any] = context.params
@@ -36,9 +36,9 @@ class Trouble:
             os._exit(0)
 
     def at(self, tick: int) -> None:
-        """Do what is due at a tick."""
+        """Make the trouble due at a tick."""
         if self._kind == "print" and tick == self._at:
-            print("a wave", tick)  # noqa: T201  what boards print is heard
+            print("a wave", tick)  # noqa: T201  output of boards is tested
         elif self._kind == "raise" and tick == self._at:
             raise ValueError(f"no wave at tick {tick}")
         elif self._kind == "late" and tick == self._at:
@@ -48,7 +48,7 @@ class Trouble:
 
 
 class Wave(Executor):
-    """Writes a value that grows with time; done at the tick that `done_at` says."""
+    """Writes a value that grows with time; done at tick `done_at`."""
 
     outputs = {"status": WAVE}
 
@@ -59,7 +59,7 @@ class Wave(Executor):
         self._final = State[context.params.get("final", "DONE")]
 
     def self_test(self) -> None:
-        """Fail if that is asked for."""
+        """Fail if requested."""
         self.trouble.self_test()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
@@ -94,7 +94,7 @@ class Steady(PlannedWave):
 
 
 class GainPlanner(Planner):
-    """Plans the gain from the wave as it was seen, every `plan_every` ticks."""
+    """Plans the gain from the wave's status, every `plan_every` ticks."""
 
     inputs = {"status": Input(WAVE, "own.status")}
     output = GAIN
@@ -105,7 +105,7 @@ class GainPlanner(Planner):
         self._every = context.params.get("plan_every", 1)
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Want a plan every so many ticks."""
+        """Want a plan every `plan_every` ticks."""
         return tick % self._every == 0
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
@@ -124,7 +124,7 @@ class BadPlanner(GainPlanner):
 
 
 class Watch(Executor):
-    """Shows what it sees of the wave."""
+    """Repeats the wave's status."""
 
     inputs = {"status": Input(WAVE, "below.status")}
     outputs = {"status": WAVE}
@@ -137,12 +137,12 @@ class Watch(Executor):
 
 
 class Program(Executor):
-    """Fails at tick 8, with as many moves as its parameters say."""
+    """Fails at tick 8, with `moves` moves."""
 
     outputs = {"status": TASK_STATUS}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Say that it goes on, and then that it does not."""
+        """Report progress, then the error."""
         write.status.state = State.ERROR if tick >= 8 else State.EXECUTING
         write.status.moves = self.context.params["moves"]
 
@@ -151,6 +151,6 @@ class Endless(Watch):
     """A level whose self-test does not end."""
 
     def self_test(self) -> None:
-        """Wait for ever."""
+        """Wait forever."""
         while True:
             time.sleep(1)

@@ -7,7 +7,7 @@ from pathlib import Path
 from random import Random
 
 from rack.boards.config import load, rack_timing, wire
-from rack.boards.operating.command import CommandConfig
+from rack.boards.config.schema import CommandConfig
 from rack.levels.timing.system_response import command_paths
 from rack.tools.benches.response import (
     RUN_S,

@@ -148,7 +148,7 @@ def test_what_cannot_be_is_one_line_that_says_what_can(running: str, words: list
         ("drop", {"probability": "often"}, 'probability = "often": should be a valid number, '),
         ("mute", {"mailbox": "sea"}, "mailbox = \"sea\": 'wave' does not write it; it writes: wave.status"),
         ("mute", {"for": "1h"}, 'for = "1h": should be a time, as in "0.5s", "20ms" or 0.5; '),
-        ("mute", {"for": "1s", "cycles": "1"}, "cycles = 1: for is given as well; permitted: one of for,"),
+        ("mute", {"for": "1s", "cycles": "1"}, "cycles = 1: for is also given; permitted: one of for,"),
         ("kill", {"tick": "0"}, "tick = 0: has passed; the rack is at tick "),
         ("kill", {"phase": "1.5"}, 'phase = "1.5": should be less than 1; '),
         ("kill", {"when": "sea"}, 'when = "sea": must be mailbox.field == value, as in "elemental_move.status.verb'),

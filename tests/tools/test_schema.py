@@ -29,7 +29,7 @@ def test_each_key_of_a_table_is_one_line_with_unit_range_default_and_meaning(sma
         "to",
         "1000",
         "required",
-        "one tick; in whole ns",
+        "tick period; a whole number of ns",
     ]
 
 

@@ -19,8 +19,7 @@ import numpy as np
 
 from rack.boards import Rack
 from rack.boards.config import load, rack_timing, wire
-from rack.boards.config.schema import RackConfig
-from rack.boards.operating.command import CommandConfig
+from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress

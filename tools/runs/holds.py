@@ -14,8 +14,8 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
+from rack.boards.config.commands import describe
 from rack.boards.events import Event
-from rack.boards.operating.command import describe
 from rack.levels.operator import Answer, Operation
 from rack.tools.faults.ending import arm_of
 

@@ -1,4 +1,4 @@
-"""Alarms as events: rung into the rings of a real segment, and read as the Rack reads them."""
+"""Alarms as events: raised in the rings of a real segment, and read as the Rack reads them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def heard(
     return AlarmEvents(segment, JOINTS).of(row, owner)
 
 
-# What an operator says is told from the operator table: test_operator.py.
+# Operator commands come from the operator table: see test_operator.py.
 TOLD_HERE = [alarm for alarm in Alarm if alarm is not Alarm.COMMANDED]
 
 
@@ -92,15 +92,15 @@ def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
         (CLOCK, Alarm.STARVED, 1, 4, "'wave.planner' is not getting its core: 4 releases missed since tick 360"),
         ("watch", Alarm.STALE, 0, 12, "'wave.status' is stale, 12 ticks (30 ms): its writer 'wave' is dead or stopped"),
         ("watch", Alarm.MUTE, 0, 3, "'wave.status' is stale, 3 ticks (7.5 ms): 'wave' is running but not writing"),
-        ("watch", Alarm.GAP, 0, 2, "'wave.status': 2 messages lost, serials are missing"),
+        ("watch", Alarm.GAP, 0, 2, "'wave.status': 2 messages lost, gap in serials"),
         ("watch", Alarm.MASQUERADE, 0, 4711, "'wave.status': a message comes from process 4711, which is not"),
         ("wave", Alarm.CLOCK_STOPPED, -1, 3, "clock stopped: no tick for 3 ticks (7.5 ms)"),
         ("wave", Alarm.CLOCK_SKIPPED, -1, 1, "clock skipped 1 tick"),
         ("wave", Alarm.CLOCK_SKIPPED, -1, 3, "clock skipped 3 ticks"),
-        ("wave", Alarm.CLOCK_LATE, -1, 1_300_000, "clock late: a tick came 1.300 ms late"),
+        ("wave", Alarm.CLOCK_LATE, -1, 1_300_000, "clock late: tick 1.300 ms late"),
         ("driven", Alarm.SENSOR_RANGE, 1, float("nan"), "sensor elbow out of range: nan rad"),
         ("driven", Alarm.SENSOR_MODEL, -1, 0.05, "sensor all joints disagrees with the model: off by 0.05"),
-        ("driven", Alarm.ACTUATOR, 7, 0.5, "actuator joint 7 does not follow its torque: off by 0.5"),
+        ("driven", Alarm.ACTUATOR, 7, 0.5, "actuator joint 7 does not produce its commanded torque: off by 0.5"),
         ("driven", Alarm.COMMAND_LIMIT, 0, 512.25, "torque of shoulder cut to its limit: 512 N m was commanded"),
         ("driven", Alarm.BRAKES_CLOSED, -1, 0, "brakes engaged"),
         ("driven", Alarm.BRAKES_CLOSED, -1, 4, "brakes engaged: no torque for 4 ticks (10 ms)"),
@@ -122,7 +122,7 @@ def test_subjects_have_names_for_programs_too(segment: Segment) -> None:
     assert heard(segment, "wave", Alarm.CLOCK_STOPPED).subject == ""
 
 
-def test_a_return_names_the_returned_task(segment: Segment) -> None:
+def test_a_rejoin_names_the_task(segment: Segment) -> None:
     event = heard(segment, CLOCK, Alarm.REJOINED, 2, 200)
     assert (event.board, event.subject, event.text) == ("watch", "watch", "'watch' rejoined after 200 ticks (500 ms)")
     assert heard(segment, CLOCK, Alarm.REJOINED, -1, 4).board == CLOCK

@@ -54,7 +54,7 @@ def test_a_dead_racks_segment_and_semaphores_are_removed(spec: Layout) -> None:
     assert left(spec.rack) == []
 
 
-def test_nothing_there_is_nothing_removed(rack_name: str) -> None:
+def test_without_a_segment_nothing_is_removed(rack_name: str) -> None:
     assert not remove_dead(rack_name)
 
 

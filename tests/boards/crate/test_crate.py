@@ -80,5 +80,5 @@ def test_the_crate_ignores_an_interrupt_from_the_terminal() -> None:
     wait_until(line.printed)
     os.kill(line.pid, signal.SIGINT)
     line.close(20.0)
-    # Killed by the interrupt it would have a status of its own.
+    # Killed by the interrupt, it would have another status.
     assert line._process.returncode == 0

@@ -25,7 +25,7 @@ TASKS = ("wave", "wave.planner", "watch")
 
 
 def running(rack: Rack) -> None:
-    """Start a rack, and come back when it has done some cycles."""
+    """Start a rack, and return once it has done some cycles."""
     rack.start()
     wait_until(lambda: rack.segment.words[System.TICK] > 20)
 
@@ -60,8 +60,8 @@ def test_a_killed_process_ends_the_run_with_its_name(
         os.kill(process_of(rack, victim), signal.SIGKILL)
         outcome = end_of(rack)
     assert (outcome.cause, outcome.worked) == ("board lost", False)
-    told = "the crate ended" if victim == "crate" else f"board '{victim}' ended: signal SIGKILL"
-    assert any(told in fault for fault in outcome.faults)
+    text = "the crate ended" if victim == "crate" else f"board '{victim}' ended: signal SIGKILL"
+    assert any(text in fault for fault in outcome.faults)
     assert next(event.board for event in rack.events if event.kind == "died") == victim
     wait_until(lambda: not any(runs(pid) for pid in family))
 
@@ -112,7 +112,7 @@ def test_a_level_that_raises_is_reported_with_its_reason(config: MakeConfig) -> 
     assert "board 'wave' ended: exit status 1" in outcome.faults[0]
     printed = [event.text for event in rack.events if event.kind == "printed"]
     assert any("ValueError: no wave at tick 30" in line for line in printed)
-    # In lockstep it is given up where it would have come back, 0.5 s later, and the arm gets 0.5 s to come to rest.
+    # In lockstep it is given up when it would have rejoined, 0.5 s later; the arm gets 0.5 s to come to rest.
     assert outcome.ticks == 30 + 200 + 200
 
 
@@ -146,7 +146,7 @@ def test_a_killed_launcher_takes_every_process_with_it(waves: tuple[Path, str], 
         program.send(signal.SIGKILL)
         program.ended()
         program.wait_for_descendants()
-    # The segment stays, for whoever wants to know; the next launch or 'rack clean' removes it.
+    # The segment stays for inspection, until the next launch or 'rack clean' removes it.
     assert not Segment.attach(rack_name).launcher_is_alive
 
 
@@ -155,7 +155,7 @@ def test_a_process_that_the_launcher_forked_does_not_keep_its_rack(waves: tuple[
         program.wait_for_launch()
         program.send(signal.SIGKILL)
         program.ended()
-        # What is left is the launcher's own child.
+        # Only the launcher's own child is left.
         wait_until(lambda: len(program.descendants) == 1)
 
 
@@ -194,7 +194,7 @@ def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
     rng = random.Random(11)
     for round_ in range(8):
         with launcher(*waves, REALTIME) as program:
-            # From the first import to the first cycles; every other time there is a segment to leave behind.
+            # From the first import to the first cycles; half of the times a segment exists.
             if round_ % 2:
                 wait_until(lambda: rack_name in racks())
             time.sleep(rng.uniform(0.0, 0.5))
@@ -206,7 +206,7 @@ def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
         assert not named(f"{rack_name}:")
 
 
-def test_a_board_killed_at_any_moment_of_its_life_is_no_hang(config: MakeConfig) -> None:
+def test_a_board_killed_at_any_moment_does_not_count_as_hanging(config: MakeConfig) -> None:
     rng = random.Random(5)
     for _ in range(6):
         with Rack(config(REALTIME, NEVER)) as rack:

@@ -46,8 +46,8 @@ def second(config: MakeConfig, rack: Rack, *settings: str, text: str = PLAIN) ->
 def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack) -> None:
     with pytest.raises(ConfigError) as refused:
         Rack(second(config, first, "board.wave.core=0"), share=False).launch()
-    holder = f"rack '{first.config.name}' (process {os.getpid()}) runs wave there at real-time priority"
-    wanted = f"core 0, asked for by wave: {holder}: stop that rack, choose other cores, or give --share"
+    holder = f"rack '{first.config.name}' (process {os.getpid()}) runs wave on it at real-time priority"
+    wanted = f"core 0, requested by wave: {holder}: stop that rack, choose other cores, or use --share"
     assert str(refused.value) == wanted
 
 
@@ -55,7 +55,7 @@ def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack)
 def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
     with Rack(second(config, first, "board.wave.core=0")) as rack:
         ready = [event.text for event in rack.events if event.kind == "ready"]
-    assert ready[0].startswith(f"core 0, asked for by wave: rack '{first.config.name}'")
+    assert ready[0].startswith(f"core 0, requested by wave: rack '{first.config.name}'")
 
 
 @needs_fifo
@@ -67,7 +67,7 @@ def test_waiting_racks_hold_no_core(config: MakeConfig, first: Rack, setting: st
 
 @needs_fifo
 @needs_two_cores
-def test_a_board_that_names_no_core_gets_another(config: MakeConfig, first: Rack) -> None:
+def test_a_board_without_a_core_setting_moves_to_a_free_core(config: MakeConfig, first: Rack) -> None:
     with Rack(second(config, first, text=ELSEWHERE), share=False) as rack:
         ready = [event.text for event in rack.events if event.kind == "ready"]
         core = rack.segment.layout.task("wave").core
@@ -90,9 +90,9 @@ def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_p
     ]
     words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
     done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
-    told = done.stderr if policy == "refuse" else done.stdout
+    printed = done.stderr if policy == "refuse" else done.stdout
     assert done.returncode == (1 if policy == "refuse" else 0), done.stderr
-    assert "SCHED_FIFO refused, ordinary scheduling for wave" in told
-    assert "@GROUP - rtprio 99" in told
-    # It stands in every look at the rack, too.
-    assert policy == "refuse" or "NO REAL-TIME PRIORITY: wave" in told.splitlines()[-3]
+    assert "SCHED_FIFO refused, ordinary scheduling for wave" in printed
+    assert "@GROUP - rtprio 99" in printed
+    # Every view of the rack repeats it.
+    assert policy == "refuse" or "NO REAL-TIME PRIORITY: wave" in printed.splitlines()[-3]

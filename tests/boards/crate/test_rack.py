@@ -45,7 +45,7 @@ def test_a_task_that_was_never_begun_is_refused_and_any_other_has_failed(
 
 
 @pytest.mark.parametrize(("seconds", "ticks"), [(0.1, 40), (0.0025, 1), (0.5051, 202)])
-def test_a_run_of_some_seconds_ends_at_its_very_tick(config: MakeConfig, seconds: float, ticks: int) -> None:
+def test_a_run_of_given_length_ends_at_its_exact_tick(config: MakeConfig, seconds: float, ticks: int) -> None:
     rack = Rack(config())
     outcome = run(rack, seconds)
     assert (outcome.cause, outcome.ticks) == ("time over", ticks)
@@ -53,14 +53,14 @@ def test_a_run_of_some_seconds_ends_at_its_very_tick(config: MakeConfig, seconds
     assert rack.segment.block("wave")[Block.CYCLES] == ticks
 
 
-def test_events_tell_the_run_in_order(config: MakeConfig) -> None:
-    told: list[Event] = []
-    rack = Rack(config(), told.append)
+def test_events_report_the_run_in_order(config: MakeConfig) -> None:
+    received: list[Event] = []
+    rack = Rack(config(), received.append)
     run(rack, 0.1)
-    assert told == rack.events
-    assert [event.kind for event in told if event.kind != "ready"] == ["launch", "start", "end"]
-    assert (told[0].tick, told[-1].tick, told[-1].text) == (-1, 39, "time over after 40 ticks")
-    assert [event.time_ns for event in told] == sorted(event.time_ns for event in told)
+    assert received == rack.events
+    assert [event.kind for event in received if event.kind != "ready"] == ["launch", "start", "end"]
+    assert (received[0].tick, received[-1].tick, received[-1].text) == (-1, 39, "time over after 40 ticks")
+    assert [event.time_ns for event in received] == sorted(event.time_ns for event in received)
 
 
 def test_output_of_a_board_becomes_an_event(config: MakeConfig) -> None:
@@ -121,7 +121,7 @@ def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConf
     assert first.outcome.cause == "time over"
 
 
-def test_racks_side_by_side_do_not_touch_each_other(config: MakeConfig, rack_name: str) -> None:
+def test_racks_running_together_do_not_affect_each_other(config: MakeConfig, rack_name: str) -> None:
     alone = run(Rack(config()), 0.5)
     pair = [Rack(config(f"name={rack_name}-{end}")) for end in ("a", "b")]
     with pair[0], pair[1]:
@@ -140,12 +140,12 @@ def test_racks_one_after_the_other_leave_no_file_open(config: MakeConfig) -> Non
     assert descriptors() == before
 
 
-def test_a_rack_that_is_gone_gives_its_memory_back(config: MakeConfig) -> None:
+def test_a_removed_rack_frees_its_memory(config: MakeConfig) -> None:
     rack = Rack(config())
     run(rack, 0.0025)
     name = shm_path(rack.config.name).name
     maps = Path("/proc/self/maps")
-    # Deleted by name, and still mapped: who reads the counters of a run that has ended has them.
+    # Unlinked but still mapped, so the counters of an ended run remain readable.
     assert rack.segment.block("wave")[Block.CYCLES] == 1
     before = maps.read_text().count("(deleted)")
     del rack
@@ -168,7 +168,7 @@ def text_of(events: Sequence[Event], kind: str) -> str:
     return "\n".join(event.text for event in events if event.kind == kind)
 
 
-def test_a_board_without_the_core_it_asks_for_says_so(config: MakeConfig) -> None:
+def test_a_board_that_cannot_have_its_core_is_reported(config: MakeConfig) -> None:
     rack = Rack(config("board.watch.core=1000"))
     with rack:
         assert "core 1000 is not available" in text_of(rack.events, "ready")

@@ -1,4 +1,4 @@
-"""Boards that die or hang come back on the grid, as their policy permits; a run in lockstep repeats with them."""
+"""Boards that die or hang rejoin the grid, as their policy permits; in lockstep such a run is repeatable."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(config:
         outcome = rack.run(5.0)
         assert rack.segment.words[System.EMERGENCY_STOP] == 1
     assert outcome.cause == "board lost"
-    assert "restarts are used up" in outcome.faults[0]
+    assert "no restarts left" in outcome.faults[0]
     assert [event.text[:9] for event in of(rack.events, "reaction", "restart")] == ["restart 1", "restart 2"]
     demand = of(rack.events, "reaction", "demand")[0]
     assert demand.subject == "emergency stop"
@@ -137,7 +137,7 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
     assert [event.board for event in of(rack.events, "recovery", "rejoined")] == [victim]
 
 
-def test_a_stopped_board_in_real_time_is_found_in_its_cycles(config: MakeConfig) -> None:
+def test_a_stopped_board_in_real_time_is_detected_within_its_cycles(config: MakeConfig) -> None:
     fault = {"kind": "hang", "board": "watch", "tick": 120, "phase": 0.4}
     outcome, events = run(faulty(config("clock.mode=realtime"), fault))
     (hang,) = of(events, "detection", "hang")
@@ -148,7 +148,7 @@ def test_a_stopped_board_in_real_time_is_found_in_its_cycles(config: MakeConfig)
     assert outcome.worked
 
 
-def test_a_stopped_clock_is_found_by_the_fastest_board(config: MakeConfig) -> None:
+def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) -> None:
     outcome, events = run(faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 120}))
     (stopped,) = of(events, "detection", "clock_stopped")
     assert stopped.board == "wave"
@@ -157,7 +157,7 @@ def test_a_stopped_clock_is_found_by_the_fastest_board(config: MakeConfig) -> No
     assert outcome.worked
 
 
-def test_late_news_of_a_clock_that_died_does_not_end_its_successor(config: MakeConfig) -> None:
+def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
         rack.start(2.0)
         words = rack.segment.words

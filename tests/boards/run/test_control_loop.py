@@ -33,7 +33,7 @@ MakeBench = Callable[..., "Bench"]
 
 
 class Bench:
-    """A wired rack whose tasks a test cycles itself; the clock stands at tick 0 and ticks last an hour."""
+    """A wired rack whose tasks are cycled by the test; the clock stands at tick 0 and a tick lasts an hour."""
 
     def __init__(self, plan: Resolved) -> None:
         self.plan = plan
@@ -92,7 +92,7 @@ def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
     assert rack.segment.block("wave")[Block.MISSED] == 1
 
 
-def test_a_slow_level_has_its_whole_cycle(bench: MakeBench) -> None:
+def test_a_slow_level_may_use_its_whole_cycle(bench: MakeBench) -> None:
     rack = bench()
     watch = rack.task("watch")
     rack.to(7)
@@ -131,7 +131,7 @@ def test_a_cut_off_access_shows_in_the_trace_and_the_cycle_continues(bench: Make
     watch.cycle(8)
     wave.cycle(8)
     assert rack.flags("watch") == [Flag(0), Flag.BUS_ERROR]
-    # What could not be written did not come in time.
+    # A failed write is a missed deadline.
     assert rack.flags("wave") == [Flag(0), Flag.BUS_ERROR | Flag.MISSED]
     assert [rack.segment.block(name)[Block.BUS_ERRORS] for name in ("wave", "watch")] == [1, 1]
 
@@ -149,7 +149,7 @@ def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -
     assert (slots.tick, slots.basis) == (8, 3)
 
 
-def test_a_planner_traces_its_plans_and_not_every_question(bench: MakeBench) -> None:
+def test_a_planner_traces_plans_but_not_idle_cycles(bench: MakeBench) -> None:
     rack = bench("board.wave.params.plan_every=4")
     planner = rack.task("wave.planner")
     for tick in (0, 4, 5, 6, 8):
@@ -162,7 +162,7 @@ def test_a_planner_traces_its_plans_and_not_every_question(bench: MakeBench) -> 
     assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.MISSED)] == [5, 3, 8, 0]
 
 
-def test_a_second_task_on_a_mailbox_is_refused(bench: MakeBench) -> None:
+def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:
     rack = bench()
     writer = open_writer(rack.segment, "wave.status")
     with pytest.raises(MailboxError, match=r"'wave\.status' has a writer already"):
@@ -181,29 +181,29 @@ def test_a_board_takes_its_core_and_stops_its_garbage_collector() -> None:
     assert exit_status(fork(take)) == 0
 
 
-def test_ordinary_scheduling_can_always_be_had() -> None:
+def test_ordinary_scheduling_is_never_refused() -> None:
     assert set_priority(0)
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def test_a_board_dies_with_its_crate() -> None:
-    told, tell = os.pipe()
+    reading, writing = os.pipe()
 
     def crate() -> None:
         parent = os.getpid()
 
         def board() -> None:
             die_with_parent(parent)
-            os.write(tell, b"%d\n" % os.getpid())
+            os.write(writing, b"%d\n" % os.getpid())
             time.sleep(60)
 
         fork(board)
         time.sleep(60)
 
     pid = fork(crate)
-    with os.fdopen(told) as lines:
+    with os.fdopen(reading) as lines:
         board = int(lines.readline())
-    os.close(tell)
+    os.close(writing)
     os.kill(pid, 9)
     assert exit_status(pid) == -9
     wait_until(lambda: not runs(board))

@@ -65,7 +65,7 @@ def test_under_time_slice_a_level_reads_by_ticks_alone(config: MakeConfig) -> No
     found = written(Rack(config(text=PLAIN)))
     seen, made = found.messages["watch.status"], found.messages["wave.status"]
     assert seen["tick"].tolist() == list(range(0, TICKS, 8))
-    # What the wave wrote one tick earlier, and nothing at tick 0.
+    # The wave's message of the tick before; none at tick 0.
     expected = [0.0, *(made["message"]["value"][tick - 1] for tick in range(8, TICKS, 8))]
     assert seen["message"]["value"].tolist() == expected
     assert seen["basis"].tolist() == [0, *(tick - 1 for tick in range(8, TICKS, 8))]
@@ -117,7 +117,7 @@ def test_a_late_message_shows_from_the_next_boundary(config: MakeConfig) -> None
     assert (behind["visible_at"] > behind["tick"]).all()
 
 
-def test_up_to_a_late_cycle_a_run_is_as_ever(config: MakeConfig) -> None:
+def test_a_run_is_unchanged_up_to_its_first_late_cycle(config: MakeConfig) -> None:
     lockstep, realtime = written(Rack(config(text=PLAIN))), written(Rack(config(*SLOW, LATE, text=PLAIN)))
     same = realtime.first_miss(TICKS)
     assert same <= 40
@@ -139,7 +139,7 @@ def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
     assert rack.segment.block("wave.planner")[Block.PLANS] == len(plans)
 
 
-def test_the_same_trouble_costs_lockstep_nothing(config: MakeConfig) -> None:
+def test_a_slow_cycle_changes_nothing_in_lockstep(config: MakeConfig) -> None:
     quiet, slow = (
         Rack(config(text=PLAIN)),
         Rack(config("board.wave.params={ trouble='late', at=40, ticks=9 }", text=PLAIN)),
@@ -149,7 +149,7 @@ def test_the_same_trouble_costs_lockstep_nothing(config: MakeConfig) -> None:
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.0])
-def test_speed_stretches_the_grid_and_not_the_run(config: MakeConfig, speed: float) -> None:
+def test_speed_scales_the_grid_but_not_the_run(config: MakeConfig, speed: float) -> None:
     rack = Rack(config(REALTIME, f"clock.speed={speed}", text=PLAIN))
     cycles = written(rack, 0.25).cycles["wave"]
     assert rack.outcome is not None

@@ -19,7 +19,7 @@ from tests.processes import FORKS, exit_status, fork
 pytestmark = pytest.mark.filterwarnings(FORKS)
 SECONDS = 2.0
 ROUND = 16
-"""Slots that a writer goes round in 40 ms, while its reader stands still."""
+"""Slots that a writer fills in 40 ms, while its reader is stalled."""
 STALLS = 12
 """Stalls, at least, that each process must have had: sent in a little more than half of the time."""
 
@@ -49,7 +49,7 @@ class Stalls:
 
 
 def cycle(every: int, epoch: int, seed: int, work: Callable[[int, Callable[[], int]], object]) -> bool:
-    """Do `work` on the grid until the time is over; releases that passed are skipped. Say whether there were stalls."""
+    """Do `work` on the grid until the time is over; missed releases are skipped. Return whether there were stalls."""
 
     def now() -> int:
         return (time.monotonic_ns() - epoch) // CLOCK_NS
@@ -84,7 +84,7 @@ def run(rack: Link, seed: int) -> None:
 
 @pytest.mark.parametrize(("rates", "depth"), [((1, 1), 1024), ((1, 8), ROUND), ((8, 1), 1024)])
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_stalls_of_writer_and_reader_ring_nothing(
+def test_stalls_of_writer_and_reader_raise_no_alarm(
     link: MakeLink, protocol: Protocol, rates: tuple[int, int], depth: int
 ) -> None:
     rack = link(protocol, rates, depth=depth)

@@ -15,7 +15,7 @@ from tests.boards.messages import Written
 SECONDS = 0.25
 TICKS = 100
 POLL = "board.wave.wake=poll"
-pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="who polls needs a core of its own")
+pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="a polling board needs its own core")
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -105,7 +105,10 @@ def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
 
 
 REFUSED = {
-    "no level": (("uper", "hold"), 'level = "uper": no such level takes commands; levels: upper, lower'),
+    "no level": (
+        ("uper", "hold"),
+        'level = "uper": no level of this name takes commands; levels that do: upper, lower',
+    ),
     "no wait to bound": (
         ("upper", "hold", "--timeout", "1"),
         "--timeout needs --wait; give both, or neither",

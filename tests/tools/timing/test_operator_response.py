@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.boards.config.schema import RackConfig
-from rack.boards.operating.command import CommandConfig
+from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.tools.benches.response import run_commands
 from rack.tools.console.answer import Failure
 from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
