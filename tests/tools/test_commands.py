@@ -170,7 +170,7 @@ def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str]
 def test_a_rack_that_is_not_there_is_named(rack_name: str) -> None:
     done = rack("stop", rack_name)
     assert done.returncode == 1
-    assert f"rack '{rack_name}' is not there" in done.stderr
+    assert f"rack '{rack_name}' does not exist" in done.stderr
 
 
 def test_a_folder_that_holds_files_is_not_written_over(small: Path, tmp_path: Path) -> None:

@@ -179,7 +179,7 @@ def test_the_emergency_stop_is_latched_until_it_is_reset(running: str) -> None:
 def test_a_rack_that_is_not_there_is_named(rack_name: str, command: list[str]) -> None:
     done = rack(*(word.format(rack_name) for word in command))
     assert done.returncode == 1
-    assert f"rack '{rack_name}' is not there" in done.stderr
+    assert f"rack '{rack_name}' does not exist" in done.stderr
 
 
 def test_the_help_lists_every_kind_with_its_means_bound_and_parameters() -> None:

@@ -135,7 +135,7 @@ def test_bad_usage_is_one_line_and_status_2(running: str, words: tuple[str, ...]
 def test_a_rack_that_is_not_there_is_one_line() -> None:
     done = rack("command", "no-such-rack", "upper", "hold")
     assert done.returncode == 1
-    assert done.stderr.startswith("rack 'no-such-rack' is not there")
+    assert done.stderr.startswith("rack 'no-such-rack' does not exist")
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
