@@ -17,7 +17,7 @@ COMMANDS = (
     ("run", "rack.tools.run:run", "Run a rack until its task ends, and report on the run."),
     ("check", "rack.tools.check:check", "Validate a config and predict its timing."),
     ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
-    ("schema", "rack.tools.schema:schema", "Show the keys of a config, with unit, range, default and meaning."),
+    ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
     ("list", "rack.tools.list:list_racks", "List the racks on this machine."),
     ("status", "rack.tools.status:status", "Show a running rack once."),
     ("stop", "rack.tools.stop:stop", "End a run and wait until it is gone."),
