@@ -37,7 +37,8 @@ def words_of(command: list[str]) -> list[str]:
     if command[0] != "run":
         return command
     # A rack of the same name may be at work on this machine. What the racks do is asserted by test_golden.py.
-    shorter = [] if command[1] == TO_ITS_END else ["--seconds", "2" if "--lockstep" in command else "1"]
+    seconds = "2" if "--lockstep" in command else "1"
+    shorter = [] if command[1] == TO_ITS_END else ["--seconds", seconds, "--no-record"]
     return [*command, "--set", f"name={OWN_NAME}", "--share", *shorter]
 
 
