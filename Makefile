@@ -6,8 +6,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 FLOORS := backplane levels boards tools configs
 CONFIG ?= nasrem
-# What needs neither a whole task nor a rack in real time; the shared memory and one small rack in lockstep are real.
-QUICK := tests/test_architecture.py tests/backplane \
+# What needs neither a whole task, a process in real time, nor a writer that hammers; shared memory and one small rack in
+# lockstep are real.
+QUICK := tests/test_architecture.py $(wildcard tests/backplane/test_*.py) $(filter-out %/test_driver.py \
+	%/test_protocols.py %/test_overtaken_reader.py,$(wildcard tests/backplane/*/test_*.py)) \
 	tests/levels/motion tests/levels/planning tests/levels/timing tests/levels/robot/test_cell.py \
 	tests/levels/robot/test_dynamics.py tests/levels/test_algebra.py tests/levels/test_level.py \
 	tests/levels/elemental_move/test_elemental_move_executor.py tests/levels/task/test_task_program.py \
