@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from tests.conftest import SMALL
 
@@ -57,5 +57,5 @@ def _run(folder: Path, name: str, seconds: float, settings: Sequence[str]) -> Pa
         config = folder / "small.toml"
         config.write_text(SMALL)
     rack = load(config, [f"name=test-shared-{name}-{os.getpid()}", *settings])
-    assert run_rack(rack, seconds, folder / "run", SilentDisplay()).recording == "complete"
+    assert run_rack(rack, seconds, folder / "run", Display()).recording == "complete"
     return folder / "run"

@@ -12,10 +12,10 @@ import typer
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
 from rack.tools.analysis.tables import text
-from rack.tools.console.answer import Json, print_json
+from rack.tools.console.answer import Json, RunFolder, print_json
+from rack.tools.console.progress import reading_progress
 from rack.tools.console.tables import print_wrapped, terminal_width
-from rack.tools.report import RunFolder
-from rack.tools.runs.recording import Recording, reading_progress
+from rack.tools.runs.recording import Recording
 from rack.tools.timing.operator_response import show
 
 Percentile = Annotated[
@@ -24,7 +24,7 @@ Percentile = Annotated[
         metavar="P",
         min=1.0,
         max=100.0,
-        help="judge the longest of P in 100 cycles, as in 99.9; 100: the longest of all, as in eq. 3.6",
+        help="judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as in eq. 3.6",
     ),
 ]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder for the results; default: the run's own")]
@@ -42,10 +42,18 @@ def analyze(
 ) -> None:
     """Compare a run with the timing model: every equation that `rack check` predicts, with its measurement.
 
-    Times of levels are processor time: they exclude waiting and preemption. A virtual machine stalled by its host
-    counts the stall as processor time; --percentile 99 leaves out whatever happens less than once in 100 cycles.
-    Lists the cycles that broke an equation, and the tasks that had their core meanwhile. Writes analysis.json,
-    residuals.png and residuals.svg. Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
+    Times of levels are processor time, without waiting and preemption. A virtual machine stalled by its host counts the
+    stall as processor time; --percentile 99 leaves out whatever happens less than once in 100 cycles.
+
+    It lists the cycles that broke an equation, and the tasks that had their core meanwhile. It writes analysis.json,
+    residuals.png and residuals.svg.
+
+    Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
+
+    \b
+    Examples:
+      rack analyze runs/nasrem-20250101-120000
+      rack analyze runs/nasrem-20250101-120000 --percentile 99.9
     """
     from rack.tools.analysis.residuals import plot  # matplotlib takes a second to import
 

@@ -22,18 +22,10 @@ FAULTLESS_S = 60.0
 MOST = 100_000
 """Faults of a kind, kills or sizes of one campaign."""
 
-Injections = Annotated[
-    int,
-    typer.Option(
-        "--injections", metavar="N", min=0, max=MOST, help="strikes of each kind; each trial has as many faults as fit"
-    ),
-]
-Seed = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="the same seed draws the same plans")]
+Injections = Annotated[int, typer.Option("--injections", metavar="N", min=0, max=MOST, help="strikes of each kind")]
+Seed = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans")]
 Kinds = Annotated[str | None, typer.Option(metavar="A,B", help="only these kinds; default: all that the rack can have")]
-Kills = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=1, max=MOST, help="only N kills from outside, in as many runs as needed"),
-]
+Kills = Annotated[int | None, typer.Option(metavar="N", min=1, max=MOST, help="instead: only N kills from outside")]
 LockstepOnly = Annotated[bool, typer.Option("--lockstep", help="trials in lockstep only; default: both")]
 RealtimeOnly = Annotated[bool, typer.Option("--realtime", help="trials in real time only; default: both")]
 Faultless = Annotated[
@@ -42,21 +34,21 @@ Faultless = Annotated[
         metavar="S",
         min=0.0,
         max=1e6,
-        help=f"seconds without faults in real time, alone and under load, each; default {FAULTLESS_S:g}",
+        help=f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
     ),
 ]
-Load = Annotated[bool, typer.Option("--load", help="faultless time only under load: stress-ng where installed")]
+Load = Annotated[bool, typer.Option("--load", help="without faults: only under load, by stress-ng where installed")]
 Sizes = Annotated[
     int | None,
-    typer.Option(metavar="N", min=0, max=MOST, help=f"sizes for the curves of size against delay; default {SIZES}"),
+    typer.Option(metavar="N", min=0, max=MOST, help=f"sizes on each curve of size against delay; default {SIZES}"),
 ]
 Seconds = Annotated[
     float | None,
-    typer.Option(metavar="S", min=1.0, max=1e9, help="simulated time of a run, for a rack that no task ends"),
+    typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of a run, for a rack that no task ends"),
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="folder; one of the same campaign is continued; default: runs/campaign-<time>"),
+    typer.Option(metavar="DIR", help="folder, also to continue a campaign in; default: runs/campaign-<time>"),
 ]
 
 
@@ -78,10 +70,18 @@ def campaign(
 ) -> None:
     """Inject random faults of all kinds into runs of a rack, and judge each of them.
 
-    Trials in lockstep run on all cores at once, others one after the other. The same --out continues an interrupted
-    campaign. The exit status is 1 if a fault did not strike, was not found within its bound, not reacted to or not
-    recovered from within its bound; if a limit was violated, anything was left behind, or a task was neither done nor
-    safely stopped; or if there was a detection without a fault.
+    Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one after the other. There
+    are also runs without faults, in real time, alone and under load. The same --out continues an interrupted campaign.
+
+    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not found, reacted to and recovered from in
+    time; a limit was violated; something was left behind; a task was neither done nor safely stopped; or a detection
+    had no fault; 2 usage or config error.
+
+    \b
+    Examples:
+      rack campaign nasrem
+      rack campaign nasrem --kinds kill,mute --injections 20 --lockstep
+      rack campaign nasrem --kills 100 --out runs/kills
     """
     from rack.boards.config import load as load_config
     from rack.tools.campaigns.campaign import ORDER, Campaign, Order

@@ -22,8 +22,7 @@ from rack.tools.timing.repair import Repair, repair
 from rack.tools.timing.tables import forecast_lines
 
 From = Annotated[
-    Path | None,
-    typer.Option("--from", metavar="RUN", help="budgets measured in this run of the rack, instead of the config's"),
+    Path | None, typer.Option("--from", metavar="RUN", help="use the budgets measured in this run, not the config's")
 ]
 Percentile = Annotated[
     float,
@@ -31,12 +30,10 @@ Percentile = Annotated[
         metavar="P",
         min=0.0,
         max=100.0,
-        help="with --from: the worst of P in 100 cycles, without those that the host stalled",
+        help="with --from: the longest of P in 100 cycles, to leave out cycles stalled by the host",
     ),
 ]
-Fix = Annotated[
-    bool, typer.Option("--fix", help="print the config with the cheapest changes that make it fit, and nothing else")
-]
+Fix = Annotated[bool, typer.Option("--fix", help="print only the config, with the cheapest changes that make it fit")]
 
 
 def check(
@@ -50,25 +47,28 @@ def check(
 ) -> None:
     """Validate a config, show its inventory, and predict its timing.
 
-    Prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per line.
-    On a terminal the tables show as many columns as fit; --json has all.
+    It prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per line. On a terminal
+    the tables show as many columns as fit; --json has all.
 
-    The timing rests on budgets, the longest processor time of each part of a level's cycle: [board.<name>.budget] in
-    the config, with read_ms (R), process_ms (X), write_ms (W), exchange_ms (C, reading the plan), plan_ms (P),
-    update_ms (U), and plan_within_ms, a limit on the time to a new plan; or measured, with --from RUN. [timing] holds
-    t_cs (context_switch_ms), the clock's time (clock_ms), the limit of eq. 3.10 (small_share), and a goal for the
-    system's response (response_ms).
+    The timing rests on budgets: the longest processor time of each part of a level's cycle. They are in the config, in
+    [board.<name>.budget], or measured, with --from RUN. [timing] has the context switch, the clock's own time, the
+    limit of eq. 3.10, and a goal for the system's response. `rack schema board.budget` and `rack schema timing` show
+    the keys.
 
-    Every equation of the paper, 3.1 to 3.10, is applied to every level that has a budget: both sides, the margin, ok or
-    FAILS. Beyond the paper: every task's worst-case response time on its core, and the load of every core.
+    Equations 3.1 to 3.10 of the paper are applied to every level with a budget: both sides, the margin, and ok or
+    FAILS. Beyond the paper, it computes the worst-case response time of every task, and the load of every core.
 
     If something fails, it lists changes that help, cheapest first, each tried on the whole rack: another priority or
-    core, a board for the planner, older plans, a longer cycle, of that board or of one that shares its core; last,
-    changes that need a core that this machine lacks. --fix prints the config with the first of them.
+    core, a board for the planner, older plans, or a longer cycle, of that board or of one that shares its core. Changes
+    that need a core that this machine lacks come last. --fix prints the config with the first of them.
 
     Exit status: 0 everything holds, or nothing can be judged; 1 an equation fails, or no change helps; 2 a bad config.
 
-    Examples: rack check fig3; rack check fig3 --fix > fits.toml; rack check nasrem --from runs/nasrem-20250101-120000
+    \b
+    Examples:
+      rack check fig3
+      rack check fig3 --fix > fits.toml
+      rack check nasrem --from runs/nasrem-20250101-120000
     """
     found = load(config, settings, faults)
     if run is not None:
@@ -169,34 +169,30 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
     yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
     yield from found["notes"]
-    clock = [CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-", "", "", "", ""]
+    clock = [*map(str, (CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-")), "", "", "", ""]
     rows = [
         [
-            *(t["slot"], t["task"], t["core"], t["priority"] or "-"),
-            *(f"{t['rate_hz']:g}", t["every_ticks"], f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+            *map(str, (t["slot"], t["task"], t["core"], t["priority"] or "-")),
+            *(f"{t['rate_hz']:g}", str(t["every_ticks"]), f"{t['slice_ms']:g}", _hex(t["trace_address"])),
         ]
         for t in found["tasks"]
     ]
     head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", "slice, ms", "trace at"]
     yield ""
-    yield from _table(head, [clock, *rows], width, ("trace at", "slice, ms"))
+    yield from table(head, [clock, *rows], width, ("trace at", "slice, ms"))
     rows = [
         [
-            *(_hex(m["address"]), m["mailbox"], m["message"], m["size"], m["depth"], m["protocol"]),
+            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), m["protocol"]),
             *(f"{m['delay_ms']:g}", f"{m['writer']} > {', '.join(m['readers']) or '(nobody)'}"),
         ]
         for m in found["mailboxes"]
     ]
     head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
     yield ""
-    yield from _table(head, rows, width, ("slots", "bytes", "message", "protocol"))
+    yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))
     yield ""
     windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
     yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
-
-
-def _table(head: list[str], rows: list[list[Any]], width: int | None, dropped: tuple[str, ...]) -> Iterator[str]:
-    yield from table(head, [[str(cell) for cell in row] for row in rows], width, dropped)
 
 
 def _hex(address: int) -> str:

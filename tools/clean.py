@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from rack.boards.crate.clean import clean as remove_leftovers
-from rack.tools.console.answer import Json, print_json
+from rack.tools.console.answer import Json, print_answer
 
 
 def clean(as_json: Json = False) -> None:
     """Remove the shared memory that killed racks left behind.
 
-    Never touches a rack in use, nor a directory or symbolic link that only has the name of one.
+    It never touches a rack in use, nor a directory or symbolic link that only has the name of one.
 
     \b
     Examples:
       rack clean
     """
     removed, in_use, strange = remove_leftovers()
-    if as_json:
-        print_json({"removed": removed, "in_use": in_use, "strange": strange})
-        return
-    print(f"removed: {', '.join(removed) or 'nothing'}")
-    if in_use:
-        print(f"in use: {', '.join(in_use)}")
-    for line in strange:
-        print(f"left alone: {line}")
+    lines = [f"removed: {', '.join(removed) or 'nothing'}", *([f"in use: {', '.join(in_use)}"] if in_use else [])]
+    lines += [f"left alone: {line}" for line in strange]
+    print_answer({"removed": removed, "in_use": in_use, "strange": strange}, lines, as_json)

@@ -17,7 +17,6 @@ COMMANDS = (
     ("run", "rack.tools.run:run", "Run a rack until its task ends, and report on the run."),
     ("check", "rack.tools.check:check", "Validate a config and predict its timing."),
     ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
-    ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
     ("list", "rack.tools.list:list_racks", "List the racks on this machine."),
     ("status", "rack.tools.status:status", "Show a running rack once."),
     ("stop", "rack.tools.stop:stop", "End a run and wait until it is gone."),
@@ -31,7 +30,7 @@ COMMANDS = (
     ("analyze", "rack.tools.analyze:analyze", "Compare a run with the timing model, equation by equation."),
     ("gantt", "rack.tools.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
     ("campaign", "rack.tools.campaign:campaign", "Inject random faults into many runs, and judge each."),
-    ("bench", "rack.tools.bench.command:bench", "Measure costs on this machine."),
+    ("bench", "rack.tools.bench:bench", "Measure costs on this machine."),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 MAX_ARGUMENT = 4096
@@ -112,15 +111,14 @@ def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
 
 
 def _loaded(name: str, source: str) -> Any:
-    """Import a command from "module:attribute"; EXAMPLES in its module end its help."""
+    """Import a command from "module:attribute"."""
     import typer
 
     path, _, attribute = source.partition(":")
-    module = import_module(path)
-    found = getattr(module, attribute)
+    found = getattr(import_module(path), attribute)
     if not isinstance(found, typer.Typer):
         app = _app()
-        app.command(name, epilog=getattr(module, "EXAMPLES", None))(found)
+        app.command(name)(found)
         found = app
     return typer.main.get_command(found)
 

@@ -7,11 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from rack.tools.console.answer import Failure, Json, RackName, print_json
+from rack.tools.console.answer import Failure, Json, RackName, Timeout, check_timeout, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.tables import terminal_width
-from rack.tools.runs.desk import LiveDesk
-from rack.tools.runs.holds import resume_command
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 
@@ -23,14 +20,10 @@ Goals = Annotated[
     list[str] | None,
     typer.Argument(metavar="GOAL", help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1"),
 ]
-Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which to give the command; default: the next")]
-At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same as simulated time, s")]
+Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
+At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")]
 Wait = Annotated[bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")]
-Timeout = Annotated[
-    float | None,
-    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: give up after S seconds of wall-clock time"),
-]
-List = Annotated[bool, typer.Option("--list", help="list each level, the commands it takes, and the one in force")]
+List = Annotated[bool, typer.Option("--list", help="list the levels, the commands each takes, and the one in force")]
 
 
 def command(
@@ -68,18 +61,21 @@ def command(
       rack command nasrem task goto position=0.45,0.1,0.95
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
     """
+    from rack.tools.console.tables import terminal_width
+    from rack.tools.runs.desk import LiveDesk
+    from rack.tools.runs.holds import resume_command
+
     desk = LiveDesk(rack)
     if is_list:
-        print_json(desk.levels()) if as_json else print("\n".join(desk.text(terminal_width())))
+        print_answer(desk.levels(), desk.text(terminal_width()), as_json)
         return
     if level is None or what is None:
         raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
-    if timeout is not None and not wait:
-        raise Failure("--timeout is the bound of --wait; give both, or neither", 2)
+    check_timeout(timeout, wait)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising():
         reply = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
-    print_json(reply.document()) if as_json else print(reply.line)
+    print_answer(reply.document(), reply.line, as_json)
     if not reply.worked:
         raise typer.Exit(1)
     if reply.is_standing and what != "resume" and not as_json:

@@ -10,7 +10,7 @@ import typer
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, Run, System
-from rack.tools.console.answer import Failure, Json, RackName, print_json
+from rack.tools.console.answer import Failure, Json, RackName, print_answer
 
 Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")]
 
@@ -45,8 +45,6 @@ def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
             raise Failure(f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but no tick has followed")
         time.sleep(0.001)
     tick = words[System.TICK]
-    if as_json:
-        print_json({"rack": rack, "emergency_stop": not reset, "tick": tick})
-        return
     state = f"reset at tick {tick}" if reset else f"latched at tick {tick}; to release: rack estop {rack} --reset"
-    print(f"rack '{rack}': emergency stop {state}")
+    document = {"rack": rack, "emergency_stop": not reset, "tick": tick}
+    print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)

@@ -11,8 +11,8 @@ import typer
 from rack.tools.charts import figure5
 from rack.tools.charts.gantt import Subject, gantt_of, subject_of
 from rack.tools.charts.window import times_of, window_options
-from rack.tools.console.answer import Failure, Json, Settings, print_json
-from rack.tools.runs.recording import reading_progress
+from rack.tools.console.answer import Failure, Json, Settings, print_answer
+from rack.tools.console.progress import reading_progress
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000
@@ -55,12 +55,19 @@ def gantt(
     out: Out = None,
     as_json: Json = False,
 ) -> None:
-    """Draw a Gantt chart, of the schedule that follows from the budgets of a config, or of the trace of a run.
+    """Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a run.
 
-    C reads the plan, R command and status, X executes, W writes, P plans, U updates the plan; "-" is an idle core,
-    "." another board on it. A run is drawn above the schedule of its config. Text on stdout, PNG and SVG in a folder.
+    The letters are unit functions: C reads the plan, R reads command and status, X executes, W writes, P plans, U
+    updates the plan. "-" is an idle core, "." a core that another board has. A run is drawn above the schedule of its
+    config. The chart is printed as text, and drawn as PNG and SVG.
 
-    Figures 2 to 4 of the paper are racks: rack gantt fig2, fig3, fig4, fig4-overload.
+    Figures 2 to 4 of the paper are racks of that name.
+
+    \b
+    Examples:
+      rack gantt fig2
+      rack gantt fig4-overload --cycles 10-12
+      rack gantt runs/nasrem-20250101-120000 --level servo
     """
     found = subject_of(subject, settings, out)
     if figure is not None:
@@ -90,8 +97,5 @@ def _made(folder: Path) -> Path:
 
 
 def _answer(text: str, document: dict[str, Any], pictures: list[Path], as_json: bool) -> None:
-    if as_json:
-        print_json({**document, "pictures": [str(path) for path in pictures]})
-        return
-    print(text)
-    print(f"\npictures: {', '.join(map(str, pictures))}")
+    paths = [str(path) for path in pictures]
+    print_answer({**document, "pictures": paths}, f"{text}\n\npictures: {', '.join(paths)}", as_json)

@@ -8,12 +8,11 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from rack.tools.console.answer import Failure, Json, named, print_json
-from rack.tools.console.tables import table
+from rack.tools.console.answer import Failure, Json, Timeout, check_timeout, named, print_answer
+from rack.tools.console.tables import table, terminal_width
 
 Rack = Annotated[
-    str | None,
-    typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named),
+    str | None, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named)
 ]
 BoardName = Annotated[
     str | None, typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock")
@@ -31,37 +30,17 @@ Mailbox = Annotated[
 ]
 Tick = Annotated[str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")]
 When = Annotated[
-    str | None, typer.Option(metavar="CONDITION", help='begin when it holds: "elemental_move.status.verb == grasp"')
+    str | None, typer.Option(metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"')
 ]
 Phase = Annotated[
-    str | None, typer.Option(metavar="X", help="part of its first tick after which it strikes, 0 to below 1")
+    str | None, typer.Option(metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1")
 ]
 Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of its random choices")]
 Wait = Annotated[bool, typer.Option("--wait", help="wait until the fault, or the run, is over")]
-Timeout = Annotated[
-    float | None,
-    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: wall-clock seconds, then exit status 1"),
-]
 Withdraw = Annotated[
     int | None, typer.Option(metavar="NO", help="withdraw a fault that still waits; --list shows its number")
 ]
 List = Annotated[bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")]
-
-EXAMPLES = """\b
-Examples:
-
-  rack inject nasrem servo kill
-
-  rack inject nasrem servo sensor-bias joint=2 size=0.05 --for 0.2s
-
-  rack inject nasrem primitive mute --when "task.status.action == 2" --for 1s
-
-  rack inject nasrem servo drop --tick 4000 --cycles 40 --wait --timeout 60
-
-  rack inject nasrem --list
-
-  rack inject nasrem --withdraw 0
-"""
 
 
 def inject(
@@ -89,22 +68,28 @@ def inject(
 
     Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or --timeout has passed;
     2 usage.
-    """
-    from rack.tools.console.tables import terminal_width
 
+    \b
+    Examples:
+      rack inject nasrem servo kill
+      rack inject nasrem servo sensor-bias joint=2 size=0.05 --for 0.2s
+      rack inject nasrem primitive mute --when "task.status.action == 2"
+      rack inject nasrem servo drop --tick 4000 --cycles 40 --wait --timeout 60
+      rack inject nasrem --list
+      rack inject nasrem --withdraw 0
+    """
     if is_list and rack is None:
-        print_json(kinds_document()) if as_json else print("\n".join(kinds_text(terminal_width())))
+        print_answer(kinds_document(), kinds_text(terminal_width()), as_json)
         return
     needs_fault = not is_list and withdraw is None
     if rack is None or (needs_fault and (board is None or kind is None)):
         raise Failure("RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list", 2)
-    if timeout is not None and not wait:
-        raise Failure("--timeout needs --wait; give both, or neither", 2)
+    check_timeout(timeout, wait)
     from rack.tools.faults.live import LiveRack
 
     live = LiveRack(rack)
     if is_list:
-        print_json(live.faults()) if as_json else print("\n".join(live.text(terminal_width())))
+        print_answer(live.faults(), live.text(terminal_width()), as_json)
         return
     if withdraw is not None:
         answer = live.withdraw(withdraw)
@@ -112,7 +97,7 @@ def inject(
         given: dict[str, Any] = {"board": board, "kind": kind, "for": lasts, "cycles": cycles, "mailbox": mailbox}
         given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
         answer = live.inject({**given, **_values(parameters or [])}, wait, timeout)
-    print_json(answer) if as_json else print(answer["told"])
+    print_answer(answer, answer["told"], as_json)
 
 
 def _values(parameters: list[str]) -> dict[str, str]:
@@ -128,8 +113,6 @@ class KindsCommand(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
-        from rack.tools.console.tables import terminal_width
-
         return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text(terminal_width())])
 
 
@@ -137,7 +120,11 @@ def kinds_text(width: int | None = None) -> Iterator[str]:
     """Yield the kinds as a table, and their parameters as another; with a width they fit into it."""
     from rack.boards.faults import KINDS
 
-    rows = [[kind.name, kind.means, str(kind.bound), _remarks(kind.realtime, kind.once)] for kind in KINDS]
+    remarks = {"real time only": "realtime", "strikes once": "once"}
+    rows = [
+        [kind.name, kind.means, str(kind.bound), ", ".join(text for text, key in remarks.items() if getattr(kind, key))]
+        for kind in KINDS
+    ]
     yield from table(["kind", "effect", "found within", ""], rows, width)
     yield ""
     yield "Cycles are the task's; a planner's is its time slice."
@@ -154,10 +141,6 @@ def kinds_text(width: int | None = None) -> Iterator[str]:
     yield from table(["kind", "parameter", "unit", "default", "range", "meaning"], numbers, width)
 
 
-def _remarks(realtime: bool, once: bool) -> str:
-    return ", ".join([*(["real time only"] if realtime else []), *(["strikes once"] if once else [])])
-
-
 def kinds_document() -> list[dict[str, Any]]:
     """Return the kinds as plain data."""
     from rack.boards.faults import KINDS
@@ -165,20 +148,15 @@ def kinds_document() -> list[dict[str, Any]]:
     numbers = ("name", "unit", "meaning", "default", "least", "most", "is_whole")
     return [
         {
-            "name": kind.name,
-            "where": kind.where,
-            "means": kind.means,
+            **{key: getattr(kind, key) for key in ("name", "where", "means")},
             "seen_as": list(kind.codes),
             "bound": str(kind.bound),
             "parameters": [{key: getattr(p, key) for key in numbers} for p in kind.parameters],
-            "realtime": kind.realtime,
-            "once": kind.once,
-            "recoverable": kind.recoverable,
-            "takes_mailbox": kind.takes_mailbox,
+            **{key: getattr(kind, key) for key in ("realtime", "once", "recoverable", "takes_mailbox")},
         }
         for kind in KINDS
     ]
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
-app.command(cls=KindsCommand, epilog=EXAMPLES)(inject)
+app.command(cls=KindsCommand)(inject)

@@ -7,15 +7,15 @@ import time
 from rack.backplane.errors import SegmentError
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import Head, Run, System
-from rack.tools.console.answer import Json, print_json
+from rack.tools.console.answer import Json, print_answer
 from rack.tools.console.tables import table, terminal_width
 
 
 def list_racks(as_json: Json = False) -> None:
     """List the racks on this machine, running or left behind by a killed launcher.
 
-    States: starting, running, stopped; "dead", its launcher is gone; "foreign", shared memory of another version or
-    user. `rack clean` removes what is dead.
+    The states are starting, running and stopped; dead, if the launcher is gone; and foreign, if the shared memory is of
+    another version or user. `rack clean` removes dead racks.
 
     \b
     Examples:
@@ -23,11 +23,8 @@ def list_racks(as_json: Json = False) -> None:
       rack list --json
     """
     found = [describe(name) for name in racks()]
-    if as_json:
-        print_json(found)
-        return
     rows = [[str(rack[key]) for key in ("rack", "state", "detail")] for rack in found]
-    print("\n".join(table(("rack", "state", ""), rows, terminal_width())) if rows else "no racks")
+    print_answer(found, table(("rack", "state", ""), rows, terminal_width()) if rows else "no racks", as_json)
 
 
 def describe(name: str) -> dict[str, str | int | float]:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rack.backplane.segment import Segment
-from rack.tools.console.answer import Json, RackName, print_json
+from rack.tools.console.answer import Json, RackName, View, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.recorder.recorder import Recorder, SafeSink
 from rack.tools.runs.folder import folder_of
@@ -17,15 +17,13 @@ from rack.tools.runs.window import ViewerWindow, free_port, url
 from rack.tools.viewer.sink import ViewSink
 
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
-View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 
 
 def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = False) -> None:
     """Record a running rack until its run is over, or until Ctrl-C.
 
-    The recording begins with what the rack's rings still hold, about two seconds. It is written as the trace, the
-    signals and run.rrd, for `rack report`, `rack analyze` and `rack replay`. Recording costs the rack no deadline, and
-    ending it does not end the run.
+    The recording begins with the two seconds that the rack's rings still hold. `rack report`, `rack analyze` and `rack
+    replay` read it. Recording costs the rack no deadline, and ending it does not end the run.
 
     \b
     Examples:
@@ -46,4 +44,4 @@ def record(rack: RackName, out: Out = None, view: View = False, as_json: Json = 
         recorder.follow()
     for text in notes:
         print(text, file=sys.stderr)
-    print_json({"rack": rack, "folder": str(folder), "notes": notes}) if as_json else print(f"recorded into {folder}")
+    print_answer({"rack": rack, "folder": str(folder), "notes": notes}, f"recorded into {folder}", as_json)

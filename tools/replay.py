@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from rack.tools.console.answer import Failure
-from rack.tools.report import RunFolder
+from rack.tools.console.answer import Failure, RunFolder
 from rack.tools.runs.window import ViewerWindow
 
 
 def replay(run: RunFolder) -> None:
     """Open the recording of a run in the viewer; return when it is closed.
 
-    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd itself.
+    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd.
 
     \b
     Examples:
@@ -19,6 +18,6 @@ def replay(run: RunFolder) -> None:
     # A restarted recorder leaves several files.
     recordings = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
     if not recordings or not all(recording.is_file() for recording in recordings):
-        raise Failure(f"{run}: no recording for the viewer, it has no run.rrd", 2)
+        raise Failure(f"{run}: nothing to replay: it has no run.rrd", 2)
     if problem := ViewerWindow(*(str(recording.resolve()) for recording in recordings)).wait():
         raise Failure(problem)

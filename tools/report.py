@@ -10,10 +10,8 @@ import typer
 
 from rack.tools.analysis.report import write_report
 from rack.tools.analysis.report_markdown import show
-from rack.tools.console.answer import Json, print_json
+from rack.tools.console.answer import Json, RunFolder, print_json
 from rack.tools.console.tables import console
-
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
 
 Against = Annotated[
     Path | None, typer.Option(metavar="RUN", help="another run: find the first tick at which the two diverge")
@@ -23,9 +21,9 @@ Against = Annotated[
 def report(run: RunFolder, against: Against = None, as_json: Json = False) -> None:
     """Report on a run, from its recording.
 
-    Writes report.json and report.md again. On a terminal the tables show as many columns as fit; report.md has all.
+    It writes report.json and report.md anew. On a terminal the tables show as many columns as fit; report.md has all.
 
-    Exit status: 0 the report was written; 1 with --against: the runs diverge before any miss; 2 not a run.
+    Exit status: 0 the report was written; 1 with --against: the runs diverge before any miss; 2 RUN is not a run.
 
     \b
     Examples:

@@ -11,7 +11,7 @@ import typer
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.tools.analysis.report import unrecorded, write_report
-from rack.tools.console.answer import ConfigName, Failure, Faults, Json, Settings
+from rack.tools.console.answer import ConfigName, Failure, Faults, Json, Settings, View
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.report import print_report
 from rack.tools.runs.display import display_for
@@ -19,18 +19,18 @@ from rack.tools.runs.folder import folder_of
 from rack.tools.runs.launch import NO_TIME, RunResult, run_rack
 
 Lockstep = Annotated[
-    bool, typer.Option("--lockstep", help="begin a tick only when every due task has finished: exact and repeatable")
+    bool, typer.Option("--lockstep", help="start a tick only when every due task has finished: exact and repeatable")
 ]
 Seconds = Annotated[
-    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until it ends")
+    float | None,
+    typer.Option(metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until its end"),
 ]
 Speed = Annotated[float | None, typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5")]
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
-View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 Share = Annotated[
     bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: both will be late")
 ]
-NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report files")]
+NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
 
 
 def run(
@@ -48,11 +48,10 @@ def run(
 ) -> None:
     """Run a rack until its task ends, and report on the run.
 
-    On a terminal a live table shows every task and what holds the rack; elsewhere one line is printed a second. --json
-    prints the report as one document. Its keys are the same with --no-record; values that only a recording knows are
-    null then.
+    On a terminal a live table shows every task and what holds the rack; elsewhere one line a second is printed. --json
+    prints the report as one document. With --no-record it has the same keys; those that need a recording are null.
 
-    Exit status: 0 the task was done, or --seconds are over, and no fault is latched; 1 otherwise; 2 usage or config
+    Exit status: 0 the task was done, or --seconds have passed, and no fault is latched; 1 otherwise; 2 usage or config
     error. Ctrl-C ends the run in order, with a report and exit status 130.
 
     \b

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.console.answer import Failure, Json, config_names, print_json
+from rack.tools.console.answer import Failure, Json, config_names, print_answer
+from rack.tools.console.tables import table, terminal_width
 
 if TYPE_CHECKING:
     from rack.boards.config.reference import KeyTable
 
-EXAMPLES = (
-    "Examples: rack schema; rack schema board; rack schema board.servo.params; rack schema task --config mine.toml"
-)
 DROPPED = ("default", "permitted", "type")
-"""Columns that a narrow terminal does not show, in that order."""
+"""Columns that a narrow terminal leaves out, in this order."""
 
 TableName = Annotated[
     str | None, typer.Argument(metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params")
@@ -34,6 +33,13 @@ def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False)
 
     Without TABLE it lists the tables. The levels' own tables, [task] and [board.<name>.params], are those of the boards
     in CONFIG. A part of a name shows all tables that begin with it.
+
+    \b
+    Examples:
+      rack schema
+      rack schema board
+      rack schema board.servo.params
+      rack schema task --config mine.toml
     """
     from rack.boards.config import load
     from rack.boards.config.reference import find_tables, key_tables
@@ -43,26 +49,18 @@ def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False)
         found = key_tables(rack) if name is None else find_tables(name, rack)
     except LookupError as error:
         raise Failure(f'TABLE = "{name}": {error.args[0]}', 2) from None
-    if as_json:
-        print_json([asdict(entry) for entry in found])
-    elif name is None:
-        _list(found)
-    else:
-        _show(found)
+    print_answer([asdict(entry) for entry in found], _names(found) if name is None else _keys(found), as_json)
 
 
-def _list(found: list[KeyTable]) -> None:
-    from rack.tools.console.tables import table, terminal_width
-
+def _names(found: list[KeyTable]) -> Iterator[str]:
     rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
-    print(*table(["table", "in TOML", "meaning"], rows, terminal_width(), ("in TOML",)), sep="\n")
+    return table(["table", "in TOML", "meaning"], rows, terminal_width(), ("in TOML",))
 
 
-def _show(found: list[KeyTable]) -> None:
-    from rack.tools.console.tables import table, terminal_width
-
+def _keys(found: list[KeyTable]) -> Iterator[str]:
+    head = ["key", "unit", "type", "permitted", "default", "meaning"]
     for at, entry in enumerate(found):
         rows = [[k.name, k.unit, k.type, k.permitted, k.default, k.meaning] for k in entry.keys]
-        title = f"{entry.heading}: {entry.meaning}"
-        head = ["key", "unit", "type", "permitted", "default", "meaning"]
-        print(*([""] if at else []), title, *table(head, rows, terminal_width(), DROPPED), sep="\n")
+        yield from ([""] if at else [])
+        yield f"{entry.heading}: {entry.meaning}"
+        yield from table(head, rows, terminal_width(), DROPPED)

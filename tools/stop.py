@@ -10,7 +10,7 @@ import typer
 from rack.backplane.process import is_alive, readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
-from rack.tools.console.answer import Failure, Json, RackName, print_json
+from rack.tools.console.answer import Failure, Json, RackName, print_answer
 
 Wait = Annotated[float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the run's end")]
 
@@ -20,7 +20,7 @@ def stop(rack: RackName, wait: Wait = 10.0, as_json: Json = False) -> None:
 
     The run ends in order at its next tick, and writes its report.
 
-    Exit status: 0 it has ended; 1 there is no such rack, or it still runs after --wait.
+    Exit status: 0 it has ended; 1 there is no such rack, or it is still running after --wait.
 
     \b
     Examples:
@@ -28,8 +28,8 @@ def stop(rack: RackName, wait: Wait = 10.0, as_json: Json = False) -> None:
       rack stop nasrem --wait 30
     """
     if not stop_rack(rack, wait):
-        raise Failure(f"rack '{rack}' has not ended within {wait:g} s; its launcher still runs")
-    print_json({"rack": rack, "stopped": True}) if as_json else print(f"rack '{rack}' has ended")
+        raise Failure(f"rack '{rack}' has not ended within {wait:g} s; its launcher is still running")
+    print_answer({"rack": rack, "stopped": True}, f"rack '{rack}' has ended", as_json)
 
 
 def stop_rack(rack: str, timeout_s: float) -> bool:

@@ -11,7 +11,7 @@ import pytest
 from rack.boards.config import load
 from rack.tools.charts.measured import TracedRun
 from rack.tools.charts.panel import Panel
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 
@@ -38,7 +38,7 @@ def slowed(name: str) -> list[str]:
 def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> TracedRun:
     """Run a rack of the figures under a name of its own, into `folder`, and return the run."""
     config = load(name, [f"name=test-{os.getpid()}-{name}", *settings])
-    result = run_rack(config, seconds, folder, SilentDisplay())
+    result = run_rack(config, seconds, folder, Display())
     assert result.worked, result.failure()
     return TracedRun(Recording(folder))
 

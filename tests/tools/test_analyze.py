@@ -12,7 +12,7 @@ from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
 from rack.tools.analysis.tables import text
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from tests.shared_runs import slow_run
 from tests.tools.command_line import rack
@@ -27,7 +27,7 @@ USUAL = ["--percentile", "50"]
 
 def run_of(figure: str, name: str, folder: Path) -> Path:
     """Run the rack of a figure in real time for 1.5 s; return its folder."""
-    run_rack(load(figure, [f"name={name}"]), 1.5, folder, SilentDisplay())
+    run_rack(load(figure, [f"name={name}"]), 1.5, folder, Display())
     return folder
 
 
@@ -79,7 +79,7 @@ def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_pa
 def test_a_folder_without_a_run_is_refused_in_one_line(tmp_path: Path) -> None:
     done = rack("analyze", tmp_path)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "no run" in done.stderr
+    assert "not a run" in done.stderr
 
 
 def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Path) -> None:

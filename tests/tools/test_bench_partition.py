@@ -8,7 +8,7 @@ import pytest
 
 from rack.boards.config import load, loads
 from rack.boards.errors import ConfigError
-from rack.tools.bench.partition import PARTITIONS, Partition, compare, lines_of
+from rack.tools.benches.partition import PARTITIONS, Partition, compare, lines_of
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from tests.boards.conftest import CLOCK, PLANNED

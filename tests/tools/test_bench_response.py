@@ -11,7 +11,7 @@ import pytest
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.operating.command import CommandConfig
 from rack.levels.timing.system_response import command_paths
-from rack.tools.bench.response import (
+from rack.tools.benches.response import (
     RUN_S,
     CommandedRun,
     ResponseRuns,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.segment import SHM_FOLDER
-from rack.tools.bench.switch import PAPER_US, WAKES, cost_of, measure
+from rack.tools.benches.switch import PAPER_US, WAKES, cost_of, measure
 from rack.tools.console.answer import Failure
 from tests.machine import needs_fifo, needs_two_cores
 

@@ -11,7 +11,7 @@ import pytest
 from rack.boards.config import load
 from rack.tools.analysis.report import write_report
 from rack.tools.analysis.report_markdown import markdown
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.viewer.reading import read
 
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("hang")
     (path / "small.toml").write_text(SMALL)
     config = load(path / "small.toml", [f"name={path.parent.name}-hang", f"fault=[{HANG}, {NEVER}]"])
-    run_rack(config, 3.0, path / "run", SilentDisplay())
+    run_rack(config, 3.0, path / "run", Display())
     return path / "run"
 
 

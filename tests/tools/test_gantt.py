@@ -124,7 +124,7 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
     [
         (["nosuch"], "no such file; by name: crossing, fig2"),
         (["runs/nosuch"], "runs/nosuch: no such run's folder, and no such config"),
-        (["configs/tasks"], "configs/tasks: no run, it has no config.toml"),
+        (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),
         (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),
         (["fig2", "--process", "arm=3"], "--process arm: no board of that name has a budget; boards: level"),

@@ -166,7 +166,7 @@ def _tasks(found: Mapping[str, Cycles], rack: RackTiming, percentile: float) -> 
 def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
     for core, load in loads.items():
         relation = Relation(load, "<=", 1.0)
-        yield EquationVerdict.of(LOAD, f"core {core}", relation, "what its tasks used of its time", "1")
+        yield EquationVerdict.of(LOAD, f"core {core}", relation, "time used by its tasks", "1")
 
 
 def core_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTiming) -> dict[int, float]:

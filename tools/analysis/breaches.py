@@ -42,17 +42,17 @@ class CoreSharing:
     def text(self) -> str:
         """Return the main uses of the time, the longest first."""
         uses = sorted(self._uses(), reverse=True)
-        return "; ".join(text for _, text in uses) or f"computed {_ms(self.own_ns)}, as usual"
+        return "; ".join(text for _, text in uses) or f"computed {brief_ms(self.own_ns)} ms, as usual"
 
     def _uses(self) -> Iterator[tuple[int, str]]:
         least = MENTIONED * self.lasted_ns
         if self.own_ns > UNUSUAL * self.usual_ns:
-            yield self.own_ns, f"computed {_ms(self.own_ns)}, usually {_ms(self.usual_ns)}"
+            yield self.own_ns, f"computed {brief_ms(self.own_ns)} ms, usually {brief_ms(self.usual_ns)} ms"
         for name, ns in self.others_ns.items():
             if ns > least:
-                yield ns, f"{'its previous cycle' if name == BEFORE else name} had the core for {_ms(ns)}"
+                yield ns, f"{'its previous cycle' if name == BEFORE else name} had the core for {brief_ms(ns)} ms"
         if self.nobody_ns > least:
-            yield self.nobody_ns, f"no task of the rack had the core for {_ms(self.nobody_ns)}"
+            yield self.nobody_ns, f"no task of the rack had the core for {brief_ms(self.nobody_ns)} ms"
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,9 @@ def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackT
     cycles = found[name]
     rows = cycles.rows[at]
     starts, ends = _due_ns(cycles, rack)[at], rows["end_ns"]
-    rivals = {other: Occupation.of(rival.rows) for other, rival in found.items() if _may_preempt(rival, cycles)}
+    others = {other: rival for other, rival in found.items() if other != name and rival.core == cycles.core}
+    # By their priorities, these can have had the core while this task wanted it.
+    rivals = {o: Occupation.of(rival.rows) for o, rival in others.items() if rival.priority >= cycles.priority}
     # A plan update that is a critical section keeps the executor waiting.
     if rack.boards[cycles.task.board].is_critical and (planner := found.get(f"{name}.planner")) is not None:
         rivals[planner.task.name] = Occupation(planner.rows["process_ns"], planner.rows["end_ns"])
@@ -159,11 +161,7 @@ def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackT
     ]
 
 
-def _may_preempt(rival: Cycles, cycles: Cycles) -> bool:
-    """Return whether a task can have had the core while another wanted it, by their priorities."""
-    is_another = rival.task.name != cycles.task.name
-    return is_another and rival.core == cycles.core and rival.priority >= cycles.priority
-
-
-def _ms(ns: float) -> str:
-    return f"{ns * 1e-6:.3g} ms"
+def brief_ms(ns: float) -> str:
+    """Return a time in ms with three digits."""
+    ms = ns * 1e-6
+    return f"{ms:.0f}" if ms >= 100 else f"{ms:.3g}"

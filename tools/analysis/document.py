@@ -14,7 +14,7 @@ from rack.levels.timing.rack import LevelTiming, RackTiming
 from rack.levels.timing.trace_times import counts, distribution, gaps_ns, lateness_ns, response_ns
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis, Pair
-from rack.tools.analysis.breaches import Breach
+from rack.tools.analysis.breaches import Breach, brief_ms
 from rack.tools.analysis.rules import slice_ns
 from rack.tools.runs.cycles import START_UP_S, Cycles, restarts
 
@@ -62,16 +62,13 @@ def _pair(pair: Pair) -> Document:
     return {
         "equation": pair.equation,
         "subject": pair.subject,
-        "predicted": _verdict(pair.predicted),
-        "measured": _verdict(pair.measured),
+        "predicted": None if pair.predicted is None else _without_subject(pair.predicted),
+        "measured": None if pair.measured is None else _without_subject(pair.measured),
         "disagrees": pair.disagrees,
     }
 
 
-def _verdict(verdict: EquationVerdict | None) -> Document | None:
-    if verdict is None:
-        return None
-    # Equation and subject are those of the pair.
+def _without_subject(verdict: EquationVerdict) -> Document:
     return {name: value for name, value in verdict.document().items() if name not in ("equation", "subject")}
 
 
@@ -134,7 +131,7 @@ def _clauses(analysis: Analysis, timing: LevelTiming) -> Iterator[str]:
     used_ns = timing.execution_ns + timing.communication_ns
     usual_ns = float(np.median(analysis.cycles[timing.board].used_ns))
     when = worst_words(analysis.percentile)
-    yield f"{_ms(used_ns)} of {_ms(timing.cycle_ns)} ms used {when}, {_ms(usual_ns)} usually"
+    yield f"{brief_ms(used_ns)} of {brief_ms(timing.cycle_ns)} ms used {when}, {brief_ms(usual_ns)} usually"
     if timing.planning_ns is not None:
         yield _planner(timing, analysis.measured.context_switch_ns)
     elif timing.coupling != "none":
@@ -152,9 +149,9 @@ def _planner(timing: LevelTiming, switch_ns: int) -> str:
     else:
         needed = plan_cycles_tight(planning_ns, timing.residual_ns, switch_ns)
         place = "on the same processor"
-    took = f"a plan takes {_ms(planning_ns)} ms {place}"
+    took = f"a plan takes {brief_ms(planning_ns)} ms {place}"
     if needed is None:
-        return f"{took}, and nothing is left for it in such a cycle"
+        return f"{took}, and no time is left for it in such a cycle"
     fits = needed <= (permitted or 0)
     return f"{took}: {f'fits into {needed} of its' if fits else f'needs {needed} and has'} {permitted} cycles"
 
@@ -163,9 +160,4 @@ def _over(timing: LevelTiming, budget: LevelTiming) -> Iterator[str]:
     for unit, name in UNITS.items():
         took, permitted = (getattr(side, f"{name}_ns") or 0 for side in (timing, budget))
         if took > permitted:
-            yield f"{unit} {_ms(took)} of {_ms(permitted)} ms"
-
-
-def _ms(ns: float) -> str:
-    ms = ns * MS
-    return f"{ms:.0f}" if ms >= 100 else f"{ms:.3g}"
+            yield f"{unit} {brief_ms(took)} of {brief_ms(permitted)} ms"

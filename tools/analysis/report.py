@@ -53,7 +53,8 @@ def report_of(recording: Recording) -> Report:
     """Return the report of a recorded run as plain data."""
     config, layout = recording.rack_config, recording.layout
     ended, found = recording.ended, misses(recording)
-    report = _head(config, ended, _last_tick(recording) + 1)
+    last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
+    report = _head(config, ended, last + 1)
     if not ended:
         # Without the end of the run in the recording, the trace has to do.
         report["missed"], report["skipped"] = counted(found)
@@ -64,7 +65,7 @@ def report_of(recording: Recording) -> Report:
         "steal": steal(recording),
         "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
         "holds": holds(recording),
-        **faults(recording, layout),
+        **faults(recording.events, layout),
         "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
         "system_response": system_response(recording),
         "task": _task_outcome(recording),
@@ -106,10 +107,6 @@ def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
     }
 
 
-def _last_tick(recording: Recording) -> int:
-    return max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
-
-
 def _compared(recording: Recording, other: Recording, found: list[Report]) -> Report:
     difference = first_difference(recording, other)
     missed = min((miss["tick"] for miss in [*found, *misses(other)]), default=None)
@@ -149,12 +146,17 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: 
     """
     slice_ns = task.every * task.within_cycles * period_ns
     gaps = gaps_ns(cycles)
-    by_the_clock = {
+    by_the_clock: Report = {
         "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),
         "residual_ms": distribution(residual_ns(cycles, slice_ns) * 1e-6),
         "largest_gap_ms": round(float(gaps.max()) * 1e-6, 6) if len(gaps) else None,
-        **_worst(slice_ns, execution_ns(cycles).tolist(), communication_ns(cycles).tolist()),
+        "alpha_ms": None,
+        "deviation_ms": None,
     }
+    if len(cycles):
+        times = execution_ns(cycles).tolist(), communication_ns(cycles).tolist()
+        by_the_clock["alpha_ms"] = round(residual_bound_ns(slice_ns, *times) * 1e-6, 6)
+        by_the_clock["deviation_ms"] = round(residual_deviation_ns(*times) * 1e-6, 6)
     return {
         "traced": len(cycles),
         "slice_ms": slice_ns * 1e-6,
@@ -163,15 +165,6 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: 
         "processor_ms": distribution(cycles["processor_ns"] * 1e-6),
         **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
     }
-
-
-def _worst(slice_ns: int, executions_ns: list[int], communications_ns: list[int]) -> dict[str, float | None]:
-    """Return alpha of eq. 3.6, the residual of the worst cycle, and the deviation of the residual; both in ms."""
-    if not executions_ns:
-        return {"alpha_ms": None, "deviation_ms": None}
-    alpha_ns = residual_bound_ns(slice_ns, executions_ns, communications_ns)
-    deviation_ns = residual_deviation_ns(executions_ns, communications_ns)
-    return {"alpha_ms": round(alpha_ns * 1e-6, 6), "deviation_ms": round(deviation_ns * 1e-6, 6)}
 
 
 def _task_outcome(recording: Recording) -> Report | None:

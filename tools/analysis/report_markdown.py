@@ -1,4 +1,4 @@
-"""A report as text for people: report.md with every column, and a terminal's view with as many as fit."""
+"""A report as text: report.md with every column, and on a terminal as many as fit."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from rack.tools.console.tables import table
-from rack.tools.runs import markdown as md
+from rack.tools.console.tables import decimal, figure, markdown_table, table
 from rack.tools.runs.history import counted
 from rack.tools.runs.holds import resume_command
 
@@ -39,10 +38,14 @@ class Grid:
     rows: Sequence[Sequence[str]]
     dropped: Sequence[str] = ()
 
+    def markdown(self) -> Iterator[str]:
+        """Yield all of it in Markdown."""
+        return markdown_table(self.head, self.rows)
+
 
 def markdown(report: Report) -> str:
     """Return report.md of a report."""
-    blocks = (md.table(block.head, block.rows) if isinstance(block, Grid) else (block,) for block in _blocks(report))
+    blocks = (block.markdown() if isinstance(block, Grid) else (block,) for block in _blocks(report))
     return "\n".join(line for lines in blocks for line in lines) + "\n"
 
 
@@ -187,15 +190,11 @@ def _misses(report: Report) -> Iterator[str | Grid]:
             str(miss["tick"]),
             miss["task"],
             miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
-            *(_given(miss, key) for key in ("started_ms", "took_ms")),
+            *(decimal(miss.get(key)) for key in ("started_ms", "took_ms")),
         ]
         for miss in misses[:SHOWN]
     ]
     yield Grid(("tick", "task", "what", "started late, ms", "took, ms"), rows)
-
-
-def _given(miss: Report, key: str) -> str:
-    return f"{miss[key]:.3f}" if key in miss else "-"
 
 
 def _task(task: Report | None) -> Iterator[str]:
@@ -217,14 +216,11 @@ def _times_row(name: str, task: Report) -> dict[str, str]:
     row = {"task": name, "R": f"{task['slice_ms']:g}"}
     row |= {key: str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")}
     for title, key in (("late", "lateness_ms"), ("exec", "execution_ms")):
-        row |= {f"{title} {part}": _ms(task[key], part) for part in ("p50", "p99", "max")}
-    row |= {key: "-" if task[f"{key}_ms"] is None else f"{task[f'{key}_ms']:.3f}" for key in ("deviation", "alpha")}
-    row |= {"comm p99": _ms(task["communication_ms"], "p99"), "proc p99": _ms(task["processor_ms"], "p99")}
-    return row | {"residual min": _ms(task["residual_ms"], "min"), "plan age max": _ms(task.get("plan_age_ms"), "max")}
-
-
-def _ms(distribution: Report | None, key: str) -> str:
-    return "-" if distribution is None else f"{distribution[key]:.3f}"
+        row |= {f"{title} {part}": figure(task[key], part) for part in ("p50", "p99", "max")}
+    row |= {key: decimal(task[f"{key}_ms"]) for key in ("deviation", "alpha")}
+    row |= {"comm p99": figure(task["communication_ms"], "p99"), "proc p99": figure(task["processor_ms"], "p99")}
+    row |= {"residual min": figure(task["residual_ms"], "min"), "plan age max": figure(task.get("plan_age_ms"), "max")}
+    return row
 
 
 def _response(response: Report | None) -> Iterator[str | Grid]:
@@ -238,7 +234,7 @@ def _response(response: Report | None) -> Iterator[str | Grid]:
     rows = [
         [
             way,
-            *(_ms(found["measured_ms"], key) for key in ("p50", "max")),
+            *(figure(found["measured_ms"], key) for key in ("p50", "max")),
             f"{found['bound_ms']:g}",
             JUDGED[found["holds"]],
         ]
@@ -249,7 +245,7 @@ def _response(response: Report | None) -> Iterator[str | Grid]:
         if found["beyond"]:
             yield from ("", f"{way}: {len(found['beyond'])} beyond the bound{_first(found['beyond'], 'longest')}:")
         for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
-            why = "; ".join(each["delayed_by"]) or "nothing in the recording says why"
+            why = "; ".join(each["delayed_by"]) or "no cause is recorded"
             yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
         if found["unseen"]:
-            yield from ("", f"{way}: {found['unseen']} not measured, messages are missing in the recording.")
+            yield from ("", f"{way}: {found['unseen']} not measured: messages are missing in the recording.")

@@ -1,4 +1,4 @@
-"""The residuals of all levels as a picture, PNG and SVG. Only pictures import matplotlib: it takes a second."""
+"""The residuals of all levels as a picture. Imports matplotlib: see `rack.tools.console.pictures`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -15,11 +13,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from rack.levels.timing.rack import LevelTiming
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import deviation_ns, worst_words
+from rack.tools.console.pictures import paths_of, picture
 from rack.tools.runs.cycles import Cycles
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH_IN, ROW_IN, EDGES_IN = 9.0, 0.95, 1.6
 CYCLES, MEASURED, PREDICTED, END = "#88ccee", "#222222", "#117733", "#cc3311"
@@ -32,23 +32,20 @@ def plot(analysis: Analysis, path: Path) -> None:
     """Draw the part of R_i that the cycles of each level used into `path`.png and `path`.svg."""
     levels = [name for name in analysis.config.board if name in analysis.measured.levels]
     height = ROW_IN * len(levels) + EDGES_IN
-    figure = Figure(figsize=(WIDTH_IN, height))
-    axes = figure.add_subplot()
     low, high = _span(analysis, levels)
     edges = np.geomspace(low, high, BINS + 1)
-    for row, name in enumerate(reversed(levels)):
-        level = _Level(analysis.cycles[name], analysis.measured.levels[name], analysis.predicted.levels.get(name))
-        _draw(axes, level, row, edges)
-    axes.set_yticks(np.arange(len(levels)) + 0.1, levels[::-1], fontsize=9)
-    axes.set_ylim(-0.35, len(levels) - 0.15)
-    _scale(axes, low, high)
-    _legend(figure, analysis)
-    figure.suptitle(_title(analysis), fontsize=10, y=1 - 0.2 / height)
-    figure.subplots_adjust(left=0.15, right=0.73, top=1 - 0.45 / height, bottom=1.05 / height)
-    figure.savefig(path.with_suffix(".png"), dpi=130)
-    # Equal runs make equal files.
-    with rc_context({"svg.hashsalt": "rack"}):
-        figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
+    with picture(paths_of(path), WIDTH_IN, height) as figure:
+        axes = figure.add_subplot()
+        for row, name in enumerate(reversed(levels)):
+            level = _Level(analysis.cycles[name], analysis.measured.levels[name], analysis.predicted.levels.get(name))
+            _draw(axes, level, row, edges)
+        axes.set_yticks(np.arange(len(levels)) + 0.1, levels[::-1])
+        axes.set_ylim(-0.35, len(levels) - 0.15)
+        _scale(axes, low, high)
+        _legend(figure, analysis)
+        title = f"{analysis.config.name}: residuals of the cycles, by level ({analysis.config.clock.mode})"
+        figure.suptitle(title, fontsize=10, y=1 - 0.2 / height)
+        figure.subplots_adjust(left=0.15, right=0.73, top=1 - 0.45 / height, bottom=1.05 / height)
 
 
 def _scale(axes: Axes, low: float, high: float) -> None:
@@ -58,12 +55,9 @@ def _scale(axes: Axes, low: float, high: float) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 300 * low else (1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda part, _: f"{100 * part:g} %"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.tick_params(axis="x", labelsize=9)
     axes.axvline(1.0, color=END, linewidth=1.4)
     axes.text(1.03, 0.98, "R_i", transform=axes.get_xaxis_transform(), fontsize=8, color=END, va="top")
-    axes.set_xlabel(
-        "t_exec + t_comm of a cycle as a part of R_i; from there to the red line is its residual", fontsize=9
-    )
+    axes.set_xlabel("t_exec + t_comm of a cycle as a part of R_i; from there to the red line is its residual")
 
 
 def _legend(figure: Figure, analysis: Analysis) -> None:
@@ -76,10 +70,6 @@ def _legend(figure: Figure, analysis: Analysis) -> None:
         Line2D([], [], color=colour, marker=marker, linestyle="", label=words) for marker, colour, words in marks
     ]
     figure.legend(handles=handles, loc="lower center", fontsize=8, frameon=False, ncols=3)
-
-
-def _title(analysis: Analysis) -> str:
-    return f"{analysis.config.name}: what the cycles of each level left ({analysis.config.clock.mode})"
 
 
 def _span(analysis: Analysis, levels: list[str]) -> tuple[float, float]:

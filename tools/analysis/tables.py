@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any
 
 from rack.levels.timing.rack import LevelTiming
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.analysis.breaches import Breach, Broken
 from rack.tools.analysis.document import summary, task_document, worst_words
-from rack.tools.console.tables import table
+from rack.tools.console.tables import decimal, figure, ms, table
 from rack.tools.runs.cycles import START_UP_S, Cycles, restarts
 
 SHOWN = 10
 """Most cycles in the list of those that broke an equation; the document has them all."""
-MS = 1e-6
 LEVELS = ["level", "", "R_i", "t_exec", "C", "R", "W", "t_comm", "t_residual", "t_plan", "d"]
 BY_THE_CLOCK = [
     *("late p50", "late p99", "late p99.9", "late max", "response p99", "response max", "of", "largest gap"),
@@ -35,23 +33,23 @@ def text(analysis: Analysis, width: int | None = None) -> str:
 
 def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
     yield from _head(analysis)
-    yield from (
-        "",
-        f"Levels, processor time in ms, {worst_words(analysis.percentile)}; t_residual is alpha of eq. 3.6:",
-    )
-    yield from table(LEVELS, list(_level_rows(analysis)), width, ("C", "R", "W", "d"))
+    yield ""
+    yield f"Levels: processor time in ms, {worst_words(analysis.percentile)}; t_residual is alpha of eq. 3.6."
+    sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
+    levels = [_level_row(n, side, of[n]) for n in analysis.config.board for side, of in sides.items() if n in of]
+    yield from table(LEVELS, levels, width, ("C", "R", "W", "d"))
     yield ""
     yield from (f"{name}: {summary(analysis, name)}" for name in analysis.config.board)
     yield ""
     yield (
-        "Tasks, wall clock in ms. Deviation: standard deviation of the residual from cycle to cycle. Overhead: "
-        "processor time of a cycle outside its parts, for waking up and closing it; the equations use 2 t_cs for it:"
+        "Tasks: wall clock in ms. Deviation: standard deviation of the residual from cycle to cycle. Overhead: "
+        "processor time of a cycle outside its parts, for waking up and closing it; the equations use 2 t_cs for it."
     )
     rows = [_task_row(name, cycles, analysis) for name, cycles in analysis.cycles.items()]
     # In lockstep there is no lateness and no deadline.
     shown = len(TASKS) - len(BY_THE_CLOCK) if analysis.predicted.is_lockstep else len(TASKS)
     yield from table(TASKS[:shown], [row[:shown] for row in rows], width, TASKS_DROPPED)
-    yield from ("", "Equations, in ms, predicted from the budgets and measured:")
+    yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
     yield from table(EQUATIONS, list(map(_pair_row, analysis.pairs)), width, EQUATIONS_DROPPED)
     yield from _broken_cycles(analysis)
 
@@ -73,7 +71,7 @@ def _head(analysis: Analysis) -> Iterator[str]:
         yield "lockstep: no deadlines, no lateness; processor times are real"
     if restarted := restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
-    yield f"the first {START_UP_S:g} s of a process are not judged; t_cs is {config.timing.context_switch_ms:g} ms"
+    yield f"the first {START_UP_S:g} s of each process are not judged; t_cs is {config.timing.context_switch_ms:g} ms"
     yield from (f"{count} rows of {name} were lost" for name, count in analysis.recording.lost.items() if count)
 
 
@@ -84,19 +82,11 @@ def _named(pairs: list[Pair]) -> str:
     return "; ".join(f"{name} {equations}" for name, equations in named.items())
 
 
-def _level_rows(analysis: Analysis) -> Iterator[list[str]]:
-    for name in analysis.config.board:
-        if (predicted := analysis.predicted.levels.get(name)) is not None:
-            yield _level_row(name, "predicted", predicted)
-        if (measured := analysis.measured.levels.get(name)) is not None:
-            yield _level_row(name, "measured", measured)
-
-
 def _level_row(name: str, side: str, timing: LevelTiming) -> list[str]:
     parts = (timing.execution_ns, timing.exchange_ns, timing.read_ns, timing.write_ns, timing.communication_ns)
-    plan = "-" if timing.planning_ns is None else _ms(timing.planning_ns)
-    cycle, d = f"{timing.cycle_ns * MS:g}", "-" if timing.within_cycles is None else str(timing.within_cycles)
-    return [name, side, cycle, *map(_ms, parts), _ms(timing.residual_ns), plan, d]
+    times = [decimal(None if ns is None else ns * 1e-6) for ns in (*parts, timing.residual_ns, timing.planning_ns)]
+    d = "-" if timing.within_cycles is None else str(timing.within_cycles)
+    return [name, side, f"{timing.cycle_ns * 1e-6:g}", *times, d]
 
 
 def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
@@ -105,12 +95,11 @@ def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
     return [
         name,
         *(str(found[key]) for key in ("cycles", "missed", "skipped")),
-        f"{found['deviation_ms']:.3f}",
-        f"{found['beside_ms']:.3f}",
-        *(_of(late, key) for key in ("p50", "p99", "p99_9", "max")),
-        *(_of(response, key) for key in ("p99", "max")),
+        *(decimal(found[key]) for key in ("deviation_ms", "beside_ms")),
+        *(figure(late, key) for key in ("p50", "p99", "p99_9", "max")),
+        *(figure(response, key) for key in ("p99", "max")),
         f"{found['slice_ms']:g}",
-        "-" if gap is None else f"{gap:.3f}",
+        decimal(gap),
     ]
 
 
@@ -144,7 +133,7 @@ def _broken_cycles(analysis: Analysis) -> Iterator[str]:
     starting = len(analysis.breaches) - len(judged)
     yield ""
     if not judged:
-        yield f"No cycle broke an equation by its own numbers; {starting} did in start-ups."
+        yield f"No cycle broke an equation by its own numbers, except {starting} in start-ups."
         return
     yield "Cycles that broke an equation by their own numbers:"
     for task in dict.fromkeys(breach.task for breach in judged):
@@ -152,7 +141,7 @@ def _broken_cycles(analysis: Analysis) -> Iterator[str]:
     yield f"  in start-ups: {starting}"
     shown = judged[:SHOWN]
     yield ""
-    yield f"The worst {len(shown)}, and the use of the core:"
+    yield f"The worst {len(shown)}, with the use of their core:"
     for breach in shown:
         broken = "; ".join(f"{each.equation} {_relation(each)}" for each in breach.broken)
         yield f"  {breach.task} at tick {breach.tick}, {breach.tick * tick_s:.3f} s: {broken}"
@@ -168,13 +157,5 @@ def _counted(task: str, judged: tuple[Breach, ...], of_all: int) -> str:
     return f"{task}: {len(mine)} of {of_all} ({100 * len(mine) / of_all:.3g} %): {by_equation}"
 
 
-def _of(distribution: dict[str, Any] | None, key: str) -> str:
-    return "-" if distribution is None else f"{distribution[key]:.3f}"
-
-
-def _ms(ns: float) -> str:
-    return f"{ns * MS:.3f}"
-
-
 def _number(value: float, unit: str) -> str:
-    return f"{value:.3f}" if unit == "1" else f"{value * MS:.3f}".removesuffix("000").rstrip(".") if value else "0"
+    return decimal(value) if unit == "1" else ms(value)

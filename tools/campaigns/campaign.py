@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,21 +76,22 @@ class Campaign:
 
     def run(self) -> Results:
         """Do everything that is not done yet, or as much as there is time for until Ctrl-C."""
+        order = self.order
         self._open()
         examine(self._config)
         with Workers(self._config) as self._workers:
             self._progress.begin("without faults, in lockstep")
             made = self._made([Plan(0, "nominal", lockstep=True)])
             if not made:
-                raise Failure(f"{self.order.name}: interrupted before the first run was done")
+                raise Failure(f"{order.name}: interrupted before the first run was done")
             nominal = made[0]
             if nominal.shortfalls or nominal.ended != "task done":
-                raise Failure(
-                    f"{self.order.name}: the task is not done even without faults: {'; '.join(nominal.shortfalls)}"
-                )
+                why = "; ".join(nominal.shortfalls)
+                raise Failure(f"{order.name}: the task is not done even without faults: {why}")
             results, self._ticks = Results(nominal), nominal.ticks
             self._inject(results)
-            results.sizes += self._made(size_plans(self._under_test(True), self.kinds, *self._swept()))
+            rack = self._under_test(True)
+            results.sizes += self._made(size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1))
             self._run_faultless(results)
         results.is_interrupted = INTERRUPT.number != 0
         return results
@@ -110,9 +111,6 @@ class Campaign:
     def _under_test(self, lockstep: bool) -> RackUnderTest:
         return RackUnderTest(self._targets, self._ticks, self._second, restart_s(self._config, lockstep))
 
-    def _swept(self) -> tuple[int, int, int]:
-        return self.order.sizes, self.order.seed, self._number + 1
-
     def _inject(self, results: Results) -> None:
         """Make trials until every kind has struck as often as ordered; in real time those that lockstep cannot have."""
         order, both = self.order, len(self.order.modes) > 1
@@ -120,16 +118,17 @@ class Campaign:
             kinds = [k for k in self.kinds if needs_real_time(k) != lockstep] if both or lockstep else self.kinds
             lacking = dict.fromkeys(kinds if order.injections else (), order.injections)
             for turn in range(ROUNDS):
-                plans = fault_plans(
-                    self._under_test(lockstep), lacking, f"{order.seed} {turn}", lockstep, self._number + 1
-                )
-                found = self._made(plans)
+                rack, seed = self._under_test(lockstep), f"{order.seed} {turn}"
+                found = self._made(fault_plans(rack, lacking, seed, lockstep, self._number + 1))
                 results.trials += found
                 struck = Counter(f.kind for run in found for f in run.faults if f.is_judged and f.seen != "not struck")
                 lacking = {kind: left for kind, count in lacking.items() if (left := count - struck[kind]) > 0}
                 if not lacking or INTERRUPT.number:
                     break
-            results.lacking += _lines(lacking, order.injections)
+            wanted = order.injections
+            results.lacking += [
+                f"{k}: struck {wanted - n} of {wanted} times, in {ROUNDS} draws" for k, n in lacking.items()
+            ]
         # Runs of kills alternate between the modes.
         rack = self._under_test(False not in order.modes)
         kills = kill_plans(rack, order.kills, order.seed, order.modes, self._number + 1)
@@ -198,11 +197,6 @@ class Campaign:
         """Estimate the time that runs take: in lockstep a core simulates the default rack in a third of real time."""
         real_s, cores = self._ticks / self._second, len(os.sched_getaffinity(0))
         return sum(LAUNCH_S + (real_s / 3.0 / cores if plan.lockstep else real_s) for plan in plans)
-
-
-def _lines(lacking: Mapping[str, int], wanted: int) -> Iterator[str]:
-    for kind, left in lacking.items():
-        yield f"{kind}: struck {wanted - left} of {wanted} times, in {ROUNDS} draws"
 
 
 def _text(plan: Plan) -> str:

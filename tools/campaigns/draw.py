@@ -23,7 +23,7 @@ TAIL_S = 1.0
 SETTLE_S = 0.1
 """Simulated time between the end of all that a fault may lead to and the next fault."""
 EPISODE = 25
-"""Reads after which a reader reports the next fault of a mailbox again: `rack.backplane.episodes`, and some more."""
+"""Reads after which a reader reports the next fault of a mailbox again: those of `Episodes`, and some more."""
 AHEAD = 60
 """Waiting faults that are tried for one that still fits into a trial."""
 KILL_GAP_S = 3.5

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from rack.backplane.process import die_with_parent, is_alive, name_process, readable
 from rack.backplane.segment import SHM_FOLDER
 from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import descendants
 
 if TYPE_CHECKING:
     from rack.boards.config.schema import RackConfig
@@ -34,16 +35,7 @@ DISKS = "disks"
 
 def children() -> set[int]:
     """Return the living processes that descend from this one."""
-    found: set[int] = set()
-    waiting = [os.getpid()]
-    while waiting:
-        pid = waiting.pop()
-        with suppress(FileNotFoundError, ProcessLookupError):
-            for path in Path(f"/proc/{pid}/task").glob("*/children"):
-                new = {int(child) for child in path.read_text().split()} - found
-                found |= new
-                waiting += new
-    return {pid for pid in found if is_alive(pid)}
+    return {pid for pid in descendants(os.getpid()) if is_alive(pid)}
 
 
 def left_behind(rack: str, before: set[int]) -> list[str]:

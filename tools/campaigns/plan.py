@@ -58,7 +58,7 @@ class Plan:
 
 
 def needs_real_time(kind: str) -> bool:
-    """Say whether a kind does not exist in lockstep, or means nothing there: no time passes while a process dies."""
+    """Return whether a kind does not exist in lockstep, or means nothing there: no time passes while a process dies."""
     return kind == EXTERNAL or KINDS[kind].realtime
 
 
@@ -93,9 +93,12 @@ class Targets:
         self.by_kind[EXTERNAL] = [Target(EXTERNAL, task, self._cycle(task)) for task in [*self._roles, CLOCK]]
 
     def _of(self, kind: Kind) -> list[Target]:
-        if kind.takes_mailbox:
-            return [self._at(kind, box) for box in self.layout.mailboxes if self._is_seen(kind, box)]
-        return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
+        if not kind.takes_mailbox:
+            return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
+        seen = [box for box in self.layout.mailboxes if self._is_seen(kind, box)]
+        readers = [min(map(self._cycle, box.readers)) for box in seen]
+        targets = zip(seen, readers, strict=True)
+        return [Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader) for box, reader in targets]
 
     def _tasks(self, kind: Kind) -> list[str]:
         if kind.where == "clock":
@@ -105,16 +108,12 @@ class Targets:
         return [task for task, role in self._roles.items() if role in kind.tasks]
 
     def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
-        """Say whether the mailbox has readers, and messages often enough: plans are not periodic."""
+        """Return whether the mailbox has readers, and messages often enough: plans are not periodic."""
         # The clock writes only for an operator.
         if not box.readers or box.writer == CLOCK or (kind.where == "lock" and box.protocol != "lock"):
             return False
         role = self._roles[box.writer]
         return role in kind.tasks and (kind.where != "writer" or role == "executor")
-
-    def _at(self, kind: Kind, box: MailboxSpec) -> Target:
-        reader = min(cycle_ticks(self.layout, task) for task in box.readers)
-        return Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader)
 
     def _cycle(self, task: str) -> int:
         return cycle_ticks(self.layout, task)

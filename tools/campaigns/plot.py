@@ -1,4 +1,4 @@
-"""A campaign as a picture, campaign.png. Only this module loads matplotlib."""
+"""A campaign as a picture, campaign.png. Imports matplotlib: see `rack.tools.console.pictures`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from rack.tools.campaigns.statistics import part_of_bound
+from rack.tools.console.pictures import picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
 Report = dict[str, Any]
@@ -26,14 +27,11 @@ WIDEST = 1.5
 
 def plot(report: Report, path: Path) -> None:
     """Draw a campaign's document into a PNG file: delays against bounds, curves of size, recovery times."""
-    figure = Figure(figsize=SIZE_IN)
-    delays, sizes, recoveries = (figure.add_subplot(place) for place in _places(figure))
-    _delays(delays, report)
-    _sizes(sizes, report)
-    _recoveries(recoveries, report)
     trials = f"{report['summary']['trials']} trials, {' and '.join(dict.fromkeys(report['modes']))}"
-    figure.suptitle(f"Faults injected into {report['config']}: {trials}, seed {report['seed']}", fontsize=11)
-    figure.savefig(path, dpi=120)
+    with picture([path], *SIZE_IN) as figure:
+        for place, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
+            draw(figure.add_subplot(place), report)
+        figure.suptitle(f"Faults injected into {report['config']}: {trials}, seed {report['seed']}", fontsize=11)
 
 
 def _places(figure: Figure) -> Iterator[SubplotSpec]:
@@ -57,7 +55,10 @@ def _delays(axes: Axes, report: Report) -> None:
         if parts:
             axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
         place, frame = (1.02, row), ("axes fraction", "data")
-        axes.annotate(_numbers(report["by_kind"][kind]), place, xycoords=frame, fontsize=8, va="center")
+        figures, cycles = report["by_kind"][kind], report["by_kind"][kind]["cycles"]
+        numbers = f"{figures['detected']} of {figures['injected']}"
+        numbers += "" if cycles is None else f"; {cycles['median']:.3g}, {cycles['max']:.3g}"
+        axes.annotate(numbers, place, xycoords=frame, fontsize=8, va="center")
     axes.axvline(1.0, color=BOUND, linewidth=1.2)
     axes.set_xlim(-0.03, WIDEST)
     _name_rows(axes, kinds)
@@ -81,11 +82,6 @@ def _part(fault: Report) -> float | None:
     return part_of_bound(fault["delay"], fault["bound"], fault["delay_ms"], fault["bound_ms"])
 
 
-def _numbers(figures: Report) -> str:
-    counts, cycles = f"{figures['detected']} of {figures['injected']}", figures["cycles"]
-    return counts if cycles is None else f"{counts}; {cycles['median']:.3g}, {cycles['max']:.3g}"
-
-
 def _sizes(axes: Axes, report: Report) -> None:
     """Draw the size of a sensor's error against the time to its detection."""
     edge, clock_ms = axes.get_xaxis_transform(), report["clock_ms"]
@@ -106,8 +102,8 @@ def _sizes(axes: Axes, report: Report) -> None:
         axes.set_ylim(-0.5 * clock_ms, 1.5 * longest)
         axes.legend(fontsize=8)
     else:
-        axes.text(0.5, 0.5, "no size was tried", ha="center", transform=axes.transAxes, fontsize=9)
-    axes.set_xlabel("size of the error, rad (dotted: must be found from there; x: not found)", fontsize=9)
+        axes.text(0.5, 0.5, "no size was tried", ha="center", transform=axes.transAxes)
+    axes.set_xlabel("size of the error, rad (dotted: must be found from there; x: not found)")
     axes.set_ylabel("time to detection, ms")
 
 
@@ -123,4 +119,4 @@ def _recoveries(axes: Axes, report: Report) -> None:
         _row(axes, row, found)
     _name_rows(axes, list(rows))
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("from the strike until every reaction is undone, s of simulated time", fontsize=9)
+    axes.set_xlabel("from the strike until every reaction is undone, s of simulated time")

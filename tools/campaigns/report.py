@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
@@ -12,6 +13,7 @@ from rack.boards.faults.kind import KINDS
 from rack.tools.campaigns.campaign import Campaign
 from rack.tools.campaigns.results import Results, TrialResult
 from rack.tools.campaigns.statistics import by_kind, curve, rate, totals
+from rack.tools.console.tables import markdown_table
 
 Report = dict[str, Any]
 SHOWN = 30
@@ -20,22 +22,18 @@ KINDS_HEAD = [
     *("kind", "injected", "detected", "in bound", "recovered", "at least", "ticks median", "max", "bound, ticks"),
     *("ms median", "max", "recovery median, ms", "max", "reactions"),
 ]
-ENDS = (
-    ("tasks_done", "task done"),
-    ("safely_stopped", "safely stopped"),
-    ("not_armed", "not armed, as required"),
-    ("neither", "neither"),
-)
+
+ENDS = {"tasks_done": "task done", "safely_stopped": "safely stopped", "not_armed": "not armed", "neither": "neither"}
 
 
 def document(campaign: Campaign, results: Results, wall_s: float) -> Report:
     """Return all results of a campaign as plain data; `shortfalls` is empty when nothing falls short."""
-    order, clock_ns = campaign.order, campaign.layout.clock_ns
+    order, clock_ns, run = campaign.order, campaign.layout.clock_ns, results.nominal
     kinds = by_kind(results.faults, clock_ns)
     for kind, figures in kinds.items():
-        with_it = [run for run in results.trials if any(f.kind == kind and f.struck >= 0 for f in run.faults)]
+        with_it = [one for one in results.trials if any(f.kind == kind and f.struck >= 0 for f in one.faults)]
         figures["trials"] = len(with_it)
-        figures["tasks_done"] = sum(run.ended == "task done" for run in with_it)
+        figures["tasks_done"] = sum(one.ended == "task done" for one in with_it)
     summary = _figures(results, 1e9 / clock_ns)
     return {
         "config": order.name,
@@ -46,7 +44,7 @@ def document(campaign: Campaign, results: Results, wall_s: float) -> Report:
         "wall_s": round(wall_s, 1),
         "machine": _machine(results),
         "clock_ms": clock_ns * 1e-6,
-        "nominal": _nominal(results.nominal, clock_ns),
+        "nominal": {"ticks": run.ticks, "seconds": round(run.ticks * clock_ns * 1e-9, 3), "digest": run.digest},
         "summary": summary,
         "by_kind": kinds,
         "sizes": _curves(results, clock_ns),
@@ -63,7 +61,7 @@ def document(campaign: Campaign, results: Results, wall_s: float) -> Report:
 
 def _figures(results: Results, second: float) -> Report:
     trials, runs = results.trials, results.runs
-    ended = [run.ended for run in trials]
+    ended = Counter[str](run.ended for run in trials)
     calm_s = sum(part.seconds for part in results.faultless)
     trips = sum(part.trips for part in results.faultless)
     simulated_s = sum(run.ticks for run in runs) / second
@@ -71,10 +69,7 @@ def _figures(results: Results, second: float) -> Report:
     return {
         **totals(results.faults),
         "trials": len(trials),
-        "tasks_done": ended.count("task done"),
-        "safely_stopped": ended.count("safely stopped"),
-        "not_armed": ended.count("not armed"),
-        "neither": ended.count("neither"),
+        **{key: ended[name] for key, name in ENDS.items()},
         "limits_violated": sum(run.violations for run in runs),
         "touches": sum(run.touches for run in runs),
         "left_behind": sum(len(run.left) for run in runs),
@@ -90,21 +85,16 @@ def _figures(results: Results, second: float) -> Report:
 
 def _shortfalls(results: Results) -> list[str]:
     """Return the reasons why the campaign fails, a line each."""
-    return [*(f"{_run_of(run)}: {line}" for run in results.runs for line in run.shortfalls), *results.lacking]
-
-
-def _run_of(run: TrialResult) -> str:
-    return f"trial {run.plan.number}" if run.plan.number else f"{run.plan.purpose} run"
+    names = [
+        (run, f"trial {run.plan.number}" if run.plan.number else f"{run.plan.purpose} run") for run in results.runs
+    ]
+    return [*(f"{name}: {line}" for run, name in names for line in run.shortfalls), *results.lacking]
 
 
 def _curves(results: Results, clock_ns: int) -> Report:
     swept = [fault for run in results.sizes for fault in run.faults] + results.faults
     curves = {kind: curve(swept, kind.name, clock_ns) for kind in KINDS if kind.visible_from is not None}
     return {kind.name: {"judged_from": kind.visible_from, "curve": points} for kind, points in curves.items() if points}
-
-
-def _nominal(run: TrialResult, clock_ns: int) -> Report:
-    return {"ticks": run.ticks, "seconds": round(run.ticks * clock_ns * 1e-9, 3), "digest": run.digest}
 
 
 def _trial(run: TrialResult) -> Report:
@@ -147,18 +137,16 @@ def _lines(report: Report) -> Iterator[str]:
     )
     yield from (f"- {note}" for note in report["machine"]["notes"])
     yield ""
-    yield from table(["", ""], [[name, str(value)] for name, value in _summary(summary)])
+    yield from markdown_table(["", ""], [[name, str(value)] for name, value in _summary(summary)])
     if report["by_kind"]:
         yield from ("", "## Faults by kind", "")
-        yield from table(KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()])
-        yield from (
-            "",
-            "At least: the smallest lower end of Wilson's 95 % interval among detected, in bound and recovered."
-            " Ticks are the clock's.",
-        )
+        yield from markdown_table(KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()])
+        yield ""
+        yield "At least: the smallest lower bound of Wilson's 95 % interval of detected, in bound and recovered."
     yield from _faultless(report["faultless"])
     yield from _sizes(report["sizes"])
-    yield from _listed(report["shortfalls"])
+    if shortfalls := report["shortfalls"]:
+        yield from ("", f"## Shortfalls: {len(shortfalls)}", "", *(f"- {line}" for line in shortfalls[:SHOWN]))
 
 
 def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
@@ -168,7 +156,7 @@ def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
     yield "reacted to", summary["reacted_to"]
     latched = f", of which {summary['latched']} ended the task, as permitted" if summary["latched"] else ""
     yield "recovered from", f"{summary['recovered']}{latched}"
-    ends = [f"{summary[key]} {name}" for key, name in ENDS if summary[key]]
+    ends = [f"{summary[key]} {name}" for key, name in ENDS.items() if summary[key]]
     yield "trials ended", ", ".join(ends) or "none"
     yield "limits violated", f"{summary['limits_violated']} (in any substep of any run)"
     yield "touches", summary["touches"]
@@ -176,11 +164,8 @@ def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
     hours = f"{summary['simulated_s'] / 3600.0:.2f} simulated hours"
     yield "false detections", f"{summary['unexplained']} in {hours}: {_rate(summary['unexplained_per_hour'])}"
     if summary["faultless_s"]:
-        rate = _rate(summary["false_trips_per_hour"])
-        yield (
-            "of these without faults, in real time",
-            f"{summary['false_trips']} in {summary['faultless_s']:g} s: {rate}",
-        )
+        trips = f"{summary['false_trips']} in {summary['faultless_s']:g} s"
+        yield "of these without faults, in real time", f"{trips}: {_rate(summary['false_trips_per_hour'])}"
     yield "unexplained misses in real time", summary["stray_misses"]
 
 
@@ -221,40 +206,15 @@ def _faultless(parts: list[Report]) -> Iterator[str]:
         ]
         for part in parts
     ]
-    yield from table(["", "s", "false trips", "an hour", "misses (no trips)"], rows)
+    yield from markdown_table(["", "s", "false trips", "an hour", "misses (no trips)"], rows)
 
 
 def _sizes(sizes: Report) -> Iterator[str]:
     for kind, found in sizes.items():
         size = KINDS[kind].size
         unit = size.unit if size is not None else ""
-        yield from (
-            "",
-            f"## {kind}: size against delay",
-            "",
-            f"Must be found from {found['judged_from']:g} {unit}.",
-            "",
-        )
-        rows = [
-            [f"{point['size']:.4g}", point["joint"] or "all", _or_dash(point["delay_ms"])] for point in found["curve"]
-        ]
-        yield from table([f"size, {unit}", "joint", "found after, ms"], rows)
-
-
-def _listed(lines: list[str]) -> Iterator[str]:
-    if lines:
-        yield from ("", f"## Shortfalls: {len(lines)}", "")
-        yield from (f"- {line}" for line in lines[:SHOWN])
-
-
-def _or_dash(value: float | None) -> str:
-    return "-" if value is None else f"{value:g}"
-
-
-def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """Yield the lines of a markdown table, its columns as wide as their widest cells."""
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    lines = [" | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows)]
-    yield f"| {lines[0]} |"
-    yield "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    yield from (f"| {line} |" for line in lines[1:])
+        yield from ("", f"## {kind}: size against delay", "")
+        yield from (f"Must be found from {found['judged_from']:g} {unit}.", "")
+        points = [(f"{point['size']:.4g}", point["joint"] or "all", point["delay_ms"]) for point in found["curve"]]
+        rows = [[size, joint, "-" if after_ms is None else f"{after_ms:g}"] for size, joint, after_ms in points]
+        yield from markdown_table([f"size, {unit}", "joint", "found after, ms"], rows)

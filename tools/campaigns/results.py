@@ -226,14 +226,8 @@ def _refused(trial: Trial) -> tuple[Judgement, ...]:
         Judgement(
             kind=table["kind"],
             board=table["board"],
-            mailbox="",
-            joint="",
-            size=None,
-            began=-1,
             struck=0 if KINDS[table["kind"]].where == "start" else -1,
             seen=_seen_at_start(table, trial),
-            is_judged=True,
-            cycle=1,
             found_by="the Rack",
             found_as="not armed",
             is_within=_seen_at_start(table, trial) == "detected",
@@ -255,14 +249,14 @@ def _shortfalls(fault: Judgement) -> Iterator[str]:
     if fault.seen == "missed":
         yield f"{strike}: not detected"
     if fault.seen == "detected" and not fault.is_within:
-        yield f"{strike}: {_lateness(fault)}"
+        by_time = fault.bound_ms is not None
+        after = (
+            f"{fault.delay_ms:g} ms; bound {fault.bound_ms:g}"
+            if by_time
+            else f"{fault.delay} ticks; bound {fault.bound}"
+        )
+        yield f"{strike}: {fault.found_as} by {fault.found_by} after {after}"
     yield from (f"{strike}: no {code.replace('_', ' ')} follows" for code in fault.lacking)
     if not fault.is_recovered:
         undone = f"undone after {fault.recovery} ticks" if fault.recovery is not None else "never undone"
         yield f"{strike}: {', '.join(fault.reactions)} {undone}; bound {fault.recovery_bound}"
-
-
-def _lateness(fault: Judgement) -> str:
-    if fault.bound_ms is not None:
-        return f"{fault.found_as} after {fault.delay_ms:g} ms; bound {fault.bound_ms:g}"
-    return f"{fault.found_as} by {fault.found_by} after {fault.delay} ticks; bound {fault.bound}"

@@ -24,16 +24,14 @@ from rack.tools.campaigns.plan import Kill, Plan
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import ArmEnd, Killed, Strike, arm_of, is_late, levels_of, strikes
 
-MAX_LENGTH = 4
-"""A run with faults may take so many times as long as without, and"""
-GRACE_S = 60.0
-"""so much more simulated time; then it is stopped. No wait is without end."""
+MAX_LENGTH, GRACE_S = 4, 60.0
+"""A run with faults is stopped after this multiple of a faultless run's length, and this simulated time more."""
 NOMINAL_S = 1800.0
 """Simulated time of a run whose length is unknown."""
 STILL_S = 120.0
-"""Time within which a rack must give out a tick: none plans for longer without faults."""
+"""Longest time without a tick: no rack plans for longer."""
 STUCK_S = 20.0
-"""Time within which a rack must stop when it is asked to."""
+"""Longest time from a request to stop to the end."""
 RESTART_S = 2.0
 """Longest time of a restart in real time: a planner with its libraries takes 1.5 s."""
 LOOK_S = 0.001
@@ -201,4 +199,4 @@ def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None) -> Non
 def _why_stop(too_long: bool, deadline: float) -> str:
     if INTERRUPT.number:
         return "the campaign was interrupted"
-    return "it takes too long" if too_long or time.monotonic() > deadline else ""
+    return "the trial takes too long" if too_long or time.monotonic() > deadline else ""

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from rack.boards.config import RackConfig
 from rack.boards.config.timing import tick_ns
+from rack.tools.charts.letters import label_row
+from rack.tools.console.pictures import paths_of, picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +64,11 @@ def placed(config: RackConfig) -> list[Placed]:
     """Return the levels of a rack with their regions, the fastest first."""
     tick_s = tick_ns(config) * 1e-9
     cycles = {name: config.every(name) * tick_s for name in config.board}
-    return [_place(name, cycles[name], config.board[name].coupling) for name in sorted(cycles, key=lambda n: cycles[n])]
+    found = []
+    for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1]):
+        region, coupling = region_of(cycle_s), config.board[name].coupling
+        found.append(Placed(name, cycle_s, region.words, coupling, f"{region.words}: {_remark(region, coupling)}"))
+    return found
 
 
 def region_of(cycle_s: float) -> Region:
@@ -76,10 +82,11 @@ def lines(config: RackConfig) -> Iterator[str]:
     margin = max(len(level.level) for level in found) + 2
     yield f"figure 5: the levels of {config.name} among the regions of implementation, by their cycle"
     yield ""
-    yield " " * margin + _names()
+    starts = [0, *(bound + 2 for bound in BOUNDS)]
+    yield " " * margin + label_row((start, region.name) for start, region in zip(starts, REGIONS, strict=True))
     for level in found:
         yield f"{level.level:{margin}}{_row(level.cycle_s)}"
-    yield " " * margin + _axis()
+    yield " " * margin + label_row((_column(at), label) for at, label in TICKS.items())
     yield ""
     yield from (f"{level.level}, {duration(level.cycle_s)}: {level.remark}" for level in found)
 
@@ -99,22 +106,14 @@ def duration(cycle_s: float) -> str:
 
 def save(config: RackConfig, stem: Path) -> list[Path]:
     """Draw the figure with the levels of a rack into `stem`.png and .svg; return their paths."""
-    # matplotlib takes a second to import, and only pictures need it.
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    levels = placed(config)
-    with rc_context({"svg.hashsalt": config.name, "font.size": 9}):
-        figure = Figure(figsize=(9.0, 1.7 + 0.36 * len(levels)), layout="constrained")
+    levels, paths = placed(config), paths_of(stem)
+    with picture(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
         axes = figure.subplots()
         _draw_regions(axes)
         _draw_levels(axes, levels)
         axes.set_ylim(len(levels) - 0.4, -2.0)
-        axes.set_title(f"Figure 5: what the cycles of {config.name} ask for", fontsize=10, loc="left")
+        axes.set_title(f"Figure 5: implementations for the levels of {config.name}", fontsize=10, loc="left")
         figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-        paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
-        figure.savefig(paths[0], dpi=150)
-        figure.savefig(paths[1], metadata={"Date": None})
     return paths
 
 
@@ -145,11 +144,6 @@ def _draw_levels(axes: Axes, levels: Sequence[Placed]) -> None:
         axes.plot([], [], marker, markerfacecolor=face, markeredgecolor=EDGE, label=MEANINGS[coupling])
 
 
-def _place(name: str, cycle_s: float, coupling: str) -> Placed:
-    region = region_of(cycle_s)
-    return Placed(name, cycle_s, region.words, coupling, f"{region.words}: {_remark(region, coupling)}")
-
-
 def _remark(region: Region, coupling: str) -> str:
     if coupling == "none":
         return "no planner to couple"
@@ -169,25 +163,11 @@ def _column(cycle_s: float) -> int:
     return round(part * (WIDTH - 1))
 
 
-def _bounds() -> list[int]:
-    return [_column(region.to_s) for region in REGIONS[:-1]]
-
-
-def _names() -> str:
-    row = ""
-    for region, start in zip(REGIONS, [-2, *_bounds()], strict=True):
-        row = row.ljust(start + 2) + region.name
-    return row
+BOUNDS = [_column(region.to_s) for region in REGIONS[:-1]]
+"""Columns of the bounds between regions."""
 
 
 def _row(cycle_s: float) -> str:
-    row = ["|" if at in _bounds() else " " for at in range(WIDTH)]
+    row = ["|" if at in BOUNDS else " " for at in range(WIDTH)]
     row[_column(cycle_s)] = "o"
     return "".join(row).rstrip()
-
-
-def _axis() -> str:
-    row = ""
-    for at, label in TICKS.items():
-        row = row.ljust(_column(at)) + label
-    return row

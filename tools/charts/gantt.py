@@ -64,11 +64,8 @@ class Gantt:
 
     def text(self) -> str:
         """Return the chart as text."""
-        panels = ["\n".join([f"{self.rack}: {first}", *rest]) for first, *rest in map(self._lines, self.panels)]
+        panels = [f"{self.rack}: " + "\n".join(lines(panel, self.column_ns)) for panel in self.panels]
         return "\n\n".join([*panels, *self.notes])
-
-    def _lines(self, panel: Panel) -> list[str]:
-        return list(lines(panel, self.column_ns))
 
     def document(self) -> dict[str, Any]:
         """Return the chart as plain data."""

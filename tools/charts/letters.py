@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 
 from rack.levels.timing.schedule import Chart, Job, Span
-from rack.tools.charts.panel import NS_PER_MS, Panel
+from rack.tools.charts.panel import Panel
 from rack.tools.charts.patterns import IDLE, Lane
+from rack.tools.console.tables import ms
 
 OTHER = "."
 """Another board has the core."""
@@ -44,11 +45,6 @@ def column_for(window_ns: int, shortest_ns: int | None) -> int:
     fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
     seen = max((step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits)
     return max(fits, seen)
-
-
-def ms(time_ns: int) -> str:
-    """Return a time in ms, to the us."""
-    return f"{time_ns / NS_PER_MS:.3f}".rstrip("0").rstrip(".")
 
 
 def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
@@ -93,10 +89,16 @@ def _axis(panel: Panel, column_ns: int) -> Iterator[str]:
     """Yield the time below the chart."""
     chart = panel.chart
     step = step_for(panel, max(LABEL_COLUMNS, len(ms(chart.end_ns)) + 2) * column_ns)
+    times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
+    yield f"{label_row(((time - chart.start_ns) // column_ns, ms(time)) for time in times)} ms"
+
+
+def label_row(labels: Iterable[tuple[int, str]]) -> str:
+    """Return a row with labels that begin at these columns, or after the label before them."""
     row = ""
-    for time in range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step):
-        row = row.ljust((time - chart.start_ns) // column_ns) + ms(time)
-    yield f"{row} ms"
+    for column, label in labels:
+        row = row.ljust(column) + label
+    return row
 
 
 def step_for(panel: Panel, narrowest_ns: int) -> int:

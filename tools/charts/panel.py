@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rack.levels.timing.schedule import Chart, Job
+from rack.levels.timing.schedule import Chart, Job, Span
 from rack.tools.charts.patterns import Lane, Patterns, Stretch
 
 NS_PER_MS = 1_000_000
@@ -69,9 +69,7 @@ class Panel:
                     "task": span.task,
                     "core": span.core,
                     "unit": span.unit.value,
-                    "start_ms": span.start_ns / NS_PER_MS,
-                    "end_ms": span.end_ns / NS_PER_MS,
-                    "release_ms": span.release_ns / NS_PER_MS,
+                    **_in_ms(span, "start", "end", "release"),
                 }
                 for span in self.chart.spans
             ],
@@ -88,16 +86,19 @@ class Panel:
         for job in self.chart.jobs:
             yield {
                 "task": job.task,
-                "release_ms": job.release_ns / NS_PER_MS,
-                "deadline_ms": job.deadline_ns / NS_PER_MS,
-                "end_ms": None if job.end_ns is None else job.end_ns / NS_PER_MS,
+                **_in_ms(job, "release", "deadline", "end"),
                 "late": (job.task, job.release_ns) in late,
             }
 
 
 def _lane(lane: Lane) -> dict[str, Any]:
-    times = {"cycle_ms": lane.cycle_ns / NS_PER_MS, "slice_ms": lane.slice_ns / NS_PER_MS}
+    times = _in_ms(lane, "cycle", "slice")
     return {"core": lane.core, "board": lane.board, "tasks": list(lane.tasks), **times}
+
+
+def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
+    times = {name: getattr(entry, f"{name}_ns") for name in names}
+    return {f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS for name, time_ns in times.items()}
 
 
 def without(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:

@@ -1,4 +1,4 @@
-"""A Gantt chart as a picture, PNG and SVG. Only pictures import matplotlib: it takes a second."""
+"""A Gantt chart as a picture. Imports matplotlib: see `rack.tools.console.pictures`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from rack.levels.timing.tasks import Unit
 from rack.tools.charts.letters import step_for
 from rack.tools.charts.panel import NS_PER_MS, Panel
 from rack.tools.charts.patterns import IDLE
+from rack.tools.console.pictures import paths_of, picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,10 +49,8 @@ LETTER = 0.012
 def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     """Draw the panels, one above the other on one axis of time, into `stem`.png and .svg; return their paths."""
     lanes = [len(panel.lanes) for panel in panels]
-    height = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2
-    # Equal charts make equal files.
-    with rc_context({"svg.hashsalt": title, "font.size": 9}):
-        figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
+    height, paths = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2, paths_of(stem)
+    with picture(paths, WIDTH_IN, height, layout="constrained") as figure:
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=lanes)
         for axes, panel in zip(rows[:, 0], panels, strict=True):
             _draw(axes, panel)
@@ -62,9 +59,6 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
         handles = [Patch(facecolor=COLOURS[unit], label=NAMES[unit]) for unit in used]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
         figure.suptitle(title, fontsize=11)
-        paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
-        figure.savefig(paths[0], dpi=150)
-        figure.savefig(paths[1], metadata={"Date": None})
     return paths
 
 
@@ -97,7 +91,7 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
     letters += [(IDLE, idle) for idle in panel.idle(lane)]
     for letter, (begin, stop) in letters:
         if stop - begin >= LETTER * (chart.end_ns - chart.start_ns):
-            axes.text((begin + stop) / 2 / NS_PER_MS, at, letter, ha="center", va="center", fontsize=9)
+            axes.text((begin + stop) / 2 / NS_PER_MS, at, letter, ha="center", va="center")
     if lane.cycle_ns >= 2 * LETTER * (chart.end_ns - chart.start_ns):
         first = -(-chart.start_ns // lane.cycle_ns) * lane.cycle_ns
         marks = [time / NS_PER_MS for time in range(first, chart.end_ns + 1, lane.cycle_ns)]

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rack.levels.timing.tasks import TimedTask
-from rack.tools.charts.letters import ms
 from rack.tools.charts.panel import NS_PER_MS
 from rack.tools.console.answer import Failure
+from rack.tools.console.tables import ms
 
 SLICES = 2
 """Plans in a default chart."""

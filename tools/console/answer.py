@@ -1,9 +1,11 @@
-"""What every command shares: its common arguments, how it prints its answer, and how it fails."""
+"""Shared by all commands: common arguments, the printing of an answer, and failure."""
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -25,6 +27,11 @@ class Failure(Exception):
 def print_json(document: Any) -> None:
     """Print the answer to --json."""
     print(json.dumps(document, indent=2))
+
+
+def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> None:
+    """Print an answer: as one JSON document, or as text for people, given whole or as lines."""
+    print_json(document) if as_json else print(text if isinstance(text, str) else "\n".join(text))
 
 
 def fail(reason: str, status: int) -> NoReturn:
@@ -53,6 +60,12 @@ def rack_names(start: str) -> list[str]:
     return [name for name in racks() if name.startswith(start)]
 
 
+def check_timeout(timeout: float | None, wait: bool) -> None:
+    """Raise `Failure` for --timeout without --wait."""
+    if timeout is not None and not wait:
+        raise Failure("--timeout needs --wait; give both, or neither", 2)
+
+
 def named(rack: str | None) -> str | None:
     """Return the name of a rack. Raises `Failure` when it is empty."""
     if rack == "":
@@ -69,6 +82,12 @@ RackName = Annotated[
     typer.Argument(
         metavar="RACK", help="running rack by name, as 'rack list' shows it", autocompletion=rack_names, callback=named
     ),
+]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
+View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
+Timeout = Annotated[
+    float | None,
+    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: give up after S seconds of wall-clock time"),
 ]
 Settings = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")

@@ -136,7 +136,7 @@ def _leave_terminal() -> None:
 
 def _kill_family() -> None:
     """Kill every descendant in this session and wait for it; a viewer window has its own session and stays."""
-    family = list(_descendants(os.getpid(), os.getsid(0)))
+    family = list(descendants(os.getpid(), os.getsid(0)))
     for pid in family:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -148,7 +148,8 @@ def _kill_family() -> None:
         time.sleep(0.002)
 
 
-def _descendants(pid: int, session: int) -> Iterator[int]:
+def descendants(pid: int, session: int | None = None) -> Iterator[int]:
+    """Yield the processes that descend from one, the youngest generation first; with a `session`, only those in it."""
     # A process that ends meanwhile leaves nothing to read.
     children: list[int] = []
     with suppress(OSError):
@@ -156,8 +157,8 @@ def _descendants(pid: int, session: int) -> Iterator[int]:
             children += map(int, (thread / "children").read_text().split())
     for child in children:
         with suppress(OSError):
-            if os.getsid(child) == session:
-                yield from _descendants(child, session)
+            if session is None or os.getsid(child) == session:
+                yield from descendants(child, session)
                 yield child
 
 

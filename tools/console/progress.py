@@ -1,14 +1,19 @@
-"""Progress of a command that makes many runs: a bar on a terminal, plain lines elsewhere, nothing with --json."""
+"""Progress: a bar on a terminal, plain lines elsewhere, nothing with --json."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
 from rack.tools.console.tables import console
+
+PATIENCE_S = 2.0
+"""Time between two lines of the progress of reading."""
 
 
 class Progress:
@@ -18,27 +23,24 @@ class Progress:
     """
 
     def __init__(self, bar: RichProgress | None = None, prints_lines: bool = False) -> None:
-        self._bar, self._prints_lines = bar, prints_lines
-        self._task = None if bar is None else bar.add_task("", total=None)
+        self._bar, self._prints_lines = bar or RichProgress(disable=True), prints_lines
+        self._task = self._bar.add_task("", total=None)
 
     def total(self, seconds: float) -> None:
         """Set the expected time of the whole series."""
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, total=seconds)
+        self._bar.update(self._task, total=seconds)
         self._print(f"about {seconds / 60.0:.0f} minutes")
 
     def begin(self, text: str) -> None:
         """Show which run begins."""
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, description=text)
+        self._bar.update(self._task, description=text)
         self._print(text)
 
     def end(self, seconds: float, ended: str, shortfalls: Sequence[str]) -> None:
         """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its shortfalls."""
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, advance=seconds)
-            for line in shortfalls:
-                self._bar.console.print(line, style="red", highlight=False, markup=False)
+        self._bar.update(self._task, advance=seconds)
+        for line in () if self._bar.disable else shortfalls:
+            self._bar.console.print(line, style="red", highlight=False, markup=False)
         for line in (ended, *shortfalls):
             self._print(f"  {line}")
 
@@ -57,3 +59,16 @@ def progress_for(silent: bool) -> Iterator[Progress]:
     columns = (BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with RichProgress(*columns, console=terminal) as bar:
         yield Progress(bar)
+
+
+def reading_progress(silent: bool) -> Callable[[float], None]:
+    """Return a function that takes the part of a run that is read, 0 to 1, and prints it on stderr now and then."""
+    shown = time.monotonic()
+
+    def show(part: float) -> None:
+        nonlocal shown
+        if not silent and time.monotonic() - shown > PATIENCE_S:
+            shown = time.monotonic()
+            print(f"reading the run: {part:.0%}", file=sys.stderr, flush=True)
+
+    return show

@@ -1,9 +1,10 @@
-"""Tables and text on stdout: they fit the terminal; in a pipe nothing is cut or coloured."""
+"""Tables and their cells as text: they fit the terminal; in a pipe, and as Markdown, nothing is cut or coloured."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from io import StringIO
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -72,3 +73,27 @@ def grid(
 def is_number(cell: str) -> bool:
     """Return whether a cell holds a number, or nothing."""
     return not cell.strip("0123456789.-+e")
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a table in Markdown, each column as wide as its widest cell."""
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    for number, row in enumerate((head, *rows)):
+        yield f"| {' | '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))} |"
+        if number == 0:
+            yield f"|{'|'.join('-' * (width + 2) for width in widths)}|"
+
+
+def decimal(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many decimals; "-" for None."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def figure(found: Mapping[str, Any] | None, key: str, digits: int = 3) -> str:
+    """Return one figure of a distribution; "-" where there is none."""
+    return decimal(None if found is None else found[key], digits)
+
+
+def ms(time_ns: float | None) -> str:
+    """Return a time in ms, to the us, without trailing zeros; "-" for None."""
+    return "-" if time_ns is None else f"{time_ns * 1e-6:.3f}".rstrip("0").rstrip(".")

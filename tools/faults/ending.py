@@ -101,7 +101,7 @@ def levels_of(segment: Segment) -> str:
 
 
 def is_late(segment: Segment) -> bool:
-    """Say whether a level gave up because it cannot meet a time."""
+    """Return whether a level gave up because it cannot meet a time."""
     return any(status.state == State.ERROR and status.error == Error.TOO_LATE for _, status in _statuses(segment))
 
 

@@ -58,7 +58,7 @@ class Detection:
 
 
 def fits(event: Event, strike: Strike) -> bool:
-    """Say whether an event can be the detection of a fault: it is of its kind, about the same thing, and not before it.
+    """Return whether an event can be the detection of a fault: of its kind, about the same thing, and not before it.
 
     A fault may strike a moment before its tick is given out; a process that reads the tick then sees the one before.
     """
@@ -68,7 +68,7 @@ def fits(event: Event, strike: Strike) -> bool:
 
 
 def explains(strike: Strike, event: Event) -> bool:
-    """Say whether an event in a fault's time can come of it: as its detection, or as a consequence of its kind."""
+    """Return whether an event in a fault's time can come of it: as its detection, or as a consequence of its kind."""
     follows = strike.record.consequence
     if event.kind == "miss":
         # A fault that takes one task's cycles may take those of any task on its core.
@@ -85,7 +85,7 @@ def _codes(alarms: Sequence[Alarm]) -> set[str]:
 
 
 def is_about(event: Event, strike: Strike) -> bool:
-    """Say whether an event is about the target of a fault: its mailboxes, its task, its joint."""
+    """Return whether an event is about the target of a fault: its mailboxes, its task, its joint."""
     if event.code == DIED:
         return event.board == strike.board
     if event.code in MAILBOX_ALARMS:
@@ -146,7 +146,7 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermat
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Say whether a reaction can be to a fault: brakes that engage for missed cycles are to one that takes cycles.
+    """Return whether a reaction can be to a fault: brakes that engage for missed cycles are to one that takes cycles.
 
     A latch is a reaction to a kind that may be latched.
     """
@@ -157,12 +157,12 @@ def _can_react(strike: Strike, reaction: Event) -> bool:
 
 
 def takes_cycles(strike: Strike) -> bool:
-    """Say whether a fault keeps tasks from their cycles, so that these are missed because of it."""
+    """Return whether a fault keeps tasks from their cycles, so that these are missed because of it."""
     return strike.record.where in TAKE_CYCLES
 
 
 def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
-    """Say whether the brakes were engaged before a tick, and are released after it."""
+    """Return whether the brakes were engaged before a tick, and are released after it."""
     before = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
     undone = (_undone(event, events) for event in before)
     return any(released is None or released > tick for released in undone)

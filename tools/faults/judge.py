@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
@@ -17,7 +17,6 @@ from rack.tools.faults.evidence import (
     COLLISION,
     LATCHED,
     MAILBOX_ALARMS,
-    Aftermath,
     Detection,
     SkippedTicks,
     aftermath,
@@ -44,14 +43,14 @@ class Judgement:
 
     kind: str
     board: str
-    mailbox: str
-    joint: str
-    size: float | None
-    began: int
     struck: int
     seen: Seen
-    is_judged: bool
-    cycle: int
+    mailbox: str = ""
+    joint: str = ""
+    size: float | None = None
+    began: int = -1
+    is_judged: bool = True
+    cycle: int = 1
     found_by: str = ""
     found_as: str = ""
     delay: int | None = None
@@ -164,12 +163,12 @@ class _Judge:
         return [self._detection(event, strike) for event in fitting]
 
     def _is_of(self, late: Detection, place: int) -> bool:
-        """Say whether a detection, too late for one fault, is in time for one that struck after it."""
+        """Return whether a detection, too late for one fault, is in time for one that struck after it."""
         after = (strike for strike in self._strikes[place + 1 :] if fits(late.event, strike))
         return not late.is_within and any(self._detection(late.event, strike).is_within for strike in after)
 
     def _is_brief(self, strike: Strike) -> bool:
-        """Say whether a fault of the arm acted in fewer cycles than it may take to be found."""
+        """Return whether a fault of the arm acted in fewer cycles than it may take to be found."""
         if strike.tick < 0 or strike.record.where != "arm":
             return False
         return strike.count * self._cycles[strike.board] < (self._bound(strike, None) or 0)
@@ -201,8 +200,11 @@ class _Judge:
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
         record, after = strike.record, aftermath(strike, self._events, horizon)
         seen: Seen = "not struck" if strike.tick < 0 else "missed" if best is None else "detected"
-        bound = self._recovery_bound(strike, best)
-        is_latched = self._is_latched(strike, after)
+        found = best.event.tick if best is not None else strike.tick
+        # Ticks from the strike within which every reaction must be undone.
+        bound = max(self._ends(strike), found) - strike.tick + self._recovery(strike)
+        # Some kinds may end the task with an error.
+        is_latched = record.consequence.latches and self._run.has_failed and LATCHED in after.reactions
         is_undone = after.is_undone and (after.recovery or 0) <= bound
         return Judgement(
             kind=strike.kind,
@@ -230,19 +232,8 @@ class _Judge:
             is_latched=is_latched,
         )
 
-    def _recovery_bound(self, strike: Strike, best: Detection | None) -> int:
-        """Return the ticks from a strike within which every reaction must be undone."""
-        found = best.event.tick if best is not None else strike.tick
-        over = max(self._ends(strike), found) - strike.tick
-        return over + self._recovery(strike)
-
-    def _is_latched(self, strike: Strike, after: Aftermath) -> bool:
-        """Say whether the task has ended with an error because of a fault that may end it so."""
-        may = strike.record.consequence.latches and self._run.has_failed
-        return may and LATCHED in after.reactions
-
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
-        """Say whether no fault explains a detection, a death or a miss."""
+        """Return whether no fault explains a detection, a death or a miss."""
         if event.kind not in ("detection", DIED, "miss") or self._is_met(event):
             return False
         # An event of a task has the tick of its release, and may come of anything until the end of its cycle.
@@ -252,7 +243,7 @@ class _Judge:
         return not any(explains(strike, event) for strike in around if strike.tick >= 0)
 
     def _is_met(self, event: Event) -> bool:
-        """Say whether an obstacle has hit an arm that a fault has stopped, or that waits for another path since."""
+        """Return whether an obstacle has hit an arm that a fault has stopped, or that waits for another path since."""
         is_moving = event.code == COLLISION and any(f"'{name}'" in event.text for name in self._run.moving)
         return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
 
@@ -270,18 +261,10 @@ def _shown(strike: Strike, events: Sequence[Event]) -> Strike:
     return strike if found == strike.tick else replace(strike, tick=found, count=max(1, strike.count))
 
 
-class Recorded(Protocol):
-    """A recorded run."""
-
-    @property
-    def events(self) -> Sequence[Mapping[str, Any]]:
-        """Its events, as plain data."""
-
-
-def faults(recording: Recorded, layout: Layout) -> Report:
-    """Return every fault injected into a run, detections that none explains, and restarts by task."""
-    events = [Event(**event) for event in recording.events if "tick" in event]
-    ended: Mapping[str, Any] = next((event for event in recording.events if event["kind"] == "outcome"), {})
+def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
+    """Return every fault injected into a run, detections that none explains, and restarts by task, by its events."""
+    events = [Event(**event) for event in recorded if "tick" in event]
+    ended: Mapping[str, Any] = next((event for event in recorded if event["kind"] == "outcome"), {})
     strikes = [_strike(entry) for entry in ended.get("faults", [])]
     is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
     verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -72,10 +72,9 @@ class LiveRack:
         entry = waiting[number]
         answer = self._document(entry)
         self._table.disarm(entry)
-        words, deadline = self._segment.words, time.monotonic() + BEGIN_S
+        words = self._segment.words
         tick = words[System.TICK]
-        while words[System.TICK] <= tick + 1 and not self._is_over and time.monotonic() < deadline:
-            time.sleep(LOOK_S)
+        self._wait_until(lambda: words[System.TICK] > tick + 1, BEGIN_S)
         if not self._table.free(entry):
             raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
         return {**answer, "stage": "free", "told": f"{answer['text']}: withdrawn"}
@@ -124,24 +123,29 @@ class LiveRack:
             raise Failure(f"{fault.kind}: SCHED_FIFO is refused to this user; no core can be taken from a board")
         set_priority(0)
 
-    def _await_begin(self, entry: FaultEntry) -> None:
-        deadline = time.monotonic() + BEGIN_S
-        while entry.stage == Stage.WAITING:
-            if self._is_over:
-                raise Failure(f"{self._described(entry)}: the run ended before it began")
+    def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
+        """Wait until a condition holds, or the run is over; return False after `timeout_s`."""
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while not holds() and not self._is_over:
             if time.monotonic() > deadline:
-                raise Failure(f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s")
+                return False
             time.sleep(LOOK_S)
+        return True
+
+    def _await_begin(self, entry: FaultEntry) -> None:
+        if not self._wait_until(lambda: entry.stage != Stage.WAITING, BEGIN_S):
+            raise Failure(f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s")
+        self._check_begun(entry)
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
         """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it never began."""
         if entry.stage == Stage.WAITING:
             print(self._state(entry), file=sys.stderr, flush=True)
-        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
-        while entry.stage != Stage.OVER and not self._is_over:
-            if time.monotonic() > deadline:
-                raise Failure(f"timed out after {timeout_s:g} s: {self._state(entry)}")
-            time.sleep(LOOK_S)
+        if not self._wait_until(lambda: entry.stage == Stage.OVER, timeout_s):
+            raise Failure(f"timed out after {timeout_s:g} s: {self._state(entry)}")
+        self._check_begun(entry)
+
+    def _check_begun(self, entry: FaultEntry) -> None:
         if entry.stage == Stage.WAITING:
             raise Failure(f"{self._described(entry)}: the run ended before it began")
 

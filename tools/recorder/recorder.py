@@ -27,11 +27,8 @@ LOCKSTEP_S = 0.005
 class Sink(Protocol):
     """Takes what a recorder drains."""
 
-    def add_cycles(self, task: str, rows: np.ndarray) -> None:
-        """Take trace records of a task, shape (rows,)."""
-
-    def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
-        """Take rows of a mailbox's ring, shape (rows,)."""
+    def add(self, ring: str, rows: np.ndarray) -> None:
+        """Take rows of a ring, shape (rows,): trace records of a task, or messages of a mailbox."""
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Note that everything before `tick` has been taken; `lost` counts lost rows by ring."""
@@ -48,13 +45,9 @@ class SafeSink:
         self._sink: Sink | None = None
         self._guarded(lambda: setattr(self, "_sink", opened()))
 
-    def add_cycles(self, task: str, rows: np.ndarray) -> None:
-        """Pass trace records on."""
-        self._pass(lambda sink: sink.add_cycles(task, rows))
-
-    def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
-        """Pass messages on."""
-        self._pass(lambda sink: sink.add_signals(mailbox, rows))
+    def add(self, ring: str, rows: np.ndarray) -> None:
+        """Pass rows on."""
+        self._pass(lambda sink: sink.add(ring, rows))
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Pass the tick on."""
@@ -115,10 +108,8 @@ class Recorder:
             rows, lost = ring.drain()
             self._spool.add(name, rows, lost)
             self._files.add(Frame(name, rows, lost))
-            if self._view is not None and name in self._files.tasks:
-                self._view.add_cycles(name, rows)
-            elif self._view is not None:
-                self._view.add_signals(name, rows)
+            if self._view is not None:
+                self._view.add(name, rows)
         self._spool.flush()
         if self._steal is not None:
             self._steal.look()

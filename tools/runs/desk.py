@@ -39,7 +39,7 @@ Fate = Literal["given", "taken", "done", "refused", "overtaken"]
 
 @dataclass(frozen=True)
 class Reply:
-    """A command and what became of it. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
+    """A command and its fate. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
 
     The fate stays "given" where the level's status does not answer operators. `objection` is why it was refused.
     """

@@ -9,16 +9,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
 
-from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from rack.boards.events import Event
-from rack.tools.console.tables import console, grid
+from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
 from rack.tools.runs.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
 
@@ -33,8 +32,8 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "missed": lambda row: str(row.missed),
     "skipped": lambda row: str(row.skipped),
     "restarts": lambda row: str(row.restarts),
-    "exec ms": lambda row: _ms(row.exec_ms),
-    "late ms": lambda row: _ms(row.lateness_ms),
+    "exec ms": lambda row: decimal(row.exec_ms, 2),
+    "late ms": lambda row: decimal(row.lateness_ms, 2),
     "state": lambda row: row.state,
 }
 """Columns by heading; `exec` and `late` are the longest since the last look."""
@@ -56,10 +55,10 @@ BRIEF_TICKS = 10
 """Brakes that missed cycles engaged for fewer ticks than this are counted, not shown."""
 
 
-class Display(Protocol):
-    """Shows a run. `period_s` is the time between looks."""
+class Display:
+    """Shows a run; this one shows nothing, for --json. `period_s` is the time between looks."""
 
-    period_s: float
+    period_s = 0.5
 
     def show(self, snapshot: Snapshot) -> None:
         """Show the rack as it is now."""
@@ -68,7 +67,7 @@ class Display(Protocol):
         """Show an event."""
 
 
-class LiveDisplay:
+class LiveDisplay(Display):
     """A table that changes in place."""
 
     period_s = 0.2
@@ -78,7 +77,7 @@ class LiveDisplay:
 
     def show(self, snapshot: Snapshot) -> None:
         """Redraw the table."""
-        self._live.update(table_of(snapshot), refresh=True)
+        self._live.update(RackView(snapshot), refresh=True)
 
     def show_event(self, event: Event) -> None:
         """Print the event above the table."""
@@ -88,7 +87,7 @@ class LiveDisplay:
             self._live.console.print(_line(event), style=style, highlight=False, markup=False, soft_wrap=True)
 
 
-class PlainDisplay:
+class PlainDisplay(Display):
     """A line a second."""
 
     period_s = 1.0
@@ -109,24 +108,12 @@ class PlainDisplay:
             print(_line(event), flush=True)
 
 
-class SilentDisplay:
-    """Nothing: stdout is for one JSON document."""
-
-    period_s = 0.5
-
-    def show(self, snapshot: Snapshot) -> None:
-        """Show nothing."""
-
-    def show_event(self, event: Event) -> None:
-        """Show nothing; the event is in the log."""
-
-
 @contextmanager
 def display_for(silent: bool) -> Iterator[Display]:
     """Give the display that suits stdout."""
     terminal = console()
     if silent:
-        yield SilentDisplay()
+        yield Display()
     elif terminal.is_terminal:
         with Live(console=terminal, auto_refresh=False) as live:
             yield LiveDisplay(live)
@@ -134,14 +121,9 @@ def display_for(silent: bool) -> Iterator[Display]:
         yield PlainDisplay()
 
 
-def table_of(snapshot: Snapshot) -> ConsoleRenderable:
-    """Return the whole view of a rack: head line, tasks, their complaints, active faults, holds, progress."""
-    return _View(snapshot)
-
-
 @dataclass(frozen=True)
-class _View:
-    """A snapshot, laid out for the width that it has when it is drawn."""
+class RackView:
+    """A snapshot, for rich to draw: head line, tasks, their complaints, active faults, holds, progress."""
 
     snapshot: Snapshot
 
@@ -201,10 +183,6 @@ def _style(column: str, text: str) -> str:
     if column == "state":
         return STATES.get(text, "")
     return COUNTED.get(column, "") if text != "0" else ""
-
-
-def _ms(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _bar(progress: TaskProgress, width: int) -> RenderableType:

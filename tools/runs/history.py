@@ -11,7 +11,6 @@ import numpy as np
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.message import State
-from rack.backplane.trace import Flag
 from rack.levels.operator import Operation
 from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
 from rack.tools.console.answer import Failure
@@ -31,7 +30,7 @@ def misses(recording: Recording) -> list[dict[str, Any]]:
 
 
 def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
-    rows = cycles[(cycles["flags"] & (Flag.MISSED | Flag.SKIPPED)) > 0]
+    rows = cycles[is_missed(cycles) | (skipped(cycles) > 0)]
     found = []
     columns = rows["tick"], skipped(rows), is_missed(rows), lateness_ns(rows) * 1e-6, lasted_ns(rows) * 1e-6
     for tick, before, missed, late_ms, took_ms in zip(*(column.tolist() for column in columns), strict=True):
@@ -119,9 +118,8 @@ class Difference:
 
 
 def first_difference(one: Recording, other: Recording) -> Difference | None:
-    """Return where two runs diverge; None when all that both wrote is equal.
+    """Return where two runs diverge, up to the end of the shorter one; None when all that both wrote is equal.
 
-    Messages after the end of the shorter run are not compared.
     Raises `Failure` when the two have no mailbox in common, or either lost rows.
     """
     for recording in (one, other):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,9 @@ def run_rack(
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to keep.
         with INTERRUPT.at_once():
-            recorder = stack.enter_context(_recorder(folder))
+            recorder = None if folder is None else RecorderProcess()
+            if recorder is not None:
+                stack.callback(recorder.finish)
             rack = stack.enter_context(Rack(config, log.add, share))
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -113,28 +115,19 @@ def run_rack(
         rack.close()
         recording = recorder.finish() if recorder is not None else "none"
         _log_news(news, segment, log)
+        blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
         result = RunResult(
             rack=config.name,
             outcome=outcome,
             wall_s=wall_s,
             clock_skipped=segment.words[System.CLOCK_SKIPPED],
-            tasks=_counters(segment),
+            tasks={task: {name.lower(): block[Block[name]] for name in COUNTED} for task, block in blocks.items()},
             recording=recording,
             faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
             clock_offset_ns=time.time_ns() - time.monotonic_ns(),
         )
         log.end(result.document())
     return result
-
-
-@contextmanager
-def _recorder(folder: Path | None) -> Iterator[RecorderProcess | None]:
-    recorder = RecorderProcess() if folder is not None else None
-    try:
-        yield recorder
-    finally:
-        if recorder is not None:
-            recorder.finish()
 
 
 def _viewer(port: int) -> News:
@@ -164,10 +157,3 @@ def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, n
 def _log_news(news: list[News], segment: Segment, log: EventLog) -> None:
     for text in [text for source in news for text in source()]:
         log.add(Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text))
-
-
-def _counters(segment: Segment) -> dict[str, dict[str, int]]:
-    return {
-        task.name: {name.lower(): segment.block(task.name)[Block[name]] for name in COUNTED}
-        for task in segment.layout.tasks
-    }

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -27,8 +26,6 @@ from rack.tools.runs.steal import Stolen
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """Errors of reading a damaged file, or a file of another kind."""
-PATIENCE_S = 2.0
-"""Time between two lines of progress."""
 
 
 class Recording:
@@ -61,7 +58,7 @@ class Recording:
         with _naming(path):
             file = pq.ParquetFile(path)
         if absent := [column for column in columns if column not in file.schema_arrow.names]:
-            raise Failure(f"{path}: not a recording of a rack, it has no column '{absent[0]}'", 2)
+            raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
         return file
 
     def _text(self, name: str) -> str:
@@ -75,7 +72,7 @@ class Recording:
 
     def _there(self, name: str) -> Path:
         if not (self.folder / name).is_file():
-            raise Failure(f"{self.folder}: no run, it has no {name}", 2)
+            raise Failure(f"{self.folder}: not a run: it has no {name}", 2)
         return self.folder / name
 
     @cached_property
@@ -93,7 +90,7 @@ class Recording:
 
     @cached_property
     def ended(self) -> dict[str, Any]:
-        """Counts at the end of the run, as in `rack.tools.running.RunResult`; empty where they are not recorded."""
+        """Counts at the end of the run, as in `rack.tools.runs.launch.RunResult`; empty where they are not recorded."""
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
     @cached_property
@@ -198,16 +195,3 @@ def _event(line: str, place: str) -> dict[str, Any]:
 
 def _note(text: str) -> None:
     print(text, file=sys.stderr)
-
-
-def reading_progress(silent: bool) -> Callable[[float], None]:
-    """Return a function that takes the part of a run that is read, 0 to 1, and prints it on stderr now and then."""
-    shown = time.monotonic()
-
-    def show(part: float) -> None:
-        nonlocal shown
-        if not silent and time.monotonic() - shown > PATIENCE_S:
-            shown = time.monotonic()
-            print(f"reading the run: {part:.0%}", file=sys.stderr, flush=True)
-
-    return show

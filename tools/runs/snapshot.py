@@ -14,6 +14,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
 from rack.boards.faults.describe import describe
+from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
 
 LOST = "lost"
@@ -168,8 +169,7 @@ class RackMonitor:
         """Return the longest execution and lateness of the cycles since the last look that saw any."""
         cycles = self._traces[task].drain().rows
         if len(cycles):
-            execution, lateness = cycles["process_ns"] - cycles["read_ns"], cycles["start_ns"] - cycles["release_ns"]
-            self._times[task] = float(execution.max()) * 1e-6, float(lateness.max()) * 1e-6
+            self._times[task] = float(execution_ns(cycles).max()) * 1e-6, float(lateness_ns(cycles).max()) * 1e-6
         return self._times[task]
 
     def _progress(self) -> TaskProgress | None:

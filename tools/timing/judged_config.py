@@ -19,15 +19,8 @@ from rack.levels.timing.verdicts import LOAD, EquationVerdict, level_verdicts, s
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values; None removes a key."""
 CHANGEABLE = (
-    "priority",
-    "planner_priority",
-    "within_cycles",
-    "coupling",
-    "planner_slot",
-    "planner_core",
-    "core",
-    "every",
-    "rate_hz",
+    *("priority", "planner_priority", "within_cycles", "coupling"),
+    *("planner_slot", "planner_core", "core", "every", "rate_hz"),
 )
 """Keys of a board's table that a change may set."""
 
@@ -85,13 +78,13 @@ class JudgedConfig:
         return own or {v.key for v in self.failing if v.equation == LOAD and v.subject in cores}
 
     def cures(self, board: str, before: JudgedConfig) -> bool:
-        """Say whether all failures of the board in `before` are gone, and no new ones have appeared."""
+        """Return whether all failures of the board in `before` are gone, and no new ones have appeared."""
         failing = {verdict.key for verdict in self.failing}
         old = {verdict.key for verdict in before.failing}
         return failing < old and not failing & before.failing_of(board)
 
     def is_sound(self, changed: RackTiming, board: str) -> bool:
-        """Say whether one changed board satisfies its own equations and lets the system respond as before.
+        """Return whether one changed board satisfies its own equations and lets the system respond as before.
 
         This is a quick check; it leaves out the effect on other tasks on the core.
         """

@@ -18,7 +18,8 @@ from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
 from rack.levels.timing.system_response import CommandPath, command_paths, lowest_level
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.tables import print_wrapped, table, terminal_width
+from rack.tools.console.pictures import paths_of, picture
+from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
 from rack.tools.runs.recording import Recording
 
 if TYPE_CHECKING:
@@ -129,18 +130,20 @@ class OperatorResponse:
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
         head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
-        yield from table(head, [[*self._cells(row)] for row in self.rows()], width, ("min", "sum, eq. 3.3", "median"))
+        names = ["min", "median", "max", "longest", "max_from_reading", "sum_eq_3_3", "bound_eq_3_2"]
+        rows = [
+            [
+                *(row["level"], str(row["commands"]), *(decimal(row[f"{name}_ms"], 1) for name in names)),
+                *(str(row["beyond"]), str(row["off_prediction"])),
+            ]
+            for row in self.rows()
+        ]
+        yield from table(head, rows, width, ("min", "sum, eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
             yield f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
         for command in self.off:
             late = (command.acts or 0) - command.predicted
             yield f"command {command.serial} to {command.level}, given at tick {command.given}: {late:+d} ticks"
-
-    def _cells(self, row: dict[str, Any]) -> Iterator[str]:
-        yield from (row["level"], str(row["commands"]))
-        names = ["min", "median", "max", "longest", "max_from_reading", "sum_eq_3_3", "bound_eq_3_2"]
-        yield from ("-" if row[f"{name}_ms"] is None else f"{row[f'{name}_ms']:.1f}" for name in names)
-        yield from (str(row["beyond"]), str(row["off_prediction"]))
 
 
 def response_of(recording: Recording) -> OperatorResponse | None:
@@ -230,20 +233,16 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
 
 def plot(response: OperatorResponse, folder: Path) -> list[Path]:
     """Write response.png and response.svg, a histogram per level with its bounds, into `folder`; return their paths."""
-    from matplotlib.figure import Figure  # takes a second to load
-
     levels = [level for level in response.paths if any(c.level == level for c in response.measured)]
-    figure = Figure(figsize=(8.0, 0.8 + 1.7 * len(levels)), layout="constrained")
-    axes = figure.subplots(len(levels), 1, squeeze=False)
-    for axis, level in zip(axes[:, 0], levels, strict=True):
-        _plot_level(axis, response, level)
-    time = "simulated time" if response.lockstep else "the wall clock"
-    axes[-1, 0].set_xlabel(f"from giving a command to the torque that rests on it, ms of {time}")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize="small")
-    paths = [folder / f"response.{kind}" for kind in ("png", "svg")]
-    for path in paths:
-        figure.savefig(path, dpi=150)
+    paths = paths_of(folder / "response")
+    with picture(paths, 8.0, 0.8 + 1.7 * len(levels), layout="constrained") as figure:
+        axes = figure.subplots(len(levels), 1, squeeze=False)
+        for axis, level in zip(axes[:, 0], levels, strict=True):
+            _plot_level(axis, response, level)
+        time = "simulated time" if response.lockstep else "the wall clock"
+        axes[-1, 0].set_xlabel(f"from giving a command to the torque that rests on it, ms of {time}")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize="small")
     return paths
 
 

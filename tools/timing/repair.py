@@ -60,10 +60,7 @@ class Repair:
 
     def document(self) -> dict[str, Any]:
         """Return it as plain data."""
-        return {
-            "steps": [[change.document() for change in changes] for changes in self.steps],
-            "fits": not self.left,
-        }
+        return {"steps": [[change.document() for change in changes] for changes in self.steps], "fits": not self.left}
 
 
 def repair(rack: JudgedConfig) -> Repair:
@@ -96,7 +93,9 @@ def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
     kinds = (_other_priority, _board_elsewhere, _planner_elsewhere, _more_cycles, _longer_cycle)
     found = [change for kind in kinds if (change := kind(rack, board)) is not None]
     found += _changes_of_others(rack, board)
-    found = found or [change for change in [_elsewhere_and_longer(rack, board)] if change is not None]
+    if not found:
+        both = (_longer_cycle(rack, board, place) for place in _places(rack, board))
+        found = [change for change in both if change is not None][:1]
     return sorted(found, key=lambda change: change.cost)
 
 
@@ -166,11 +165,6 @@ def _longer_cycle(
     # leave plans too few cycles.
     sound = [{**(place or {}), **settings} for changed, settings in tried if rack.is_sound(changed, board)]
     return _first(rack, board, sound, cures)
-
-
-def _elsewhere_and_longer(rack: JudgedConfig, board: str) -> Change | None:
-    places = _places(rack, board)
-    return next((change for place in places if (change := _longer_cycle(rack, board, place)) is not None), None)
 
 
 def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:

@@ -1,7 +1,4 @@
-"""A forecast as text: the system's response, and tables of levels, verdicts and response times; times in ms.
-
-To fit into a `width` the tables leave out some columns.
-"""
+"""A forecast as text: the system's response, and tables of levels, verdicts and response times; times in ms."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from rack.levels.timing.rack import LevelTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
 from rack.levels.timing.verdicts import LOAD, RESPONSE_TIME, EquationVerdict
-from rack.tools.console.tables import table
+from rack.tools.console.tables import ms, table
 
 
 def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:
@@ -20,13 +17,13 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
     yield from _prediction_lines(forecast.system)
     if forecast.levels:
         yield from ("", f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:", "")
-        yield from level_table(forecast.levels, width)
+        yield from _levels(forecast.levels, width)
     if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in (RESPONSE_TIME, LOAD)]:
         yield ""
-        yield from verdict_table(paper, width)
+        yield from _verdicts(paper, width)
     if forecast.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
-        yield from response_table(forecast.responses, width)
+        yield from _responses(forecast.responses, width)
         yield ""
         loads = (f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}" for core, load in forecast.loads.items())
         yield f"load: {', '.join(loads)}"
@@ -43,28 +40,23 @@ def _prediction_lines(system: Prediction) -> Iterator[str]:
         yield f"plan of {level}: available {plan_ms:g} ms after its planner's release"
 
 
-def level_table(levels: Iterable[LevelTiming], width: int | None = None) -> Iterator[str]:
+def _levels(levels: Iterable[LevelTiming], width: int | None) -> Iterator[str]:
     """Yield a line per level: its cycle, its parts, and the residual for its planner."""
     head = ["level", "coupling", "R_i", "t_exec", "t_comm", "R", "W", "C", "t_residual", "t_plan", "P", "U", "d"]
     yield from table([*head, "d R_i"], [_level_row(level) for level in levels], width, ("C", "R", "W", "U", "P", "d"))
 
 
-def verdict_table(verdicts: Iterable[EquationVerdict], width: int | None = None) -> Iterator[str]:
+def _verdicts(verdicts: Iterable[EquationVerdict], width: int | None) -> Iterator[str]:
     """Yield a line per verdict: both sides, the margin, whether it holds."""
-    head = ["eq.", "of", "left", "", "right", "margin", "", "which is"]
-    yield from table(head, [_verdict_row(verdict) for verdict in verdicts], width, ("which is", "margin"))
+    head = ["eq.", "of", "left", "", "right", "margin", "", "meaning"]
+    yield from table(head, [_verdict_row(verdict) for verdict in verdicts], width, ("meaning", "margin"))
 
 
-def response_table(responses: Iterable[TaskResponse], width: int | None = None) -> Iterator[str]:
+def _responses(responses: Iterable[TaskResponse], width: int | None) -> Iterator[str]:
     """Yield a line per task, core by core: its cost, its blocking, its response and its deadline."""
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
     yield from table(head, [_response_row(response) for response in ordered], width, ("FIFO", "margin"))
-
-
-def ms(time_ns: float | None) -> str:
-    """Return a time in ms as text, rounded to 1 us; "-" for None."""
-    return "-" if time_ns is None else f"{round(time_ns * 1e-6, 3):g}"
 
 
 def _level_row(level: LevelTiming) -> list[str]:

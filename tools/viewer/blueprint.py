@@ -57,10 +57,8 @@ def blueprint(layout: Layout, config: RackConfig, cell: Cell | None, live: bool)
 
 
 def _cell_view(cell: Cell) -> rrb.View:
-    contents = [_all(CELL), f"- {path(CELL, COLLISION)}/**", _all(FRAMES)]
-    return rrb.Spatial3DView(
-        origin=path(CELL), contents=contents, name="cell", eye_controls=eye_on(cell), line_grid=False
-    )
+    shown, eye = [_all(CELL), f"- {path(CELL, COLLISION)}/**", _all(FRAMES)], eye_on(cell)
+    return rrb.Spatial3DView(origin=path(CELL), contents=shown, name="cell", eye_controls=eye, line_grid=False)
 
 
 def _joints(names: Sequence[str]) -> rrb.Container:

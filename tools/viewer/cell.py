@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import STATE, Cell
+from rack.tools.viewer.levels import verb_name
 from rack.tools.viewer.shapes import shape_of, xyzw
 from rack.tools.viewer.stream import Changes, RowBlock, Stream
 from rack.tools.viewer.style import CURRENT, GOAL, PLANNED
@@ -74,7 +75,7 @@ def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
 
 
 class Poses:
-    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the way of the tool."""
+    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the path of the tool."""
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
@@ -188,16 +189,8 @@ class Goals:
             self._stream.at(int(block.ticks[row]), int(block.stamps_ns[row]), CURRENT_GOAL, point)
 
     def _name(self, move: np.void) -> str:
-        verb = Verb(int(move["verb"])).name.lower().replace("_", " ")
-        return f"{verb} {self._object(move)}".strip()
+        return f"{verb_name(int(move['verb']))} {self._object(move)}".strip()
 
     def _object(self, move: np.void) -> str:
         row = int(move["object"])
         return self._objects[row] if 0 <= row < len(self._objects) else ""
-
-
-class CurrentGoal:
-    """The side of `Goals` that reads statuses."""
-
-    def __init__(self, goals: Goals) -> None:
-        self.write = goals.write_status

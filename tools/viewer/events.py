@@ -1,6 +1,7 @@
 """Log lines: the rack's events, from its event log, and the recorder's own losses and load.
 
-Each board also has a lane: the kind of its last event, until the next."""
+Each board also has a lane: the kind of its last event, until the next.
+"""
 
 from __future__ import annotations
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State
-from rack.backplane.trace import Flag
 from rack.levels.messages import Verb
+from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Changes, RowBlock, Stream
 from rack.tools.viewer.style import STATES, style_lane, write_spans
 
@@ -21,22 +22,32 @@ ROW, COLUMN = 45.0, 110.0
 """Distance between nodes, in the graph's units; a letter is about 7 wide."""
 
 
+class ValueLane:
+    """A lane of a level: the name of a value, from where it changes."""
+
+    def __init__(self, stream: Stream, *lane: str) -> None:
+        self._stream, self._lane, self._changes = stream, (LEVELS, *lane), Changes()
+
+    def write(self, block: RowBlock, values: np.ndarray, name: Callable[[Any], str]) -> None:
+        """Write the changes in a block; `values` has shape (rows,)."""
+        rows = self._changes.rows(values)
+        if len(rows):
+            times = self._stream.times.columns(block.ticks[rows], block.stamps_ns[rows])
+            write_spans(self._stream, self._lane, times, [name(value) for value in values[rows].tolist()])
+
+
 class Activity:
     """Writes the state in a level's statuses, and each error once."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream, self._board = stream, mailbox.name.partition(".")[0]
-        self._lane = (LEVELS, self._board, "state")
-        self._states, self._errors = Changes(), Changes()
-        style_lane(stream, self._lane, STATES)
+        self._states, self._errors = ValueLane(stream, self._board, "state"), Changes()
+        style_lane(stream, (LEVELS, self._board, "state"), STATES)
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
         messages = block.messages
-        rows = self._states.rows(messages["state"])
-        if len(rows):
-            names = [State(int(state)).name.lower() for state in messages["state"][rows]]
-            write_spans(self._stream, self._lane, _times(self._stream, block, rows), names)
+        self._states.write(block, messages["state"], lambda state: State(state).name.lower())
         for row in self._errors.rows(messages["error"]):
             if messages["error"][row]:
                 reason = messages["reason"][row].decode("ascii", "replace")
@@ -49,39 +60,28 @@ class Commanded:
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         board, _, port = mailbox.name.partition(".")
-        self._stream, self._lane, self._serials = stream, (LEVELS, board, port), Changes()
+        self._serials = ValueLane(stream, board, port)
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
-        serials = block.messages["id"]
-        rows = self._serials.rows(serials)
-        if len(rows):
-            names = [f"command {serial}" if serial else "" for serial in serials[rows].tolist()]
-            write_spans(self._stream, self._lane, _times(self._stream, block, rows), names)
+        self._serials.write(block, block.messages["id"], lambda serial: f"command {serial}" if serial else "")
 
 
 class Moves:
     """Writes the current elemental move of `MOVE_STATUS`es, by its verb."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._stream, self._lane = stream, (LEVELS, mailbox.name.partition(".")[0], "move")
-        self._moves = Changes()
+        self._moves = ValueLane(stream, mailbox.name.partition(".")[0], "move")
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
-        messages = block.messages
-        rows = self._moves.rows(messages["current"])
-        if len(rows):
-            names = [_verb(int(verb)) if at else "" for at, verb in messages[["current", "verb"]][rows].tolist()]
-            write_spans(self._stream, self._lane, _times(self._stream, block, rows), names)
+        moves = block.messages[["current", "verb"]]
+        self._moves.write(block, moves, lambda move: verb_name(move[1]) if move[0] else "")
 
 
-def _verb(verb: int) -> str:
+def verb_name(verb: int) -> str:
+    """Return the verb of an elemental move in words."""
     return Verb(verb).name.lower().replace("_", " ")
-
-
-def _times(stream: Stream, block: RowBlock, rows: np.ndarray) -> list[rr.TimeColumn]:
-    return stream.times.columns(block.ticks[rows], block.stamps_ns[rows])
 
 
 class Hierarchy:
@@ -137,20 +137,16 @@ class Hierarchy:
             self._tasks,
             positions=[self._positions[task] for task in self._tasks],
             colors=[STATES[self._shown[task]] for task in self._tasks],
-            labels=[_label(task) for task in self._tasks],
+            # A planner's node is next to its board's.
+            labels=[task.partition(".")[2] or task for task in self._tasks],
         )
         self._stream.at(tick, stamp_ns, (HIERARCHY,), nodes)
-
-
-def _label(task: str) -> str:
-    """Return the label of a task's node; a planner's node is next to its board's."""
-    return task.partition(".")[2] or task
 
 
 def _names(rows: np.ndarray) -> np.ndarray:
     """Return the state of the level in each trace record, or "missed"."""
     names = np.array([state.name.lower() for state in State] + ["missed"])
-    shown = np.where((rows["flags"] & Flag.MISSED) > 0, len(names) - 1, rows["state"])
+    shown = np.where(is_missed(rows), len(names) - 1, rows["state"])
     return np.asarray(names[shown])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,7 +14,6 @@ Floats = NDArray[np.float64]
 Shape = Callable[[mujoco.MjModel, int], rr.AsComponents]
 
 Geom = mujoco.mjtGeom
-SOLID: Final = "solid"
 
 
 def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
@@ -35,58 +34,37 @@ def xyzw(quaternions: Floats) -> Floats:
     return np.roll(quaternions, -1, axis=-1)
 
 
+def _solid(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
+    """Return orientation and colour of a solid geom."""
+    return {"quaternions": [xyzw(model.geom_quat[geom])], "colors": [colour(model, geom)], "fill_mode": "solid"}
+
+
 def _box(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    return rr.Boxes3D(
-        half_sizes=[model.geom_size[geom]],
-        centers=[model.geom_pos[geom]],
-        quaternions=[xyzw(model.geom_quat[geom])],
-        colors=[colour(model, geom)],
-        fill_mode=SOLID,
-    )
+    centers = [model.geom_pos[geom]]
+    return rr.Boxes3D(half_sizes=[model.geom_size[geom]], centers=centers, **_solid(model, geom))
 
 
 def _sphere(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    return _ellipsoid_of(model, geom, np.full(3, model.geom_size[geom][0]))
+    radius = model.geom_size[geom][0]
+    return rr.Ellipsoids3D(half_sizes=[[radius] * 3], centers=[model.geom_pos[geom]], **_solid(model, geom))
 
 
 def _ellipsoid(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    return _ellipsoid_of(model, geom, model.geom_size[geom])
-
-
-def _ellipsoid_of(model: mujoco.MjModel, geom: int, half_sizes: Floats) -> rr.AsComponents:
-    return rr.Ellipsoids3D(
-        half_sizes=[half_sizes],
-        centers=[model.geom_pos[geom]],
-        quaternions=[xyzw(model.geom_quat[geom])],
-        colors=[colour(model, geom)],
-        fill_mode=SOLID,
-    )
+    centers = [model.geom_pos[geom]]
+    return rr.Ellipsoids3D(half_sizes=[model.geom_size[geom]], centers=centers, **_solid(model, geom))
 
 
 def _cylinder(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     radius, half, _ = model.geom_size[geom]
-    return rr.Cylinders3D(
-        lengths=[2 * half],
-        radii=[radius],
-        centers=[model.geom_pos[geom]],
-        quaternions=[xyzw(model.geom_quat[geom])],
-        colors=[colour(model, geom)],
-        fill_mode=SOLID,
-    )
+    centers = [model.geom_pos[geom]]
+    return rr.Cylinders3D(lengths=[2 * half], radii=[radius], centers=centers, **_solid(model, geom))
 
 
 def _capsule(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     radius, half, _ = model.geom_size[geom]
     # MuJoCo's capsule is centred; rerun's begins at its origin.
     begin = placed(model, geom, np.array([[0.0, 0.0, -half]]))
-    return rr.Capsules3D(
-        lengths=[2 * half],
-        radii=[radius],
-        translations=begin,
-        quaternions=[xyzw(model.geom_quat[geom])],
-        colors=[colour(model, geom)],
-        fill_mode=SOLID,
-    )
+    return rr.Capsules3D(lengths=[2 * half], radii=[radius], translations=begin, **_solid(model, geom))
 
 
 def _plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:

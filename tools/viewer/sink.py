@@ -26,7 +26,7 @@ from rack.levels.messages import (
 )
 from rack.levels.robot.cell import Cell, build_cell
 from rack.tools.viewer.blueprint import blueprint, write_document
-from rack.tools.viewer.cell import CurrentGoal, Goals, PlannedPath, Poses, write_geometry
+from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses
 from rack.tools.viewer.levels import Activity, Commanded, Hierarchy, Moves
@@ -62,39 +62,36 @@ class ViewSink:
         write_document(stream, segment.config, config, layout)
         if cell is not None:
             write_geometry(stream, cell.model, cell.start())
-        self._of_mailbox = _parts_of(stream, layout, config, cell)
+        of_mailbox = _parts_of(stream, layout, config, cell)
         lockstep, period_ns = bool(words[System.LOCKSTEP]), words[System.PERIOD_NS]
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
         self._of_task: dict[str, list[ViewPart]] = {
             task.name: [
-                CycleLanes(stream, task, speed, lockstep),
-                Load(stream, task, slice_ns, lockstep),
-                Misses(stream, task),
+                CycleLanes(stream, task, speed, lockstep).write,
+                Load(stream, task, slice_ns, lockstep).write,
+                Misses(stream, task).write,
             ]
             for task in layout.tasks
         }
         # An operator's mailbox has no age: it is not written periodically.
         periodic = [mailbox for mailbox in layout.mailboxes if mailbox.writer != CLOCK]
         self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
+        for mailbox, age in self._ages.items():
+            of_mailbox[mailbox].append(age.write)
+        self._parts = self._of_task | of_mailbox
         self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout).hierarchy)
         self._events = Events(stream, folder / "events.jsonl", self._hierarchy)
         self._losses = Losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
-        self._cycles: dict[str, list[np.ndarray]] = {name: [] for name in self._of_task}
-        self._signals: dict[str, list[np.ndarray]] = {name: [] for name in self._of_mailbox}
+        self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
         self._written = words[System.TICK]
 
-    def add_cycles(self, task: str, rows: np.ndarray) -> None:
-        """Take trace records of a task, shape (rows,)."""
+    def add(self, ring: str, rows: np.ndarray) -> None:
+        """Take rows of a ring, shape (rows,)."""
         if len(rows):
-            self._cycles[task].append(rows)
-
-    def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
-        """Take rows of a mailbox's ring, shape (rows,)."""
-        if len(rows):
-            self._signals[mailbox].append(rows)
+            self._waiting[ring].append(rows)
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Write a block if one is full; everything before `tick` has been taken. `lost` counts rows by ring.
@@ -113,20 +110,18 @@ class ViewSink:
 
     def _write(self, tick: int, lost: Mapping[str, int]) -> None:
         self._written = tick
-        cycles, signals = _taken(self._cycles), _taken(self._signals)
-        if self._fastest in cycles:
-            self._times.learn(cycles[self._fastest]["tick"], cycles[self._fastest]["start_ns"])
-        for task, rows in cycles.items():
-            block = RowBlock(rows, "start_ns", self._times)
-            for part in self._of_task[task]:
-                part.write(block)
-            self._hierarchy.write(task, block)
-        for mailbox, rows in signals.items():
-            block = RowBlock(rows, "stamp_ns", self._times)
-            for part in self._of_mailbox[mailbox]:
-                part.write(block)
-            if mailbox in self._ages:
-                self._ages[mailbox].write(block)
+        waiting, self._waiting = self._waiting, defaultdict(list)
+        taken = {ring: np.concatenate(blocks) for ring, blocks in waiting.items()}
+        if (fastest := taken.get(self._fastest)) is not None:
+            self._times.learn(fastest["tick"], fastest["start_ns"])
+        for ring, rows in taken.items():
+            if ring in self._of_task:
+                block = RowBlock(rows, "start_ns", self._times)
+                self._hierarchy.write(ring, block)
+            else:
+                block = RowBlock(rows, "stamp_ns", self._times)
+            for write in self._parts[ring]:
+                write(block)
         for age in self._ages.values():
             age.advance(tick)
         self._events.advance()
@@ -134,14 +129,7 @@ class ViewSink:
         self._losses.advance(tick, lost)
 
 
-def _taken(waiting: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    taken = {name: np.concatenate(blocks) for name, blocks in waiting.items() if blocks}
-    for blocks in waiting.values():
-        blocks.clear()
-    return taken
-
-
-def _parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> Mapping[str, list[ViewPart]]:
+def _parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> dict[str, list[ViewPart]]:
     """Return the parts of the view by mailbox: chosen by message types, so that any rack has a view."""
     parts: dict[str, list[ViewPart]] = defaultdict(list)
     for mailbox in layout.mailboxes:
@@ -157,13 +145,13 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
     names = {field.name for field in mailbox.fields}
     parts: list[ViewPart] = []
     if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
-        parts.append(Activity(stream, mailbox))
+        parts.append(Activity(stream, mailbox).write)
     elif mailbox.name.endswith(".command") and "id" in names and mailbox.message != JOINT_SET_POINT.name:
-        parts.append(Commanded(stream, mailbox))
+        parts.append(Commanded(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
-        parts.append(Moves(stream, mailbox))
+        parts.append(Moves(stream, mailbox).write)
     if mailbox.message not in (*SHOWN_IN_3D, SERVO_STATUS.name):
-        parts.append(Fields(stream, mailbox))
+        parts.append(Fields(stream, mailbox).write)
     return parts
 
 
@@ -172,14 +160,14 @@ def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ARM_STATE.name:
-            return [Poses(stream, cell, config.clock_ns)]
+            return [Poses(stream, cell, config.clock_ns).write]
         case SERVO_STATUS.name:
-            return [Joints(stream, robot.joints, cell, robot.gripper is not None)]
+            return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
         case MOVE_PLAN.name:
-            return [PlannedPath(stream, cell)]
+            return [PlannedPath(stream, cell).write]
         case TASK_PLAN.name:
-            return [goals]
+            return [goals.write]
         case MOVE_STATUS.name:
-            return [CurrentGoal(goals)]
+            return [goals.write_status]
         case _:
             return []

@@ -6,10 +6,9 @@ Its rows have three timelines: simulated time, tick, wall clock. They come in bl
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, Protocol
 
 import numpy as np
 import rerun as rr
@@ -26,13 +25,6 @@ FLUSH_S = 0.5
 """Longest single wait for the disk: the rings, not drained meanwhile, hold two seconds."""
 SERVER_MEMORY = "200MB"
 """What the server keeps for a viewer that joins later."""
-
-
-class Moment(NamedTuple):
-    """One moment: simulated time since tick 0, and the wall clock."""
-
-    sim_time: np.timedelta64
-    wall: np.datetime64
 
 
 class Timelines:
@@ -53,9 +45,9 @@ class Timelines:
             rr.TimeColumn(WALL, timestamp=(stamps_ns + self._offset_ns).astype("datetime64[ns]")),
         ]
 
-    def moment(self, tick: int, stamp_ns: int) -> Moment:
-        """Return one moment on the timelines."""
-        return Moment(np.timedelta64(tick * self.clock_ns, "ns"), np.datetime64(stamp_ns + self._offset_ns, "ns"))
+    def wall(self, stamp_ns: int) -> np.datetime64:
+        """Return a CLOCK_MONOTONIC stamp on the wall clock."""
+        return np.datetime64(stamp_ns + self._offset_ns, "ns")
 
     def learn(self, ticks: Ints, stamps_ns: Ints) -> None:
         """Remember when ticks happened; both are sorted."""
@@ -98,11 +90,8 @@ class RowBlock:
         return np.asarray(self.rows["message"])
 
 
-class ViewPart(Protocol):
-    """Writes one aspect of one mailbox or task to the stream."""
-
-    def write(self, block: RowBlock) -> None:
-        """Write a block of rows."""
+ViewPart = Callable[[RowBlock], None]
+"""Writes one aspect of one mailbox or task to the stream, block by block."""
 
 
 class Changes:
@@ -156,10 +145,9 @@ class Stream:
 
     def at(self, tick: int, stamp_ns: int, entity: Sequence[str], archetype: rr.AsComponents) -> None:
         """Log a single item, at a tick and a time of CLOCK_MONOTONIC."""
-        moment = self.times.moment(tick, stamp_ns)
-        self._recording.set_time(SIM_TIME, duration=moment.sim_time)
+        self._recording.set_time(SIM_TIME, duration=np.timedelta64(tick * self.times.clock_ns, "ns"))
         self._recording.set_time(TICK, sequence=tick)
-        self._recording.set_time(WALL, timestamp=moment.wall)
+        self._recording.set_time(WALL, timestamp=self.times.wall(stamp_ns))
         self._recording.log(path(*entity), archetype)
 
     def property(self, name: str, values: rr.AsComponents) -> None:

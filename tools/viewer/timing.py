@@ -18,11 +18,6 @@ SPAN_S = 0.25
 """Time marked around a missed cycle: the cycle itself would be too narrow to be visible."""
 
 
-def lane_of(task: TaskSpec) -> tuple[str, ...]:
-    """Return the lane of a task; lanes are in the order of slots."""
-    return (BOARDS, f"{task.slot}-{task.board}", task.role)
-
-
 class CycleLanes:
     """Writes trace records as spans: read, process or plan, write, wait. Missed cycles are red.
 
@@ -32,7 +27,7 @@ class CycleLanes:
 
     def __init__(self, stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> None:
         self._stream, self._speed = stream, speed
-        self._lane = lane_of(task)
+        self._lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
         self._last_ns = task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS) if lockstep else None
         self._work = "process" if task.role == "executor" else "plan"
         style_lane(stream, self._lane, PHASES, quiet=["wait"])

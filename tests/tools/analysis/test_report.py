@@ -17,7 +17,7 @@ from rack.boards.config import load
 from rack.levels.timing.equations import response_ticks
 from rack.tools.analysis.report import report_of, task_times, write_report
 from rack.tools.analysis.report_markdown import markdown, show
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
@@ -29,7 +29,7 @@ MS = 1_000_000
 PARTS = ("min", "p50", "p99", "p99_9", "max")
 
 
-class Watchful(SilentDisplay):
+class Watchful(Display):
     """Looks often: a run in lockstep is soon over."""
 
     period_s = 0.02

@@ -14,7 +14,7 @@ from rack.boards.config import RackConfig, load
 from rack.levels.timing.tasks import Budget
 from rack.tools.console.answer import Failure
 from rack.tools.runs.cycles import cycles_of, measured_budgets
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 from tests.tools.recordings import MS, Cycle, recorded
@@ -118,7 +118,7 @@ def figure(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     """A run of fig2, in the mode that is the fixture's parameter, with an executor of 1 ms."""
     folder = tmp_path_factory.mktemp("figure") / "run"
     settings = [f"name=test-cycles-{os.getpid()}", f"clock.mode={request.param}", "board.level.params.process_ms=1.0"]
-    assert run_rack(load("fig2", settings), 2.0, folder, SilentDisplay()).outcome.cause == "time over"
+    assert run_rack(load("fig2", settings), 2.0, folder, Display()).outcome.cause == "time over"
     return Recording(folder)
 
 

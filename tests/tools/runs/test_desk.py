@@ -16,10 +16,10 @@ from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.command import LiveDesk, goal_of
+from rack.tools.command import goal_of
 from rack.tools.console.answer import Failure
 from rack.tools.runs import desk
-from rack.tools.runs.desk import Replies
+from rack.tools.runs.desk import LiveDesk, Replies
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
@@ -108,7 +108,7 @@ REFUSED = {
     "no level": (("uper", "hold"), 'level = "uper": no such level takes commands; levels: upper, lower'),
     "no wait to bound": (
         ("upper", "hold", "--timeout", "1"),
-        "--timeout is the bound of --wait; give both, or neither",
+        "--timeout needs --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
     "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),

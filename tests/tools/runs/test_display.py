@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from rack.boards.events import Event
-from rack.tools.runs.display import COLUMNS, PlainDisplay, line_of, table_of
+from rack.tools.runs.display import COLUMNS, PlainDisplay, RackView, line_of
 from rack.tools.runs.holds import Hold
 from rack.tools.runs.snapshot import Snapshot, TaskProgress, TaskRow
 
@@ -25,7 +25,7 @@ HOLD = Hold("task", 15268, 38.17, "diverted by the operator (goto home)", "rack 
 def shown(snapshot: Snapshot, width: int) -> str:
     console = Console(width=width, force_terminal=True, color_system=None)
     with console.capture() as capture:
-        console.print(table_of(snapshot))
+        console.print(RackView(snapshot))
     return capture.get()
 
 

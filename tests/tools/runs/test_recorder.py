@@ -13,7 +13,7 @@ from rack.boards.config import load
 from rack.boards.config.layout import field_specs
 from rack.tools.analysis.report import report_of
 from rack.tools.console.answer import Failure
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.parquet import columns_of
 from rack.tools.runs.recording import Recording
@@ -60,12 +60,12 @@ def test_signals_are_what_the_levels_wrote(recording: Recording) -> None:
 
 
 def test_recording_changes_nothing_in_a_run(small: Path, rack_name: str, recording: Recording) -> None:
-    unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, SilentDisplay())
+    unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, Display())
     assert unrecorded.outcome.digest == report_of(recording)["digest"]
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(Failure, match="no run, it has no config"):
+    with pytest.raises(Failure, match="not a run: it has no config"):
         Recording(tmp_path)
 
 

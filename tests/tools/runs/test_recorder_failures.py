@@ -20,7 +20,7 @@ from rack.tools.analysis.report import write_report
 from rack.tools.console.answer import Failure
 from rack.tools.recorder.recorder import Recorder, SafeSink
 from rack.tools.runs import recorder_process
-from rack.tools.runs.display import SilentDisplay
+from rack.tools.runs.display import Display
 from rack.tools.runs.launch import NO_RECORDER, run_rack
 from rack.tools.runs.recording import Recording
 from rack.tools.runs.snapshot import Snapshot
@@ -49,10 +49,7 @@ class Failing:
     def __init__(self) -> None:
         self.blocks = 0
 
-    def add_cycles(self, task: str, rows: np.ndarray) -> None:
-        """Take anything."""
-
-    def add_signals(self, mailbox: str, rows: np.ndarray) -> None:
+    def add(self, ring: str, rows: np.ndarray) -> None:
         """Take anything."""
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
@@ -71,7 +68,7 @@ def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
     sink = Failing()
     safe = SafeSink(lambda: sink, notes.append)
     for tick in range(5):
-        safe.add_cycles("servo", np.zeros(1))
+        safe.add("servo", np.zeros(1))
         safe.advance(tick, {})
     safe.close(5, {})
     assert notes == ["run.rrd ends here: the disk is full"]
@@ -90,7 +87,7 @@ def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "run.rrd").symlink_to("/dev/full")
-    result = run_rack(config, 5.0, folder, SilentDisplay())
+    result = run_rack(config, 5.0, folder, Display())
     recording = Recording(folder)
     assert result.worked
     assert result.recording == "complete"
@@ -100,7 +97,7 @@ def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path
     assert lines[0].startswith("run.rrd ends here: ")
 
 
-class Keeping(SilentDisplay):
+class Keeping(Display):
     """Keeps the texts of events."""
 
     def __init__(self) -> None:
@@ -119,7 +116,7 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
     assert display.texts.count("events.jsonl ends here: No space left on device") == 1
 
 
-class AtTick(SilentDisplay):
+class AtTick(Display):
     """Sends a signal to the recorder of the run, once, when that has got to some tick."""
 
     period_s = 0.05
@@ -159,7 +156,7 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config:
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
     assert len(recording.cycles["lower"]) == result.outcome.ticks
     assert not any(recording.lost.values())
-    assert result.outcome.digest == run_rack(config, LONG_S, None, SilentDisplay()).outcome.digest
+    assert result.outcome.digest == run_rack(config, LONG_S, None, Display()).outcome.digest
     # The viewer's file is not written over.
     assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
 
@@ -193,7 +190,7 @@ def test_a_recorder_that_comes_late_delays_no_run(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
-    result = run_rack(realtime(config), 3.0, tmp_path / "run", SilentDisplay())
+    result = run_rack(realtime(config), 3.0, tmp_path / "run", Display())
     assert (result.worked, result.recording) == (True, "complete")
     assert notes_of(Recording(tmp_path / "run"))[:1] == [NO_RECORDER]
 

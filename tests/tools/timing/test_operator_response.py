@@ -12,7 +12,7 @@ import pytest
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.operating.command import CommandConfig
-from rack.tools.bench.response import run_commands
+from rack.tools.benches.response import run_commands
 from rack.tools.console.answer import Failure
 from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
 from tests.boards.commanded_racks import COMMANDED

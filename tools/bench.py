@@ -1,4 +1,4 @@
-"""`rack bench`: what things cost on this machine."""
+"""`rack bench`: measure costs on this machine."""
 
 from __future__ import annotations
 
@@ -9,27 +9,32 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from rack.tools.console.answer import Json, print_json
+from rack.tools.console.answer import Json, config_names, print_json
 from rack.tools.console.interrupt import INTERRUPT
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 
-Config = Annotated[str, typer.Option("--config", metavar="CONFIG", help="rack by name, or a path to a .toml file")]
+Config = Annotated[
+    str,
+    typer.Option(
+        "--config", metavar="CONFIG", help="config by name, or path to a .toml file", autocompletion=config_names
+    ),
+]
 
 
 @bench.callback()
 def interruptible(context: typer.Context) -> None:
-    """Measure what things cost on this machine."""
+    """Measure costs on this machine."""
     context.with_resource(INTERRUPT.raising())  # so that temporary folders are removed, too
 
 
 @bench.command()
 def mailbox(as_json: Json = False) -> None:
-    """A write and a read of 200 bytes, by protocol.
+    """Measure a write and a read of 200 bytes, by protocol.
 
     Figures are medians; on a busy machine look at the best ones.
     """
-    from rack.tools.bench.mailbox import lines_of, measure
+    from rack.tools.benches.mailbox import lines_of, measure
 
     costs = measure()
     _print({"mailbox": [asdict(cost) for cost in costs]}, lines_of(costs), as_json)
@@ -37,8 +42,11 @@ def mailbox(as_json: Json = False) -> None:
 
 @bench.command()
 def recording(config: Config = "nasrem", as_json: Json = False) -> None:
-    """Misses and lateness of a rack without a recorder, with it, and with a live viewer, interleaved."""
-    from rack.tools.bench.recording import lines_of, measure
+    """Measure the cost of recording: misses and lateness.
+
+    One rack runs without a recorder, with one, and with a live viewer, by turns.
+    """
+    from rack.tools.benches.recording import lines_of, measure
     from rack.tools.console.tables import terminal_width
 
     costs = measure(config)
@@ -47,13 +55,13 @@ def recording(config: Config = "nasrem", as_json: Json = False) -> None:
 
 @bench.command()
 def switch(as_json: Json = False) -> None:
-    """The context switch t_cs of eqs 3.8 and 3.9; on the paper's 68020 boards it took 100 us.
+    """Measure the context switch t_cs of eqs 3.8 and 3.9.
 
-    An executor of real-time priority wakes up on the core of a busy planner, as on a board with both. Measured is the
-    time from the planner's last instant to the executor's first, and back. Exit status 1 if the machine does not permit
-    real-time priorities.
+    On the paper's 68020 boards it took 100 us. An executor of real-time priority wakes up on the core of a busy
+    planner, as on a board with both. The times are those from the planner's last instant to the executor's first, and
+    back. Exit status 1 if the machine does not permit real-time priorities.
     """
-    from rack.tools.bench.switch import measure
+    from rack.tools.benches.switch import measure
 
     cost = measure()
     _print(asdict(cost), cost.lines(), as_json)
@@ -62,16 +70,17 @@ def switch(as_json: Json = False) -> None:
 @bench.command()
 def partition(
     config: Config = "nasrem",
-    seconds: Annotated[float, typer.Option(min=1.0, max=1e9, help="simulated time of one run, s")] = 15.0,
-    rounds: Annotated[int, typer.Option(min=1, help="runs of each partition, interleaved")] = 2,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run")] = 15.0,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each partition, interleaved")] = 2,
     as_json: Json = False,
 ) -> None:
-    """The same rack in other partitions: every planner tight or loose, on one core and on two.
+    """Compare four partitions of a rack.
 
-    Runs them in real time, one after another. Prints misses, residuals and plan ages, and next to them the timing
-    model's predictions from the budgets of the config.
+    Its planners are coupled tightly or loosely, on one core or two. The runs are in real time, one after another. The
+    output shows misses, residuals and plan ages, and next to them the timing model's predictions from the budgets of
+    the config.
     """
-    from rack.tools.bench.partition import compare, lines_of
+    from rack.tools.benches.partition import compare, lines_of
     from rack.tools.console.progress import progress_for
     from rack.tools.console.tables import terminal_width
 
@@ -84,20 +93,22 @@ def partition(
 @bench.command()
 def response(
     config: Config = "nasrem",
-    commands: Annotated[int, typer.Option(min=1, help="commands to measure, holds and resumes at every level")] = 200,
-    seed: Annotated[int, typer.Option(help="seed of their ticks")] = 1,
+    commands: Annotated[int, typer.Option(metavar="N", min=1, help="holds and resumes to measure, in all")] = 200,
+    seed: Annotated[int, typer.Option(metavar="N", help="seed of their ticks")] = 1,
     mode: Annotated[Literal["lockstep", "realtime"], typer.Option(help="how the racks run")] = "lockstep",
-    twins: Annotated[int, typer.Option(min=0, help="holds whose run is compared with one without them; lockstep")] = 4,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for response.png and .svg")] = None,
+    twins: Annotated[
+        int, typer.Option(metavar="N", min=0, help="in lockstep: holds whose run is compared with one without them")
+    ] = 4,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for response.png and response.svg")] = None,
     as_json: Json = False,
 ) -> None:
-    """The response to an operator, from the tick of a command to the torque that rests on it, with the bounds R_s.
+    """Measure the response to an operator, from command to torque.
 
-    Runs racks one after another, each with holds and resumes at random ticks, at every level in turn. In lockstep each
-    must arrive at the predicted tick; in a twin of the run without that command, the torque must differ from that tick
-    on. Exit status 1 if one does not, or exceeds a bound.
+    Racks run one after another, with holds and resumes at random ticks, at every level in turn; the response is
+    compared with its bounds R_s. In lockstep each command must act at the predicted tick; in a twin of the run without
+    that command, the torque must differ from that tick on. Exit status 1 if one does not, or a bound is exceeded.
     """
-    from rack.tools.bench.response import ResponseRuns
+    from rack.tools.benches.response import ResponseRuns
     from rack.tools.console.progress import progress_for
     from rack.tools.console.tables import terminal_width
     from rack.tools.timing.operator_response import plot
@@ -114,7 +125,6 @@ def response(
 
 
 def _print(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
-    """Print a result: as JSON, or as text for people."""
     from rack.tools.console.tables import print_wrapped
 
     print_json(document) if as_json else print_wrapped("\n".join(lines))

@@ -15,12 +15,12 @@ import numpy as np
 
 from rack.backplane.process import processor_ns
 from rack.backplane.segment import Segment
-from rack.backplane.trace import Flag, trace_ring
+from rack.backplane.trace import trace_ring
 from rack.boards import Rack
-from rack.boards.config import RackConfig, load
-from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
+from rack.boards.config import load
+from rack.levels.timing.trace_times import Distribution, counts, distribution, lateness_ns
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import table
+from rack.tools.console.tables import decimal, figure, table
 from rack.tools.runs.recorder_process import RecorderProcess
 from rack.tools.runs.window import ViewerWindow, free_port, url
 
@@ -33,7 +33,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class RecordingCost:
-    """All rounds of one phase: cycles, misses and skips of all tasks, lateness of the fastest task in ms.
+    """All rounds of one phase: cycles, missed and skipped ones, of all tasks; lateness of the fastest task in ms.
 
     `recorder_percent` is the recorder's share of one core; 0 without one.
     """
@@ -47,10 +47,9 @@ class RecordingCost:
 
 
 class _Sample(NamedTuple):
-    """One round of one phase; `flags` and `lateness_ms` are of shape (cycles,)."""
+    """Trace records as read by `Meter`, again and again, and the recorder's share of a core."""
 
-    flags: np.ndarray
-    lateness_ms: np.ndarray
+    readings: list[list[np.ndarray]]
     recorder_percent: float
 
 
@@ -58,15 +57,12 @@ class Meter:
     """Reads the traces of a running rack, phase by phase."""
 
     def __init__(self, segment: Segment) -> None:
-        self._rings = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
-        self._fastest = min(segment.layout.tasks, key=lambda task: task.every).name
+        tasks = sorted(segment.layout.tasks, key=lambda task: task.every)
+        self._rings = [trace_ring(segment, task.name) for task in tasks]
 
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flags of all cycles since the last call, and the fastest task's lateness in ms."""
-        rows = {task: ring.drain().rows for task, ring in self._rings.items()}
-        fastest = rows[self._fastest]
-        flags = np.concatenate([taken["flags"] for taken in rows.values()])
-        return flags, lateness_ns(fastest) * 1e-6
+    def read(self) -> list[np.ndarray]:
+        """Return the trace records since the last call, of the fastest task first."""
+        return [ring.drain().rows for ring in self._rings]
 
 
 def measure(name: str) -> list[RecordingCost]:
@@ -74,7 +70,9 @@ def measure(name: str) -> list[RecordingCost]:
 
     Raises `Failure` if the rack ends early or a recorder cannot attach.
     """
-    config = _endless(load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"]))
+    config = load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"])
+    endless = {name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()}
+    config = config.model_copy(update={"board": endless})
     found: dict[str, list[_Sample]] = {phase: [] for phase in PHASES}
     with tempfile.TemporaryDirectory() as folder, Rack(config) as rack:
         rack.start()
@@ -86,21 +84,16 @@ def measure(name: str) -> list[RecordingCost]:
                     _watch(rack, SETTLE_S)
                     meter.read()
                     used_ns, began_ns = _processor_ns(pid), time.monotonic_ns()
-                    flags, lateness = zip(*(_reading(rack, meter) for _ in range(round(PHASE_S))), strict=True)
+                    readings = [_reading(rack, meter) for _ in range(round(PHASE_S))]
                     share = 100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
-                    found[phase].append(_Sample(np.concatenate(flags), np.concatenate(lateness), share))
+                    found[phase].append(_Sample(readings, share))
         rack.stop("measured")
         while rack.watch(0.5):
             continue
     return [_cost(phase, samples) for phase, samples in found.items()]
 
 
-def _endless(config: RackConfig) -> RackConfig:
-    boards = {name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()}
-    return config.model_copy(update={"board": boards})
-
-
-def _reading(rack: Rack, meter: Meter) -> tuple[np.ndarray, np.ndarray]:
+def _reading(rack: Rack, meter: Meter) -> list[np.ndarray]:
     # The rings hold two seconds.
     _watch(rack, 1.0)
     return meter.read()
@@ -138,13 +131,15 @@ def _processor_ns(pid: int | None) -> int:
 
 
 def _cost(phase: str, samples: Sequence[_Sample]) -> RecordingCost:
-    flags = np.concatenate([sample.flags for sample in samples])
+    readings = [reading for sample in samples for reading in sample.readings]
+    cycles = np.concatenate([rows for reading in readings for rows in reading])
+    missed, skipped = counts(cycles)
     return RecordingCost(
         phase=phase,
-        cycles=len(flags),
-        missed=int(np.count_nonzero(flags & Flag.MISSED)),
-        skipped=int(np.count_nonzero(flags & Flag.SKIPPED)),
-        lateness_ms=distribution(np.concatenate([sample.lateness_ms for sample in samples])),
+        cycles=len(cycles),
+        missed=missed,
+        skipped=skipped,
+        lateness_ms=distribution(lateness_ns(np.concatenate([reading[0] for reading in readings])) * 1e-6),
         recorder_percent=round(float(np.mean([sample.recorder_percent for sample in samples])), 2),
     )
 
@@ -155,8 +150,8 @@ def lines_of(costs: Sequence[RecordingCost], width: int | None = None) -> Iterat
     rows = [
         [
             *(cost.phase, str(cost.cycles), str(cost.missed), str(cost.skipped)),
-            *(f"{cost.lateness_ms[name]:.3f}" if cost.lateness_ms else "-" for name in ("p50", "p99", "p99_9", "max")),
-            f"{cost.recorder_percent:.1f}",
+            *(figure(cost.lateness_ms, name) for name in ("p50", "p99", "p99_9", "max")),
+            decimal(cost.recorder_percent, 1),
         ]
         for cost in costs
     ]

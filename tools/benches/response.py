@@ -90,8 +90,8 @@ class ResponseBench:
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as text for people, the table fitted to `width`."""
         yield self.response.text(width)
-        count = len(self.response.measured)
-        yield f"{len(self.response.beyond)} of {count} beyond a bound, {len(self.response.off)} off the predicted tick"
+        beyond, off, measured = (len(getattr(self.response, name)) for name in ("beyond", "off", "measured"))
+        yield f"{beyond} of {measured} beyond a bound, {off} not at the predicted tick"
         for twin in self.twins:
             where = "nowhere" if twin.differs is None else f"first at tick {twin.differs}"
             command = f"command {twin.serial} to {twin.level}, given at tick {twin.given}"
@@ -215,11 +215,9 @@ def compare(config: RackConfig, run: CommandedRun, command: AnsweredCommand, fol
 
 def first_difference(first: Recording, second: Recording) -> int | None:
     """Return the first tick at which the torques of two runs differ in any bit, over the ticks that both have."""
-    torques = [_torques(recording) for recording in (first, second)]
+    torques = []
+    for recording in (first, second):
+        ticks, values = (recording.signal("servo.status", name) for name in ("tick", "torque"))
+        torques.append({int(tick): value.tobytes() for tick, value in zip(ticks, values, strict=True)})
     common = sorted(torques[0].keys() & torques[1].keys())
     return next((tick for tick in common if torques[0][tick] != torques[1][tick]), None)
-
-
-def _torques(recording: Recording) -> dict[int, bytes]:
-    ticks, torques = (recording.signal("servo.status", name) for name in ("tick", "torque"))
-    return {int(tick): torque.tobytes() for tick, torque in zip(ticks, torques, strict=True)}

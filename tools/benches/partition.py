@@ -17,14 +17,14 @@ from rack.levels.timing.response_time import response_times
 from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.console.tables import table
+from rack.tools.console.tables import figure, table
 from rack.tools.runs.display import display_for
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 
 LAUNCH_S = 3.0
 """About how long launching and recording a run take in addition to its time."""
-PLANNERS_DROPPED = ("plans", "median left", "median age")
+PLANNERS_DROPPED = ("plans", "residual p50", "age p50")
 """Columns that a narrow terminal leaves out, in this order."""
 
 
@@ -172,26 +172,26 @@ def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Ite
     """Yield two tables for people, fitted to `width`: executors, and planners with their plan ages; times in ms."""
     levels = [(one.partition, level) for one in found for level in one.levels]
     planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
-    yield "executors: predicted worst response, and time left of the cycle, ms"
-    head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "median left", "worst"]
-    yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "median left"))
+    yield "executors: predicted worst-case response, and residual, ms"
+    head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "residual p50", "residual min"]
+    yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50"))
     yield ""
-    yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
-    head = ["partition", "level", "slice", "predicted", "plans", "late", "median left", "worst", "median age", "oldest"]
-    yield from table(head, planned, width, PLANNERS_DROPPED)
+    yield "planners: the same for a plan's time slice, and the age of plans when they are read, ms"
+    head = ["partition", "level", "slice", "predicted", "plans", "late", "residual p50", "residual min"]
+    yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
 
 
 def _executor_row(partition: str, level: LevelFigures) -> list[str]:
     executor = level.executor
     counts = [str(count) for count in (executor.cycles, executor.missed, executor.skipped)]
-    return [partition, level.level, *_prediction(executor), *counts, *_ms(executor.residual_ms, "p50", "min")]
+    return [partition, level.level, *_prediction(executor), *counts, *_cells(executor.residual_ms, "p50", "min")]
 
 
 def _planner_row(partition: str, level: LevelFigures) -> list[str]:
     planner = level.planner
     assert planner is not None, "levels without a planner have no such row"
     row = [partition, level.level, *_prediction(planner), str(planner.cycles), str(planner.missed)]
-    return [*row, *_ms(planner.residual_ms, "p50", "min"), *_ms(level.plan_age_ms, "p50", "max")]
+    return [*row, *_cells(planner.residual_ms, "p50", "min"), *_cells(level.plan_age_ms, "p50", "max")]
 
 
 def _prediction(task: TaskFigures) -> list[str]:
@@ -202,5 +202,5 @@ def _prediction(task: TaskFigures) -> list[str]:
     return [f"{task.slice_ms:g}", response if task.fits else f"{response} FAILS"]
 
 
-def _ms(found: Distribution | None, *names: str) -> list[str]:
-    return ["-" if found is None else f"{found[name]:.2f}" for name in names]
+def _cells(found: Distribution | None, *names: str) -> list[str]:
+    return [figure(found, name, 2) for name in names]

@@ -1,0 +1,32 @@
+"""Pictures by matplotlib, as PNG and SVG. It takes a second to import: only what draws may import it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+KINDS = ("png", "svg")
+DPI = 150
+
+
+@contextmanager
+def picture(paths: Sequence[Path], width_in: float, height_in: float, **settings: Any) -> Iterator[Figure]:
+    """Give an empty figure to draw on, and save it when the context ends; equal figures make equal files."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context({"svg.hashsalt": "rack", "font.size": 9}):
+        figure = Figure(figsize=(width_in, height_in), **settings)
+        yield figure
+        for path in paths:
+            figure.savefig(path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
+
+
+def paths_of(stem: Path) -> list[Path]:
+    """Return the paths of a picture: `stem`.png and `stem`.svg."""
+    return [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
