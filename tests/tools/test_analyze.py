@@ -14,7 +14,8 @@ from rack.tools.analysis.document import document
 from rack.tools.analysis.tables import text
 from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
-from tests.tools.in_process import rack
+from tests.shared_runs import slow_run
+from tests.tools.command_line import rack
 from tests.tools.recordings import MS, Cycle, recorded
 
 SETTLED = 40
@@ -145,10 +146,8 @@ def test_the_tables_of_an_analysis_fit_the_terminal(small: Path, tmp_path: Path,
     assert max(map(len, text(analysis).splitlines())) > 120
 
 
-def test_a_run_in_lockstep_is_analyzed_with_its_system_response(small: Path, rack_name: str, tmp_path: Path) -> None:
-    settings = [f"name={rack_name}", "board.upper.rate_hz=10", "board.lower.rate_hz=80"]
-    run_rack(load(small, settings), 4.0, tmp_path / "run", Display())
-    found = json.loads(rack("analyze", tmp_path / "run", "--json").stdout)
+def test_a_run_in_lockstep_is_analyzed_with_its_system_response(tmp_path_factory: pytest.TempPathFactory) -> None:
+    found = json.loads(rack("analyze", slow_run(tmp_path_factory), "--json").stdout)
     measured = [(row["equation"], row["measured"]) for row in found["equations"] if row["measured"] is not None]
     # 40 and 5 ticks: a command takes both cycles, a status waits for up to 35 ticks more.
     responses = [(found["left"], found["right"]) for equation, found in measured if equation == "3.3"]

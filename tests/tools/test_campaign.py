@@ -12,15 +12,13 @@ from typing import Any
 import pytest
 
 from tests.processes import RACK, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack
 
-ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 50
 COMMAND = [*RACK, "campaign"]
 
 
 def campaign(config: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [*COMMAND, str(config), *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    return rack("campaign", config, *arguments)
 
 
 def trials_in(folder: Path) -> list[dict[str, Any]]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,13 +13,11 @@ import pytest
 from rack.boards.config import budgets, load
 from rack.levels.timing.forecast import Forecast
 from rack.tools.check import inventory, inventory_lines
-from rack.tools.cli import run_commands
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.tables import forecast_lines
-from tests.conftest import SMALL
+from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
-Check = Callable[..., subprocess.CompletedProcess[str]]
 FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
 FAILS = ("--set", "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }")
 ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
@@ -38,47 +35,32 @@ def two_cores() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run of the small rack."""
-    folder = tmp_path_factory.mktemp("recorded")
-    (folder / "small.toml").write_text(SMALL)
-    name = f"name=test-check-{os.getpid()}"
-    done = rack("run", folder / "small.toml", "--seconds", 1, "--set", name, "--out", folder / "run", "--json")
-    assert done.returncode == 0, done.stderr
-    return folder / "run"
+    return small_run(tmp_path_factory)
 
 
-@pytest.fixture
-def check(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Check:
-    """Run `rack check` in this process."""
-
-    def ended(*words: object) -> subprocess.CompletedProcess[str]:
-        monkeypatch.setattr(sys, "argv", ["rack", "check", *map(str, words)])
-        with pytest.raises(SystemExit) as end:
-            run_commands()
-        out, err = capsys.readouterr()
-        return subprocess.CompletedProcess(words, int(end.value.code or 0), out, err)
-
-    return ended
+def check(*words: object) -> subprocess.CompletedProcess[str]:
+    return rack("check", *words)
 
 
 def failures(done: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in done.stdout.splitlines() if "FAILS" in line]
 
 
-def test_a_rack_that_fits_ends_with_status_0(check: Check, small: Path) -> None:
+def test_a_rack_that_fits_ends_with_status_0(small: Path) -> None:
     done = check(small, *FITS, *ALONE)
     assert (done.returncode, failures(done)) == (0, [])
     assert "to make it fit" not in done.stdout
     assert "not counted (set one in the config, or use --from RUN): upper" in done.stdout
 
 
-def test_a_rack_that_fails_shows_where_and_which_changes_help(check: Check, small: Path) -> None:
+def test_a_rack_that_fails_shows_where_and_which_changes_help(small: Path) -> None:
     done = check(small, *FAILS, *ALONE)
     assert done.returncode == 1
     assert {line.split()[0] for line in failures(done)} == {"3.8", "1", "load:"}
     assert "  board 'lower': within_cycles 4 -> 7 (a plan every 17.5 ms)" in done.stdout
 
 
-def test_a_rack_without_budgets_has_nothing_to_fail(check: Check, small: Path) -> None:
+def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
     done = check(small)
     assert done.returncode == 0
     assert "not counted (set one in the config, or use --from RUN): upper, lower" in done.stdout
@@ -96,7 +78,7 @@ def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
     assert max(map(len, rows)) <= width
 
 
-def test_json_holds_everything_with_both_sides(check: Check, small: Path) -> None:
+def test_json_holds_everything_with_both_sides(small: Path) -> None:
     done = check(small, *FAILS, *ALONE, "--json")
     timing = json.loads(done.stdout)["timing"]
     assert done.returncode == 1
@@ -120,7 +102,7 @@ def test_json_holds_everything_with_both_sides(check: Check, small: Path) -> Non
     assert timing["repair"]["steps"][0][0]["settings"] == {"within_cycles": 7}
 
 
-def test_a_fixed_config_loads_and_holds(check: Check, small: Path, tmp_path: Path) -> None:
+def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
     done = check(small, *FAILS, *ALONE, "--fix")
     assert done.returncode == 0
     assert "within_cycles 4 -> 7" in done.stderr
@@ -132,25 +114,25 @@ def test_a_fixed_config_loads_and_holds(check: Check, small: Path, tmp_path: Pat
     assert check(fixed).returncode == 0
 
 
-def test_a_fix_is_json_too(check: Check, small: Path) -> None:
+def test_a_fix_is_json_too(small: Path) -> None:
     document = json.loads(check(small, *FAILS, *ALONE, "--fix", "--json").stdout)
     assert document["fits"]
     assert "within_cycles = 7" in document["config"]
 
 
-def test_where_nothing_helps_no_config_is_printed(check: Check, small: Path) -> None:
+def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
     done = check(small, "--set", "board.lower.budget.process_ms=100", "--fix")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("no change helps with 3.1 of lower")
 
 
-def test_a_rack_that_fits_is_fixed_as_it_is(check: Check, small: Path) -> None:
+def test_a_rack_that_fits_is_fixed_as_it_is(small: Path) -> None:
     done = check(small, *FITS, *ALONE, "--fix")
     assert (done.returncode, done.stderr) == (0, "nothing to change\n")
     assert done.stdout == load(small, [*FITS[1:], *ALONE[1::2]]).text()
 
 
-def test_budgets_come_from_an_earlier_run(check: Check, small: Path, recorded: Path) -> None:
+def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
     done = check(small, "--from", recorded, "--percentile", 90, "--json")
     timing = json.loads(done.stdout)["timing"]
     assert done.returncode == (0 if timing["holds"] else 1)
@@ -161,7 +143,7 @@ def test_budgets_come_from_an_earlier_run(check: Check, small: Path, recorded: P
     assert levels["upper"]["plan_ns"] is None
 
 
-def test_a_fix_carries_the_measured_budgets(check: Check, small: Path, recorded: Path, tmp_path: Path) -> None:
+def test_a_fix_carries_the_measured_budgets(small: Path, recorded: Path, tmp_path: Path) -> None:
     # A cycle this short leaves the measured planner nothing; whatever helps is judged by what was measured.
     done = check(small, "--from", recorded, "--percentile", 50, "--fix")
     assert done.returncode == 0, done.stderr
@@ -171,19 +153,19 @@ def test_a_fix_carries_the_measured_budgets(check: Check, small: Path, recorded:
     assert check(fixed).returncode == 0
 
 
-def test_a_run_of_another_rack_is_refused_in_one_line(check: Check, recorded: Path) -> None:
+def test_a_run_of_another_rack_is_refused_in_one_line(recorded: Path) -> None:
     done = check("fig2", "--from", recorded)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"{recorded}: a run of other boards: lower, upper; 'fig2' has level\n"
 
 
-def test_a_folder_that_is_no_run_is_refused_in_one_line(check: Check, small: Path, tmp_path: Path) -> None:
+def test_a_folder_that_is_no_run_is_refused_in_one_line(small: Path, tmp_path: Path) -> None:
     done = check(small, "--from", tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(check: Check, small: Path) -> None:
+def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(small: Path) -> None:
     done = check(small, "--set", "board.upper.budget.plan_ms=6")
     assert done.returncode == 2
     assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; remove it, or add one\n"

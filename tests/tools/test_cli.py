@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from tests.processes import RACK
-from tests.tools.command_line import BOUND_S, ROOT, refused
+from tests.tools.command_line import BOUND_S, ROOT, rack
 
 LONG = "a" * 5000
 COMMANDS = (
@@ -27,42 +27,40 @@ COMMANDS = (
 
 @pytest.mark.parametrize("arguments", COMMANDS, ids=lambda arguments: " ".join(arguments)[:20])
 def test_an_argument_without_end_is_refused_in_one_line(arguments: tuple[str, ...]) -> None:
-    status, printed, why = refused(*arguments)
-    assert (status, printed) == (2, "")
-    assert why.startswith("argument ")
-    assert why.endswith(" characters; at most 4096\n")
-    assert len(why) < 200
+    done = rack(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("argument ")
+    assert done.stderr.endswith(" characters; at most 4096\n")
+    assert len(done.stderr) < 200
 
 
 @pytest.mark.parametrize("arguments", [("report",), ("analyze",), ("replay",), ("gantt",), ("run", "fig2", "--out")])
 def test_a_name_that_no_file_can_have_is_refused_in_one_line(arguments: tuple[str, ...]) -> None:
-    status, _, why = refused(*arguments, "a" * 300)
-    assert status == 2
-    assert len(why.splitlines()) == 1
-    assert "aaaaaaaa" in why
+    done = rack(*arguments, "a" * 300)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "aaaaaaaa" in done.stderr
 
 
 @pytest.mark.parametrize("seconds", ["inf", "nan", "1e300", "-1"])
 def test_no_run_lasts_for_ever_or_less_than_nothing(seconds: str) -> None:
-    status, printed, why = refused("run", "fig2", "--lockstep", "--no-record", "--seconds", seconds)
-    assert (status, printed) == (2, "")
-    assert "Invalid value for '--seconds'" in why
+    done = rack("run", "fig2", "--lockstep", "--no-record", "--seconds", seconds)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "Invalid value for '--seconds'" in done.stderr
 
 
 @pytest.mark.parametrize("command", ["status", "stop", "record", "estop", "command", "inject"])
 def test_an_empty_name_is_no_rack(command: str) -> None:
-    assert refused(command, "") == (
-        2,
-        "",
-        'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it\n',
-    )
+    done = rack(command, "")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == 'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it\n'
 
 
 @pytest.mark.parametrize("option", ["--faultless=nan", "--faultless=inf", "--faultless=-1", "--seconds=inf"])
 def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
-    status, printed, why = refused("campaign", "fig2", option)
-    assert (status, printed) == (2, "")
-    assert f"Invalid value for '{option.partition('=')[0]}'" in why
+    done = rack("campaign", "fig2", option)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"Invalid value for '{option.partition('=')[0]}'" in done.stderr
 
 
 def test_bytes_that_are_no_text_are_refused() -> None:

@@ -17,7 +17,7 @@ import pytest
 from rack.backplane.segment import racks
 from rack.tools.cli import COMMANDS
 from tests.processes import RACK
-from tests.tools.command_line import BOUND_S, ROOT, rack, refused
+from tests.tools.command_line import BOUND_S, ROOT, rack
 
 
 @contextmanager
@@ -168,12 +168,12 @@ def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str]
 
 
 def test_a_rack_that_is_not_there_is_named(rack_name: str) -> None:
-    status, _, why = refused("stop", rack_name)
-    assert status == 1
-    assert f"rack '{rack_name}' does not exist" in why
+    done = rack("stop", rack_name)
+    assert done.returncode == 1
+    assert f"rack '{rack_name}' does not exist" in done.stderr
 
 
 def test_a_folder_that_holds_files_is_not_written_over(small: Path, tmp_path: Path) -> None:
-    status, _, why = refused("run", str(small), "--seconds", "1", "--out", str(tmp_path))
-    assert status == 2
-    assert "not an empty folder" in why
+    done = rack("run", small, "--seconds", 1, "--out", tmp_path)
+    assert done.returncode == 2
+    assert "not an empty folder" in done.stderr

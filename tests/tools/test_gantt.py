@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from tests.tools.in_process import rack
+from tests.tools.command_line import rack
 from tests.tools.recordings import cycle, recorded
 
 

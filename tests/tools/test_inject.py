@@ -23,15 +23,9 @@ from rack.tools.faults import live
 from rack.tools.faults.live import LiveRack
 from tests.boards.fault_racks import DRIVEN
 from tests.processes import RACK, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack
 
-ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 50
 TASKS = "wave, wave.planner, watch, driven, clock"
-
-
-def rack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [*RACK, *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
 
 
 @pytest.fixture(scope="module")

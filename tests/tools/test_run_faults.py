@@ -10,38 +10,28 @@ import pytest
 
 from rack.backplane.segment import racks
 from rack.boards.config import FAULTS, loads, names
-from tests.processes import RACK
+from tests.tools.command_line import rack
 
-ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 50
 HANG = '[[fault]]\nkind = "hang"\nboard = "upper"\nat = 0.5\n'
 
 
 def run(config: Path | str, name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [
-        *RACK,
-        "run",
-        str(config),
-        "--set",
-        f"name={name}",
-        *map(str, arguments),
-    ]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    return rack("run", config, "--set", f"name={name}", *arguments)
 
 
 def test_a_run_with_a_script_repeats_with_its_faults(small: Path, rack_name: str, tmp_path: Path) -> None:
     script = tmp_path / "hang.toml"
     script.write_text(HANG)
-    reports = []
-    for folder in (tmp_path / "one", tmp_path / "two"):
-        done = run(small, rack_name, "--faults", script, "--seconds", "2", "--out", folder, "--json")
-        assert done.returncode == 0, done.stderr
-        reports.append(json.loads(done.stdout))
-    assert reports[0]["digest"] == reports[1]["digest"]
-    assert [fault["struck"] for fault in reports[0]["faults"]] == [200]
+    done = run(small, rack_name, "--faults", script, "--seconds", "2", "--out", tmp_path / "run", "--json")
+    assert done.returncode == 0, done.stderr
     # The resolved config holds the script: it needs no file to run again.
-    again = loads((tmp_path / "one" / "config.toml").read_text())
-    assert [(fault.kind, fault.at) for fault in again.fault] == [("hang", 0.5)]
+    again = run(tmp_path / "run" / "config.toml", rack_name, "--seconds", "2", "--no-record", "--json")
+    assert again.returncode == 0, again.stderr
+    report, repeated = json.loads(done.stdout), json.loads(again.stdout)
+    assert report["digest"] == repeated["digest"]
+    assert [fault["struck"] for fault in report["faults"]] == [200]
+    found = loads((tmp_path / "run" / "config.toml").read_text())
+    assert [(fault.kind, fault.at) for fault in found.fault] == [("hang", 0.5)]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from pathlib import Path
 from typing import ClassVar
 
@@ -23,7 +22,7 @@ from rack.tools.runs.launch import run_rack
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands
-from tests.conftest import SMALL
+from tests.shared_runs import slow_run
 
 TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
 MS = 1_000_000
@@ -76,11 +75,7 @@ def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(cycles:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in lockstep of two levels, of 40 and 5 ticks."""
-    path = tmp_path_factory.mktemp("response")
-    (path / "small.toml").write_text(SMALL)
-    settings = [f"name=test-response-{os.getpid()}", "board.upper.rate_hz=10", "board.lower.rate_hz=80"]
-    run_rack(load(path / "small.toml", settings), 5.0, path / "run", Display())
-    return path / "run"
+    return slow_run(tmp_path_factory)
 
 
 def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:

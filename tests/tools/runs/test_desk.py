@@ -22,7 +22,7 @@ from rack.tools.runs import desk
 from rack.tools.runs.desk import LiveDesk, Replies
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import RACK, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack, refused
+from tests.tools.command_line import BOUND_S, ROOT, rack
 
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
@@ -129,16 +129,16 @@ REFUSED = {
 
 @pytest.mark.parametrize(("words", "reason"), REFUSED.values(), ids=REFUSED)
 def test_bad_usage_is_one_line_and_status_2(running: str, words: tuple[str, ...], reason: str) -> None:
-    status, _, why = refused("command", running, *words)
-    assert status == 2
-    assert len(why.splitlines()) == 1
-    assert reason in why
+    done = rack("command", running, *words)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert reason in done.stderr
 
 
 def test_a_rack_that_is_not_there_is_one_line() -> None:
-    status, _, why = refused("command", "no-such-rack", "upper", "hold")
-    assert status == 1
-    assert why.startswith("rack 'no-such-rack' does not exist")
+    done = rack("command", "no-such-rack", "upper", "hold")
+    assert done.returncode == 1
+    assert done.stderr.startswith("rack 'no-such-rack' does not exist")
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])

@@ -11,13 +11,14 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Field, MessageType
 from rack.boards.config import load
 from rack.boards.config.layout import field_specs
+from rack.tools.analysis.report import report_of
 from rack.tools.console.answer import Failure
 from rack.tools.runs.display import Display
-from rack.tools.runs.launch import RunResult, run_rack
+from rack.tools.runs.launch import run_rack
 from rack.tools.runs.parquet import columns_of
 from rack.tools.runs.recording import Recording
+from tests.shared_runs import SMALL_S, small_run
 
-SECONDS = 4.0
 TICKS = 1600
 POINT = MessageType("point", 1, (Field("at", "f8", "m", "place", (3,)), Field("id", "u2", "1", "number")))
 PATH = MessageType(
@@ -27,19 +28,14 @@ PATH = MessageType(
 )
 
 
-def run(config: Path, name: str, folder: Path | None) -> RunResult:
-    return run_rack(load(config, [f"name={name}"]), SECONDS, folder, Display())
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return Recording(small_run(tmp_path_factory))
 
 
-@pytest.fixture
-def recorded(small: Path, rack_name: str, tmp_path: Path) -> tuple[RunResult, Recording]:
-    result = run(small, rack_name, tmp_path / "run")
-    return result, Recording(tmp_path / "run")
-
-
-def test_every_message_and_every_cycle_is_recorded(recorded: tuple[RunResult, Recording]) -> None:
-    result, recording = recorded
-    assert result.recording == "complete"
+def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None:
+    report = report_of(recording)
+    assert report["recording"] == "complete"
     assert not any(recording.lost.values())
     assert set(recording.mailboxes) == {"upper.command", "upper.status", "lower.status", "lower.plan"}
     for mailbox in recording.mailboxes:
@@ -47,14 +43,13 @@ def test_every_message_and_every_cycle_is_recorded(recorded: tuple[RunResult, Re
         assert np.array_equal(serials, np.arange(1, len(serials) + 1))
     assert len(recording.signal("lower.status", "serial")) == TICKS
     assert {task: len(rows) for task, rows in recording.cycles.items()} == {
-        "upper": result.tasks["upper"]["cycles"],
-        "lower": result.tasks["lower"]["cycles"],
-        "lower.planner": result.tasks["lower.planner"]["plans"],
+        "upper": report["tasks"]["upper"]["cycles"],
+        "lower": report["tasks"]["lower"]["cycles"],
+        "lower.planner": report["tasks"]["lower.planner"]["plans"],
     }
 
 
-def test_signals_are_what_the_levels_wrote(recorded: tuple[RunResult, Recording]) -> None:
-    _, recording = recorded
+def test_signals_are_what_the_levels_wrote(recording: Recording) -> None:
     goals = recording.signal("upper.command", "goal")
     # Each goal is one more than the count that the level below had reached: the status of the cycle before.
     assert goals[0] == 1
@@ -64,8 +59,9 @@ def test_signals_are_what_the_levels_wrote(recorded: tuple[RunResult, Recording]
     assert np.array_equal(visible_at, ticks + 4)
 
 
-def test_recording_changes_nothing_in_a_run(small: Path, rack_name: str, recorded: tuple[RunResult, Recording]) -> None:
-    assert run(small, rack_name, None).outcome.digest == recorded[0].outcome.digest
+def test_recording_changes_nothing_in_a_run(small: Path, rack_name: str, recording: Recording) -> None:
+    unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, Display())
+    assert unrecorded.outcome.digest == report_of(recording)["digest"]
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from rack.tools.runs.spool import SPOOL, mend
 from rack.tools.runs.window import executable
 from rack.tools.viewer.reading import read
 from tests.processes import children_of
+from tests.shared_runs import small_run
 
 WATCHDOG_S = 30.0
 FIRST_BLOCK = 400
@@ -74,11 +75,10 @@ def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
     assert sink.blocks == 2
 
 
-def test_a_rack_without_an_arm_is_recorded_too(config: RackConfig, tmp_path: Path) -> None:
-    run_rack(config, 3.0, tmp_path / "run", Display())
-    recording = Recording(tmp_path / "run")
+def test_a_rack_without_an_arm_is_recorded_too(tmp_path_factory: pytest.TempPathFactory) -> None:
+    recording = Recording(small_run(tmp_path_factory))
     for field, mailbox in (("count", "lower.status"), ("goal", "upper.command")):
-        rows = read(tmp_path / "run" / "run.rrd", f"/signals/{mailbox}/{field}")
+        rows = read(recording.folder / "run.rrd", f"/signals/{mailbox}/{field}")
         assert np.array_equal(rows.values.ravel(), recording.signal(mailbox, field))
         assert np.array_equal(rows.ticks, recording.signal(mailbox, "tick"))
 

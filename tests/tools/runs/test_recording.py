@@ -11,15 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rack.boards.config import load
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.report import write_report
 from rack.tools.charts.gantt import subject_of
 from rack.tools.console.answer import Failure
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
-from tests.conftest import SMALL
+from tests.shared_runs import small_run
 
 READERS: tuple[Callable[[Path], object], ...] = (
     write_report,
@@ -36,11 +33,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recording")
-    (folder / "small.toml").write_text(SMALL)
-    config = load(folder / "small.toml", [f"name=recording-{folder.parent.name}"])
-    assert run_rack(config, 1.0, folder / "run", Display()).recording == "complete"
-    return folder / "run"
+    return small_run(tmp_path_factory)
 
 
 @pytest.fixture

@@ -11,23 +11,16 @@ from rerun.chunk import RrdReader
 
 from rack.boards.config import load, loads
 from rack.levels.robot.cell import STATE, Cell, build_cell
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 from rack.tools.runs.window import executable
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
-
-SECONDS = 6.5
-"""The first way is planned, and some of it gone."""
+from tests.shared_runs import NASREM_S, nasrem_run
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    folder = tmp_path_factory.mktemp("run")
-    config = load("nasrem", [f"name=viewer-{folder.parent.name}", "clock.mode=lockstep"])
-    assert run_rack(config, SECONDS, folder, Display()).recording == "complete"
-    return Recording(folder)
+    return Recording(nasrem_run(tmp_path_factory))
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +104,7 @@ def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
 
 
 def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> None:
-    end_ns = round(SECONDS * 1e9)
+    end_ns = round(NASREM_S * 1e9)
     for chunk in RrdReader(str(run.folder / "run.rrd")).stream().filter(is_static=False).to_chunks():
         if chunk.entity_path.startswith("/__"):
             continue
@@ -155,7 +148,7 @@ def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
 def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
     try:
         with opened(run.folder / "run.rrd") as screen:
-            look = screen.look(at_s=SECONDS - 0.5)
+            look = screen.look(at_s=NASREM_S - 0.5)
     except NoViewerError as error:
         pytest.skip(str(error))
     assert look.complaints == ()

@@ -1,0 +1,61 @@
+"""Recorded runs that several files of tests read: each is made once in a session, by the worker that needs it first."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import load
+from rack.tools.runs.display import Display
+from rack.tools.runs.launch import run_rack
+from tests.conftest import SMALL
+
+SMALL_S = 4.0
+SLOW_RATES = ("board.upper.rate_hz=10", "board.lower.rate_hz=80")
+"""Cycles of 40 and 5 ticks."""
+SLOW_S = 5.0
+NASREM_S = 6.5
+"""The first path is planned, and part of it driven."""
+
+
+def small_run(factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of a run in lockstep of the small rack, `SMALL_S` long."""
+    return _copy(factory, "small", SMALL_S)
+
+
+def slow_run(factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of a run in lockstep of the small rack at `SLOW_RATES`, `SLOW_S` long."""
+    return _copy(factory, "slow", SLOW_S, SLOW_RATES)
+
+
+def nasrem_run(factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of a run in lockstep of the NASREM rack, `NASREM_S` long."""
+    return _copy(factory, "nasrem", NASREM_S, ("clock.mode=lockstep",))
+
+
+def _copy(factory: pytest.TempPathFactory, name: str, seconds: float, settings: Sequence[str] = ()) -> Path:
+    """Return a copy of the run `name`: its readers write reports and pictures into the folder."""
+    base = factory.getbasetemp()
+    # Each worker of pytest-xdist has a folder of its own in the session's.
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    made = base / f"shared-{name}"
+    with (base / f"shared-{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.is_dir():
+            _run(factory.mktemp(name), name, seconds, settings).rename(made)
+    return Path(shutil.copytree(made, factory.mktemp(name) / "run"))
+
+
+def _run(folder: Path, name: str, seconds: float, settings: Sequence[str]) -> Path:
+    config: Path | str = name
+    if name != "nasrem":
+        config = folder / "small.toml"
+        config.write_text(SMALL)
+    rack = load(config, [f"name=test-shared-{name}-{os.getpid()}", *settings])
+    assert run_rack(rack, seconds, folder / "run", Display()).recording == "complete"
+    return folder / "run"
