@@ -176,7 +176,7 @@ def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Ite
     head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "residual p50", "residual min"]
     yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50"))
     yield ""
-    yield "planners: the same for a plan's time slice, and the age of plans when they are read, ms"
+    yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
     head = ["partition", "level", "slice", "predicted", "plans", "late", "residual p50", "residual min"]
     yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
 

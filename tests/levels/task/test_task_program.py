@@ -58,7 +58,7 @@ def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> Non
     ("action", "line"),
     [
         ({"do": "fly"}, 'task.action[0].do = "fly": permitted: transfer, goto, home'),
-        ({"object": "peg"}, "task.action[0].do: missing; it says what kind of table this is"),
+        ({"object": "peg"}, "task.action[0].do: missing; it selects the kind of table"),
         (
             {"do": "transfer", "object": "cup", "to": [0.5, 0.3, 0.5]},
             'task.action[0].object = "cup": not in the scene; objects: block1, block2, peg',
