@@ -12,6 +12,8 @@ with its `Verdict` for input ports. A program that looks into a running rack nee
 - `open_writer` and `open_reader` open a mailbox under its protocol; `open_observer` never takes its lock.
 - `SystemClock` reads the clock; `Alarm` lists the kinds of alarms; `Demand` is the demand of safety on the arm.
 - `BackplaneError` is the root of all errors of this package.
+
+Names are imported on first use: numpy takes a tenth of a second, which `rack list` and the like need not wait for.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
 from rack.backplane.errors import SegmentError
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, TaskSpec
 from rack.backplane.process import is_alive, start_time
-from rack.backplane.words import Block, Head, System
+from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 4
@@ -165,6 +165,11 @@ class Segment:
         """Whether the process that made the segment, of any version, still runs."""
         words = self.words
         return words[Head.MAGIC] == MAGIC and is_alive(words[Head.LAUNCHER_PID], words[Head.LAUNCHER_START])
+
+    @property
+    def run_is_over(self) -> bool:
+        """Whether the run has ended, in order or with its launcher."""
+        return self.words[System.STATE] == Run.STOPPED or not self.launcher_is_alive
 
     @property
     def has_its_name(self) -> bool:

@@ -32,7 +32,7 @@ def estop(rack: RackName, reset: Reset = False, as_json: Json = False) -> None:
     """
     segment = Segment.attach(rack)
     words, lines = segment.words, UtilityLines(segment)
-    if words[System.STATE] == Run.STOPPED or not segment.launcher_is_alive:
+    if segment.run_is_over:
         raise Failure(f"rack '{rack}': its run is over")
     if reset:
         lines.reset_emergency_stop()

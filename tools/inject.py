@@ -97,7 +97,7 @@ def inject(
         given: dict[str, Any] = {"board": board, "kind": kind, "for": lasts, "cycles": cycles, "mailbox": mailbox}
         given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
         answer = live.inject({**given, **_values(parameters or [])}, wait, timeout)
-    print_answer(answer, answer["told"], as_json)
+    print_answer(answer, answer["message"], as_json)
 
 
 def _values(parameters: list[str]) -> dict[str, str]:

@@ -70,7 +70,7 @@ class InputPorts:
         return sum([statistics.corrupt for statistics in self._statistics])
 
     def basis(self, port: str, tick: int) -> int:
-        """Return the tick of the oldest information behind a port's message; `tick` if there is no message."""
+        """Return the tick of the oldest information that a port's message rests on; `tick` if there is no message."""
         reader = self.readers.get(port)
         return reader.basis if reader is not None and reader.serial else tick
 
@@ -121,8 +121,8 @@ class OutputPorts:
     def write(self, tick: int, now: int, inputs: InputPorts) -> bool:
         """Write every mailbox; return False if a message was too late.
 
-        Each message carries the tick of the oldest information behind it: a command that of the command it follows, a
-        status that of the status below it. This makes the response time of the whole system measurable.
+        Each message carries the tick of the oldest information that it rests on. A command inherits the tick of the
+        command that it follows, a status that of the status below. So the system's response time can be measured.
         """
         in_time = True
         for port, writer, write in self._lines:

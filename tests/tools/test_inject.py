@@ -90,7 +90,7 @@ def test_a_fault_with_a_condition_is_armed_and_can_be_withdrawn(running: str) ->
     number = answer["fault"]
     assert answer["waits_for"] == "watch.status.state == error"
     armed = f"armed, waits for {answer['waits_for']}; to withdraw it: rack inject {running} --withdraw {number}"
-    assert answer["told"] == f"mute of watch: {armed}"
+    assert answer["message"] == f"mute of watch: {armed}"
     entry = FaultTable(Segment.attach(running)).entries[number]
     assert rack("inject", running, "--withdraw", str(number)).stdout == "mute of watch: withdrawn\n"
     assert entry.stage == Stage.FREE

@@ -8,6 +8,7 @@ of their own while they are being imported. A command with something to finish u
 from __future__ import annotations
 
 import os
+import select
 import signal
 import stat
 import sys
@@ -136,16 +137,18 @@ def _leave_terminal() -> None:
 
 def _kill_family() -> None:
     """Kill every descendant in this session and wait for it; a viewer window has its own session and stays."""
-    family = list(descendants(os.getpid(), os.getsid(0)))
+    family, ends = list(descendants(os.getpid(), os.getsid(0))), select.poll()
+    left = 0
     for pid in family:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
+            ends.register(os.pidfd_open(pid), select.POLLIN)
+            left += 1
     deadline = time.monotonic() + GONE_S
-    while any(Path(f"/proc/{pid}/exe").exists() for pid in family) and time.monotonic() < deadline:
-        # Reap our own children; others are adopted and reaped elsewhere.
-        with suppress(ChildProcessError):
-            os.waitpid(-1, os.WNOHANG)
-        time.sleep(0.002)
+    while left and (ended := ends.poll(max(0.0, deadline - time.monotonic()) * 1000)):
+        for pidfd, _ in ended:
+            ends.unregister(pidfd)
+            left -= 1
 
 
 def descendants(pid: int, session: int | None = None) -> Iterator[int]:

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
-from rack.backplane.words import Run, System
+from rack.backplane.words import System
 from rack.boards.config import loads
 from rack.boards.config.faults import injection
 from rack.boards.config.mistakes import mistakes_of
@@ -61,7 +61,7 @@ class LiveRack:
             self._await_begin(entry)
         if wait:
             self._await_end(entry, timeout_s)
-        return {**self._document(entry), "told": self._state(entry)}
+        return {**self._document(entry), "message": self._state(entry)}
 
     def withdraw(self, number: int) -> dict[str, Any]:
         """Withdraw a fault that waits for its tick or condition; return it as plain data. Raises `Failure`."""
@@ -77,7 +77,7 @@ class LiveRack:
         self._wait_until(lambda: words[System.TICK] > tick + 1, BEGIN_S)
         if not self._table.free(entry):
             raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
-        return {**answer, "stage": "free", "told": f"{answer['text']}: withdrawn"}
+        return {**answer, "stage": "free", "message": f"{answer['text']}: withdrawn"}
 
     def faults(self) -> list[dict[str, Any]]:
         """Return the faults injected so far, as plain data."""
@@ -178,4 +178,4 @@ class LiveRack:
 
     @property
     def _is_over(self) -> bool:
-        return self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
+        return self._segment.run_is_over

@@ -15,7 +15,7 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
-from rack.backplane.words import Run, System
+from rack.backplane.words import System
 from rack.tools.runs.spool import Frame, RunFiles, Spool
 from rack.tools.runs.steal import StealMeter
 
@@ -129,7 +129,7 @@ class Recorder:
         watched = [] if until is None else [until]
         while not select.select(watched, [], [], period_s)[0]:
             self.drain()
-            over = self._words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
+            over = self._segment.run_is_over
             if self._is_stopped or (until is None and over):
                 break
         self.drain()

@@ -16,7 +16,7 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
 from rack.backplane.segment import Segment
-from rack.backplane.words import Run, System
+from rack.backplane.words import System
 from rack.boards.config import loads
 from rack.boards.config.commands import asked, commandable, describe, message_of, request
 from rack.boards.errors import ConfigError, Mistake
@@ -228,4 +228,4 @@ class _Patience:
     @property
     def is_in_vain(self) -> bool:
         """Whether the run is over."""
-        return self._words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive
+        return self._segment.run_is_over

@@ -13,7 +13,7 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Run, System
+from rack.backplane.words import Block, System
 from rack.boards.config.commands import describe
 from rack.boards.events import Event
 from rack.levels.operator import Answer, Operation
@@ -78,7 +78,7 @@ class Holds:
 
     def look(self) -> tuple[Hold, ...]:
         """Return the holds now, the arm's first; none once the run is over."""
-        if self._segment.words[System.STATE] == Run.STOPPED or not self._segment.launcher_is_alive:
+        if self._segment.run_is_over:
             return ()
         shown: list[str] = []
         held = (hold for level in self._statuses for hold in self._held(level))

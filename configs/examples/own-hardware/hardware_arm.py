@@ -1,4 +1,4 @@
-"""An arm of one's own behind the servo level: hardware in place of MuJoCo."""
+"""Arm hardware of your own: the servo level drives it instead of MuJoCo."""
 
 from __future__ import annotations
 

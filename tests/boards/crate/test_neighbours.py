@@ -80,14 +80,7 @@ def test_a_board_without_a_core_setting_moves_to_a_free_core(config: MakeConfig,
 def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_path: Path, policy: str) -> None:
     path = tmp_path / "config.toml"
     path.write_text(config(*FIFO, f"clock.on_no_realtime={policy}", text=PLAIN).text())
-    command = [
-        "setpriv",
-        "--bounding-set",
-        "-sys_nice",
-        "--inh-caps",
-        "-sys_nice",
-        *RACK,
-    ]
+    command = ["setpriv", "--bounding-set", "-sys_nice", "--inh-caps", "-sys_nice", *RACK]
     words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
     done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
     printed = done.stderr if policy == "refuse" else done.stdout
