@@ -63,8 +63,8 @@ from rack.backplane.words import Demand
 from rack.levels.operator import Commands
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 
-__all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Pace", "Planner", "Ports"]
-__all__ += ["Program", "Reading", "Verdict"]
+__all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
+__all__ += ["Ports", "Program", "Reading", "Verdict"]
 
 
 class Input(NamedTuple):
@@ -74,6 +74,15 @@ class Input(NamedTuple):
     source: str
     """A mailbox ("world.model"), or relative to the level: "above.command", "below.status", "own.plan". A config may
     wire the port elsewhere."""
+
+
+class Output(NamedTuple):
+    """A port that a level does not write in every cycle."""
+
+    type: MessageType
+    cycles: int
+    """Written in every n-th cycle: the one whose release is a multiple of n cycles' ticks. If that cycle is missed,
+    the message is missing too."""
 
 
 class Ports(SimpleNamespace):
@@ -151,7 +160,7 @@ class Executor(ABC):
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {}
-    outputs: ClassVar[Mapping[str, MessageType]] = {}
+    outputs: ClassVar[Mapping[str, MessageType | Output]] = {}
     faults: ClassVar[tuple[type, ...]] = ()
     """Classes of steps by which faults can strike what the level drives: see `rack.levels.faults`."""
     commands: ClassVar[Commands] = {}
@@ -168,6 +177,10 @@ class Executor(ABC):
         self.demand = Demand.NONE  # stop that the rack's safety demands of the arm in this cycle
         self.findings: list[Finding] = []  # faults found in this cycle, once per episode: the board raises alarms
         self.acted: list[int] = []  # indices, in the injected sequence, of the faults that acted in this cycle
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load what every process of the level needs, as compiled code, once: the crate calls this before it forks."""
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""
@@ -199,6 +212,10 @@ class Planner(ABC):
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load what every process of the level needs, as compiled code, once: the crate calls this before it forks."""
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
