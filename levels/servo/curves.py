@@ -52,10 +52,11 @@ def set_motion(table: Array, duration_s: float, ends_s: float, time_s: float, mo
         motion[1:] = 0.0
         return
     h, u = duration_s, time_s / duration_s
-    c0, c1, c2, c3, c4, c5 = table[0], table[1], table[2], table[3], table[4], table[5]
-    motion[0] = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
-    motion[1] = (c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
-    motion[2] = (2.0 * c2 + u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5))) / (h * h)
+    for j in range(table.shape[1]):
+        c0, c1, c2, c3, c4, c5 = table[0, j], table[1, j], table[2, j], table[3, j], table[4, j], table[5, j]
+        motion[0, j] = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
+        motion[1, j] = (c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
+        motion[2, j] = (2.0 * c2 + u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5))) / (h * h)
 
 
 class Bridge(Curve):
