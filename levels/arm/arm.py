@@ -21,6 +21,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
 
 PATIENCE_CYCLES = 2
@@ -76,6 +77,7 @@ class Arm(ABC):
         self.violations = 0  # steps in which the drives broke a limit of position, velocity or torque
         self.pushed = 0  # steps in which a blow pushed a joint beyond a limit of position or velocity
         self.first_violation = ""  # the first violation, readable: which limit, by how much, and when
+        self.dynamics = Dynamics(cell)  # for the level that drives the arm; one that senses exactly shares it with it
         self._data = cell.start()
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
 

@@ -13,6 +13,7 @@ from rack.levels.algebra import Array, norm
 from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
+from rack.levels.arm.substeps import advance, substeps
 from rack.levels.level import Finding
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -33,12 +34,14 @@ class SimulatedArm(Arm):
     def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
         self._model, self._clock_ns = cell.model, clock_ns
-        self._substeps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
+        self._steps = substeps(cell, self._data, round(clock_ns * 1e-9 / cell.model.opt.timestep))
+        self._advance = advance.load()
         dynamics = Dynamics(cell)
-        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
+        known = self.dynamics.newest
+        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics, known)
         self._brake = Brake(cell.limits.acceleration, dynamics, cell.home)
         self._contacts = ContactMonitor(cell)
-        self._limits = LimitMonitor(cell, self._data, self._substeps)
+        self._limits = LimitMonitor(cell, self._steps)
         self._most: Array | None = None  # (joints,), N m: torques of weakened motors
         obstacles = zip(cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True)
         self._motions = [
@@ -46,7 +49,7 @@ class SimulatedArm(Arm):
             for mocap, body, name in obstacles
         ]
         joints = len(cell.qpos)
-        self._true = (np.zeros(joints), np.zeros(joints))  # position and velocity
+        self._qpos, self._qvel = self._data.qpos, self._data.qvel
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._struck = 0  # ticks for which the motion is still blamed on a blow
         self._sound = np.zeros(mujoco.mj_stateSize(cell.model, STATE))  # MuJoCo's state before the tick
@@ -71,21 +74,18 @@ class SimulatedArm(Arm):
 
     def sense(self) -> Sensed:
         """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
-        d, cell = self._data, self.cell
+        cell = self.cell
         position, velocity = self._state()
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
         if cell.gripper_qpos is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
-        opening, speed = float(d.qpos[cell.gripper_qpos]), float(d.qvel[cell.gripper_dof])
-        return Sensed(position, velocity, opening, speed, self.tick)
+        opening, speed = self._qpos[cell.gripper_qpos], self._qvel[cell.gripper_dof]
+        return Sensed(position, velocity, float(opening), float(speed), self.tick)
 
     def _state(self) -> tuple[Array, Array]:
-        """Return true joint positions and velocities, rad, rad/s. Valid until the next call."""
-        position, velocity = self._true
-        np.take(self._data.qpos, self.cell.qpos, out=position)
-        np.take(self._data.qvel, self.cell.dof, out=velocity)
-        return position, velocity
+        """Return true joint positions and velocities, rad, rad/s."""
+        return self._qpos[self.cell.qpos], self._qvel[self.cell.dof]
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and give torques and gripper force for the coming torque cycle; see `Link.drive`."""
@@ -117,7 +117,7 @@ class SimulatedArm(Arm):
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time continues."""
-        self._contacts.struck = None
+        self._contacts.struck = self.contact = None
         for _ in range(ticks):
             if self.waited >= self.patience:
                 self._engage()
@@ -129,7 +129,6 @@ class SimulatedArm(Arm):
                 self._simulate()
             self.tick += 1
             self._data.time = self._now_s
-        self._count()
 
     def _count(self) -> None:
         """Take over the monitors' counts."""
@@ -179,24 +178,33 @@ class SimulatedArm(Arm):
         self._given = True
 
     def _simulate(self) -> None:
-        """Simulate one tick; on a fault, restore the state before it."""
+        """Simulate one tick."""
         m, d = self._model, self._data
         mujoco.mj_getState(m, d, self._sound, STATE)
         for mocap, motion in self._motions:
             d.mocap_pos[mocap] = motion.position(self._now_s)
-        touches = self._contacts.count
-        for substep in range(self._substeps):
-            mujoco.mj_step(m, d)
-            self._contacts.look(d, d.time)
-            self._limits.look(substep)
-        if self._contacts.count > touches and self._contacts.struck is not None:
+        step, touches, sound = 0, self._contacts.count, True
+        while step < len(self._steps.seen):
+            step = self._advance(step, *self._steps)
+            if step < 0:
+                step, sound = -step, False
+                self._contacts.look(d, d.time)
+        if sound:
+            self._struck = max(self._struck - 1, 0)
+        else:
+            self._judge(self._contacts.count > touches)
+
+    def _judge(self, touched: bool) -> None:
+        """Judge a tick of which a step was not as it should be; on a fault, restore the state before the tick."""
+        if touched and self._contacts.struck is not None:
             self._struck = STRUCK_TICKS
         broken = self._limits.judge(self._now_s, self._struck > 0)
         if self._struck:
             self._struck = STRUCK_TICKS if broken else self._struck - 1
         self.fault = self._broken()
         if self.fault:
-            mujoco.mj_setState(m, d, self._sound, STATE)
+            mujoco.mj_setState(self._model, self._data, self._sound, STATE)
+        self._count()
 
     def _broken(self) -> str:
         """Return the fault of the simulation; empty: none."""

@@ -154,10 +154,7 @@ def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArra
     """Return the pairs of geoms, (n, 2), in unintended contact; `touch` is that of `Cell`."""
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
-    suspects = touch[pairs[:, 0], pairs[:, 1]]
-    if not np.count_nonzero(suspects):  # the usual case, at every substep
-        return pairs[:0]
-    return np.asarray(pairs[suspects & (contact.dist < 0.0)])
+    return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0.0)])
 
 
 def start_qpos(cell: Cell) -> NDArray[np.float64]:

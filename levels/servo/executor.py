@@ -50,7 +50,7 @@ class ServoExecutor(Executor):
         self._faulty = FaultyLink(self.arm, cell, every, self.acted)
         self._link: Link = self.arm  # the path to the arm; through `_faulty` while faults are injected
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)  # set points, interpolated
-        self._loop = ComputedTorque(cell, params)
+        self._loop = ComputedTorque(cell, params, self.arm.dynamics)
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
