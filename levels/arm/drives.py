@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import daqp
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.levels.algebra import Array, cholesky_solve, mat_vec, solve
 from rack.levels.compiled import compiled
-from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Evaluated
+from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
 from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
 
 STANDSTILL = 0.01
@@ -54,16 +56,16 @@ class LimitGate:
     nearly always, one rough prediction shows that nothing is to be cut.
     """
 
-    def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics, known: Evaluated) -> None:
-        """Predict with `dynamics`, or with what is `known` already, if that is of the same state."""
+    def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
         self._torque = bounds.torque
         self._fastest = SPEED_PART * bounds.velocity
         self._low = bounds.position[:, 0] + RANGE_KEPT_RAD
         self._high = bounds.position[:, 1] - RANGE_KEPT_RAD
         self._braking = braking
         self._period_s = period_s
-        self._dynamics, self._known = dynamics, known
-        self._limits = np.stack((self._torque, self._fastest, self._low, self._high, braking, dynamics.dry))
+        self._dynamics = dynamics
+        limits = np.stack((self._torque, self._fastest, self._low, self._high, braking, dynamics.dry))
+        self.clearance = limits, period_s  # for `is_clear`
         self._is_clear = is_clear.load()
         joints = len(braking)
         self._inertia, self._resisting = np.eye(joints), np.zeros(joints)
@@ -75,14 +77,13 @@ class LimitGate:
 
         `torque` must be finite.
         """
-        if self._is_clear(torque, q, qd, *self._known, self._limits, self._period_s):
+        self._dynamics.terms(q, qd)
+        if self._is_clear(torque, *self._dynamics.newest, *self.clearance):
             return torque, False
         passed: Array = np.clip(torque, -self._torque, self._torque)
         least = -self._speed_towards(q - self._low, -qd) - qd
         most = self._speed_towards(self._high - q, qd) - qd
         gain = np.clip(self._gain(passed, q, qd), least, most)
-        if self._is_clear(torque, q, qd, *self._dynamics.newest, self._limits, self._period_s):
-            return torque, False
         # Light joints change speed so much within a cycle that only its middle predicts where it ends.
         gain = self._gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
         if (gain < least).any() or (gain > most).any():
@@ -114,26 +115,22 @@ class LimitGate:
 @compiled
 def is_clear(
     torque: Array,
-    q: Array,
-    qd: Array,
-    state: Array,
+    state: Array,  # (2, joints), rad and rad/s
     inertia: Array,
     bias: Array,
-    limits: Array,
+    limits: Array,  # (6, joints): see `LimitGate`
     period_s: float,
 ) -> bool:
-    """Return whether `torque` leads nowhere near a limit, by an equation of motion that was evaluated at `state`.
+    """Return whether `torque` leads nowhere near a limit, by the equation of motion at `state`.
 
     It does not if the velocity stays within its bounds at no gain as at twice the gain predicted, with some room: more
     than inertia and bias change in a cycle.
     """
-    most_torque, fastest, low, high, braking, dry = limits
-    for joint in range(len(q)):
-        same = state[0, joint] == q[joint] and state[1, joint] == qd[joint]
-        if not (same and abs(torque[joint]) <= most_torque[joint]):
-            return False
+    (q, qd), (most_torque, fastest, low, high, braking, dry) = state, limits
     left = torque - bias
     for joint in range(len(q)):
+        if not abs(torque[joint]) <= most_torque[joint]:
+            return False
         left[joint] -= dry[joint] * math.tanh(qd[joint] / FRICTION_SPEED)
     twice = cholesky_solve(inertia, left) * (2.0 * period_s)
     for joint in range(len(q)):
@@ -142,6 +139,51 @@ def is_clear(
         most = speed_towards(high[joint] - q[joint], qd[joint], speed, hard, period_s) - qd[joint] - room
         if not (least <= 0.0 <= most and least <= twice[joint] <= most):
             return False
+    return True
+
+
+class Motors(NamedTuple):
+    """More arguments of `give`."""
+
+    joints: NDArray[np.int64]  # (2, joints): their addresses in qpos and in qvel
+    actuators: NDArray[np.int64]  # (joints,), in ctrl
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    brakes: Array  # (nv,), N m
+    command: Array  # (joints,), N m: the torque as commanded, and as given
+    given: Array
+
+
+@compiled
+def give(
+    torque: Array,
+    state: Array,  # this and the next as for `is_clear`, evaluated at any state
+    inertia: Array,
+    bias: Array,
+    limits: Array,
+    period_s: float,
+    joints: NDArray[np.int64],  # this and the next: see `Motors`
+    actuators: NDArray[np.int64],
+    qpos: Array,
+    qvel: Array,
+    ctrl: Array,
+    brakes: Array,
+    command: Array,
+    given: Array,
+) -> bool:
+    """Give `torque` to the motors, and none to the brakes, if it is clear; return whether it is.
+
+    The usual case in one call: the equation of motion has been evaluated at the arm's present state, for its controller.
+    """
+    for joint in range(len(torque)):
+        if not (state[0, joint] == qpos[joints[0, joint]] and state[1, joint] == qvel[joints[1, joint]]):
+            return False
+    if not is_clear(torque, state, inertia, bias, limits, period_s):
+        return False
+    for joint in range(len(torque)):
+        command[joint] = given[joint] = ctrl[actuators[joint]] = torque[joint]
+        brakes[joints[1, joint]] = 0.0
     return True
 
 

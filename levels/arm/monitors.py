@@ -70,13 +70,13 @@ class ContactMonitor:
         self.first = ""  # the first one, readable: which geoms, and when
         self.struck: tuple[int, int] | None = None  # geoms of the newest one of arm or load since last cleared
 
-    def look(self, data: mujoco.MjData, time_s: float) -> None:
-        """Count the unintended contacts of one step at simulated `time_s`."""
+    def look(self, data: mujoco.MjData) -> None:
+        """Count the unintended contacts of the last step."""
         pairs = unintended_contacts(data, self._touch)
         if not len(pairs):
             return
         if not self.first:
-            self.first = f"unintended contact: {self.named(pairs[0])} at {time_s:.3f} s"
+            self.first = f"unintended contact: {self.named(pairs[0])} at {data.time:.3f} s"
         self.count += len(pairs)
         ours = pairs[(self._arm | self._held(data))[pairs].any(axis=1)]
         if len(ours):

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
-from rack.levels.robot.cell import Cell
-from rack.levels.robot.engine import contact_views, mj_step
+from rack.levels.robot.cell import STATE, Cell
+from rack.levels.robot.engine import contact_views, mj_get_state, mj_step
+
+WHOLE = int(STATE)
 
 
 class Substeps(NamedTuple):
@@ -19,6 +21,7 @@ class Substeps(NamedTuple):
 
     model: int  # address
     data: int  # address
+    before: Array  # (state,): MuJoCo's state before the tick
     warnings: NDArray[np.int32]  # (kinds,), how often MuJoCo has raised each
     qpos: Array
     qvel: Array
@@ -41,6 +44,7 @@ def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
     return Substeps(
         cell.model._address,
         data._address,
+        np.zeros(mujoco.mj_stateSize(cell.model, STATE)),
         data.warning.number,
         data.qpos,
         data.qvel,
@@ -59,6 +63,7 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     begin: int,
     model: int,
     data: int,
+    before: Array,
     warnings: NDArray[np.int32],
     qpos: Array,
     qvel: Array,
@@ -77,6 +82,8 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     Returns the number of the step to continue with; negative if the last one made broke a limit, or has an unintended
     contact, a warning, or a state that is not finite.
     """
+    if begin == 0:
+        mj_get_state(model, data, before.ctypes.data, WHOLE)
     for step in range(begin, len(seen)):
         mj_step(model, data)
         sound = True
