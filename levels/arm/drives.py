@@ -174,7 +174,7 @@ def give(
 ) -> bool:
     """Give `torque` to the motors, and none to the brakes, if it is clear; return whether it is.
 
-    The usual case in one call: the equation of motion has been evaluated at the arm's present state, for its controller.
+    The usual case in one call: the equation of motion has been evaluated, for the controller, at the arm's state.
     """
     for joint in range(len(torque)):
         if not (state[0, joint] == qpos[joints[0, joint]] and state[1, joint] == qvel[joints[1, joint]]):
@@ -208,18 +208,53 @@ class CoarseSensors:
     """
 
     def __init__(self, encoders: Encoders, seed: int) -> None:
-        self._seed = seed
         per_second = np.array([[1.0], [1.0 / EDGE_TIMING_S]])
-        self._noise, self._step = encoders.noise * per_second, encoders.resolution * per_second
-        self._noisy, self._stepped = bool(encoders.noise.any()), self._step > 0.0
-        self._per_step = 1.0 / np.where(self._stepped, self._step, 1.0)
+        self._sensors = seed, encoders.noise * per_second, encoders.resolution * per_second
+        self._sense = sense_coarsely.load()
 
     def sample(self, position: Array, velocity: Array, tick: int) -> Array:
         """Return (2, joints): positions, rad, and velocities, rad/s, of a tick as sensed."""
         sample = np.array((position, velocity))
-        if self._noisy:
-            sample += self._noise * np.random.default_rng((self._seed, tick)).standard_normal(sample.shape)
-        steps = np.rint(sample * self._per_step)
-        steps *= self._step
-        np.copyto(sample, steps, where=self._stepped)
+        self._sense(sample, tick, *self._sensors)
         return sample
+
+
+@compiled
+def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Array) -> None:
+    """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to multiples of `step`."""
+    joints = sample.shape[1]
+    chance = uniform(seed, tick, 2 * joints)
+    for joint in range(joints):
+        # Box and Muller: two independent normal numbers from two uniform ones.
+        length, angle = math.sqrt(-2.0 * math.log(chance[joint])), 2.0 * math.pi * chance[joints + joint]
+        sample[0, joint] += noise[0, joint] * length * math.cos(angle)
+        sample[1, joint] += noise[1, joint] * length * math.sin(angle)
+        for row in range(2):
+            if step[row, joint] > 0.0:
+                sample[row, joint] = np.rint(sample[row, joint] / step[row, joint]) * step[row, joint]
+
+
+@compiled
+def uniform(seed: int, tick: int, count: int) -> Array:
+    """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick alone."""
+    bits = mixed(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
+    bits = mixed(mixed(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
+    return ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+
+
+@compiled
+def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return `bits` mixed as SplitMix64 does (Steele, Lea and Flood, OOPSLA 2014)."""
+    bits = bits + np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    none, square, state, joints = np.zeros(0), np.zeros((0, 0)), np.zeros((2, 0)), np.zeros((2, 0), dtype=int)
+    clearance = state, square, none, np.zeros((6, 0)), 1.0
+    is_clear.load()(none, *clearance)
+    give.load()(none, *clearance, joints, joints[0], *[none] * 6)
+    sense_coarsely.load()(state, 0, 0, state, state)

@@ -13,8 +13,6 @@ from rack.levels.compiled import compiled
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.engine import contact_views, mj_get_state, mj_step
 
-WHOLE = int(STATE)
-
 
 class Substeps(NamedTuple):
     """Arguments of `advance`, prepared once: a cycle has no time for it."""
@@ -83,7 +81,7 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     contact, a warning, or a state that is not finite.
     """
     if begin == 0:
-        mj_get_state(model, data, before.ctypes.data, WHOLE)
+        mj_get_state(model, data, before.ctypes.data, STATE)
     for step in range(begin, len(seen)):
         mj_step(model, data)
         sound = True
@@ -102,3 +100,13 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
         if not sound:
             return -(step + 1)
     return len(seen)
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    nothing, mask = np.zeros(0), np.zeros((0, 0), dtype=bool)
+    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+    room = contact_views(data.model, data)
+    joints, table, warnings = np.zeros((2, 0), dtype=int), np.zeros((0, 3, 0)), data.warning.number
+    arrays = nothing, nothing, nothing, nothing, joints, table, table
+    advance.load()(1, 0, 0, nothing, warnings, *arrays, *room, mask)

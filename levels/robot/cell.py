@@ -18,7 +18,7 @@ from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.tables import RobotConfig, SceneConfig
 
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything the next step depends on: a simulation restored from it continues bit for bit."""
 
 

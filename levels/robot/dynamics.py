@@ -164,3 +164,13 @@ def carry(
             loaded_bias[joint] += force * acceleration
             for other in range(count):
                 loaded_inertia[joint, other] += force * jacobian[joints[1, other]]
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    data, joints, none, square = mujoco.MjData(model), np.zeros((2, 0), dtype=int), np.zeros(0), np.zeros((0, 0))
+    at, state, place = (model._address, data._address, joints), np.zeros((2, 0)), np.zeros(3)
+    evaluate.load()(state, *at, none, none, none, none, square, state, square, none)
+    jacobians = np.zeros((2, 3, 0))
+    carry.load()(0.0, place, *at, 0, place, np.zeros(9), place, jacobians, state, square, none, square, none)
