@@ -110,13 +110,13 @@ def evaluate(
     bias: Array,
 ) -> None:
     """Evaluate `inertia` and `bias` at the state `wanted`, (2, joints); `joints` are addresses in `qpos` and `qvel`."""
-    if (wanted == state).all():
-        return
-    state[:] = wanted
-    count = joints.shape[1]
+    count, same = joints.shape[1], True
     for joint in range(count):
-        qpos[joints[0, joint]] = wanted[0, joint]
-        qvel[joints[1, joint]] = wanted[1, joint]
+        same &= state[0, joint] == wanted[0, joint] and state[1, joint] == wanted[1, joint]
+        state[0, joint] = qpos[joints[0, joint]] = wanted[0, joint]
+        state[1, joint] = qvel[joints[1, joint]] = wanted[1, joint]
+    if same:
+        return
     mj_fwd_position(model, data)
     mj_fwd_velocity(model, data)
     mj_full_m(model, data, full.ctypes.data)
@@ -153,7 +153,10 @@ def carry(
     mj_jac(model, data, jacobians[0].ctypes.data, 0, centre.ctypes.data, hand)
     mj_jac_dot(model, data, jacobians[1].ctypes.data, 0, centre.ctypes.data, hand)
     count = joints.shape[1]
-    loaded_inertia[:], loaded_bias[:] = inertia, bias
+    for joint in range(count):
+        loaded_bias[joint] = bias[joint]
+        for other in range(count):
+            loaded_inertia[joint, other] = inertia[joint, other]
     for axis in range(3):
         jacobian, change = jacobians[0, axis], jacobians[1, axis]
         acceleration = -gravity[axis]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm
+from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
 from rack.levels.arm.faulty import STEPS
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
@@ -61,6 +61,11 @@ class ServoExecutor(Executor):
         self._wanted = Motion(cell.home, self._rest, self._rest)  # motion wanted in the last cycle: rad, rad/s, rad/s2
         self._started = False  # the first cycle has begun
         self._abandoned = False  # set points were abandoned in the last cycle: the arm was braked
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the arm."""
+        preload()
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
