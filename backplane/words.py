@@ -119,15 +119,15 @@ class Box(IntEnum):
 class Slot(IntEnum):
     """Words in front of every message in its slot.
 
-    The chain covers SERIAL to the end of the message, the CRC also BASIS and EPOCH. The time stamp is in neither, so
-    that equal runs have equal chains.
+    The CRC covers BASIS to the end of the message, and all messages before it: it begins with CHAIN, the CRC of the one
+    before. It does not cover time stamp and writer, so that equal runs have equal CRCs.
     """
 
     STAMP_NS = 0
-    CRC = 1
-    EPOCH = 2
-    BASIS = 3
-    SERIAL = 4
-    TICK = 5
-    VISIBLE_AT = 6
-    CHAIN = 7
+    EPOCH = 1
+    CHAIN = 2
+    CRC = 3
+    BASIS = 4
+    SERIAL = 5
+    TICK = 6
+    VISIBLE_AT = 7

@@ -8,16 +8,15 @@ Memory order: the one writer fills the slot before it stores the head's serial. 
 order. On weaker machines a reader may see the serial first: its copy then fails the CRC, or holds another serial, and
 the read steps back to the message before. Words are aligned to 8 bytes, so they are never torn.
 
-Why a chained hash as well as a CRC: the CRC covers one message and tells a reader, in well under a microsecond, whether
-its copy is whole and undamaged. The hash covers this message and the hash before it, so the newest one stands for all
-that was ever written: one comparison shows whether two runs are equal (`history.digest`). It is longer than a CRC, so
-that no two runs agree by chance, and omits epoch and basis, which are not content. No reader checks it.
+Each CRC begins where that of the message before it ended. So it tells a reader, well under a microsecond, whether its
+copy is whole and undamaged; and it stands for all that was ever written, so that one comparison shows whether two runs
+are equal (`history.digest`). A CRC finds every difference of up to 32 bits in a row, and misses any other one time in
+2^32. A cryptographic hash besides would cost as much as the rest of a write; nobody forges a run to look like another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from hashlib import blake2b
 from time import monotonic_ns
 from zlib import crc32
 
@@ -29,11 +28,9 @@ from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
-CRC_FROM = Slot.EPOCH * 8
-CHAIN_FROM = Slot.SERIAL * 8
-CHAIN_AT = Slot.CHAIN * 8
+CRC_FROM = Slot.BASIS * 8
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
-_STAMP, _CRC, _EPOCH, _BASIS, _SERIAL, _TICK, _VISIBLE = range(7)
+_STAMP, _EPOCH, _CHAIN, _CRC, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _CLAIMANT = int(Box.CLAIMANT)
 EPOCH_BITS = 32
 EPOCH_MASK = (1 << EPOCH_BITS) - 1
@@ -76,7 +73,8 @@ def _format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
 class Slots:
     """One process's access to the slots of a mailbox: a local `record` and its `message`.
 
-    `record` holds the head's eight words (`words.Slot`), then the message.
+    `record` holds the head's eight words (`words.Slot`), then the message; `words` and `covered` are views of its head
+    and of what the CRC covers. `places` are the slots, `heads` their words.
     """
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
@@ -91,12 +89,10 @@ class Slots:
         self.message = Message(self.dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
-        self._slots = [segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)]
-        self._slot_words = [slot[:SLOT_HEAD_SIZE].cast("q") for slot in self._slots]
-        self._words = self.record[:SLOT_HEAD_SIZE].cast("q")
-        self._crc_part = self.record[CRC_FROM:]
-        self._chain_part = self.record[CHAIN_FROM:]
-        self._chain = self.record[CHAIN_AT:SLOT_HEAD_SIZE]
+        self.places = [segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)]
+        self.heads = [place[:SLOT_HEAD_SIZE].cast("q") for place in self.places]
+        self.words = self.record[:SLOT_HEAD_SIZE].cast("q")
+        self.covered = self.record[CRC_FROM:]
 
     def resume(self, signature: int) -> None:
         """Continue after the newest published message, as a writer."""
@@ -104,10 +100,9 @@ class Slots:
         # A serial may have been lost: the chain continues from the newest message that is in its slot.
         while whole > max(0, head - self.depth) and not self.holds(whole):
             whole -= 1
-        self._words[_SERIAL] = head
-        self._words[_EPOCH] = signature
-        chain = self._slots[whole & self.mask][CHAIN_AT:SLOT_HEAD_SIZE]
-        self._chain[:] = bytes(chain) if whole and self.holds(whole) else bytes(8)
+        self.words[_SERIAL] = head
+        self.words[_EPOCH] = signature
+        self.words[_CRC] = self.heads[whole & self.mask][_CRC] if whole and self.holds(whole) else 0
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an intruder, 0: none.
@@ -115,18 +110,19 @@ class Slots:
         An intruder has published since this writer's last message; its message is overwritten. `damage`: bits of the
         message to flip in the slot.
         """
-        words, box = self._words, self.box
-        serial = words[_SERIAL] + 1
-        intruder = 0 if box[0] == serial - 1 else self._slot_words[serial & self.mask][_EPOCH] >> EPOCH_BITS
+        words, box = self.words, self.box
+        before = words[_SERIAL]
+        serial = before + 1
+        at = serial & self.mask
+        intruder = 0 if box[0] == before else self.heads[at][_EPOCH] >> EPOCH_BITS
         words[_BASIS] = basis
         words[_SERIAL] = serial
         words[_TICK] = tick
         words[_VISIBLE] = visible_at
-        # The word still holds the hash of the message before: it is hashed in, then replaced.
-        self._chain[:] = blake2b(self._chain_part, digest_size=8).digest()
-        words[_CRC] = crc32(self._crc_part)
+        words[_CHAIN] = chain = words[_CRC]
+        words[_CRC] = crc32(self.covered, chain)
         words[_STAMP] = monotonic_ns()
-        self._slots[serial & self.mask][:] = self.record
+        self.places[at][:] = self.record
         if damage:
             self._flip(serial, damage)
         box[0] = serial
@@ -134,17 +130,17 @@ class Slots:
 
     def lose(self) -> None:
         """Publish a serial without filling its slot."""
-        self._words[_SERIAL] += 1
-        self.box[0] = self._words[_SERIAL]
+        self.words[_SERIAL] += 1
+        self.box[0] = self.words[_SERIAL]
 
     def _flip(self, serial: int, bits: Sequence[int]) -> None:
-        message = self._slots[serial & self.mask][SLOT_HEAD_SIZE:]
+        message = self.places[serial & self.mask][SLOT_HEAD_SIZE:]
         for bit in bits:
             message[bit >> 3] ^= 1 << (bit & 7)
 
     def holds(self, serial: int) -> bool:
         """Say whether that serial's slot holds its message, not an older or a newer one."""
-        return self._slot_words[serial & self.mask][_SERIAL] == serial
+        return self.heads[serial & self.mask][_SERIAL] == serial
 
     def keeps(self, serial: int) -> bool:
         """Say whether that serial's slot has not been reused: a copy made before this call is then of that message."""
@@ -152,66 +148,66 @@ class Slots:
 
     def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
         """Return each slot's head, as words, and the part of the slot that its CRC covers."""
-        return [(head, slot[CRC_FROM:]) for head, slot in zip(self._slot_words, self._slots, strict=True)]
+        return [(head, slot[CRC_FROM:]) for head, slot in zip(self.heads, self.places, strict=True)]
 
     def visible_at(self, serial: int) -> int:
         """Return the tick from which the message in that serial's slot may be read."""
-        return self._slot_words[serial & self.mask][_VISIBLE]
+        return self.heads[serial & self.mask][_VISIBLE]
 
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
-        self.record[:] = self._slots[serial & self.mask]
-        return self._words[_SERIAL] == serial and self._words[_CRC] == crc32(self._crc_part)
+        self.record[:] = self.places[serial & self.mask]
+        return self.words[_SERIAL] == serial and self.words[_CRC] == crc32(self.covered, self.words[_CHAIN])
 
     def copy(self, serial: int) -> bool:
         """Copy that serial's slot, without any check, into the local record; False when it was reused meanwhile."""
-        self.record[:] = self._slots[serial & self.mask]
+        self.record[:] = self.places[serial & self.mask]
         return self.keeps(serial)
 
     @property
     def is_sound(self) -> bool:
         """Whether the message in the local record passes its CRC."""
-        return self._words[_CRC] == crc32(self._crc_part)
+        return self.words[_CRC] == crc32(self.covered, self.words[_CHAIN])
 
     @property
     def serial(self) -> int:
         """Serial of the message in the local record; 0: none."""
-        return self._words[_SERIAL]
+        return self.words[_SERIAL]
 
     @property
     def signature(self) -> int:
         """Signature of its writer: see `claim`."""
-        return self._words[_EPOCH]
+        return self.words[_EPOCH]
 
     def is_lawful(self, known: int) -> bool:
         """Say whether that message comes from the writer that holds the claim, or from an earlier holder.
 
         `known` is the signature of the last lawful message, 0 before the first: epochs only rise.
         """
-        signature, holder = self._words[_EPOCH], self.box[_CLAIMANT]
+        signature, holder = self.words[_EPOCH], self.box[_CLAIMANT]
         return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(holder)
 
     @property
     def tick(self) -> int:
         """Release tick of the cycle that wrote that message."""
-        return self._words[_TICK]
+        return self.words[_TICK]
 
     @property
     def visible(self) -> int:
         """Tick from which that message may be read."""
-        return self._words[_VISIBLE]
+        return self.words[_VISIBLE]
 
     @property
     def stamp_ns(self) -> int:
         """When that message was published, CLOCK_MONOTONIC."""
-        return self._words[_STAMP]
+        return self.words[_STAMP]
 
     @property
     def basis(self) -> int:
         """Tick of the oldest information that the message rests on, level by level."""
-        return self._words[_BASIS]
+        return self.words[_BASIS]
 
     @property
-    def chain(self) -> bytes:
-        """Running hash over this and every earlier message of the mailbox, 8 bytes."""
-        return bytes(self._chain)
+    def chain(self) -> int:
+        """CRC over this and every earlier message of the mailbox."""
+        return self.words[_CRC]
