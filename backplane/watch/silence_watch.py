@@ -23,9 +23,10 @@ _LOST, _CLAIMANT = int(Block.LOST), int(Box.CLAIMANT)
 
 
 class ReadingTask:
-    """The task that reads: the tick since which it has read without a pause, and which writers are dead or stopped.
+    """The task that reads: the tick `since` which it has read without a pause, and which writers are dead or stopped.
 
-    `troubles` counts its reads that failed or found a bad message.
+    After a pause of this task or of the clock, all messages are old but no writer is silent. `troubles` counts reads
+    that failed or found a bad message.
     """
 
     def __init__(self) -> None:
@@ -37,7 +38,7 @@ class ReadingTask:
         self._gone: dict[int, bool] = {}
 
     def reads(self, tick: int) -> None:
-        """Note a read. After a pause of this task or of the clock, all messages are old but no writer is silent."""
+        """Note a read of a task that does not know how many cycles it skipped."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:

@@ -41,6 +41,7 @@ class VirtualControlLoop(Task):
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
         self._guard = ClockGuard(segment, self.alarms, self.spec.every) if wiring.guards_clock else None
+        self._has_cycled = False
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
         self.read_command_and_status = slowed(self.inputs.read_command_and_status, times.read_ns)
@@ -57,10 +58,11 @@ class VirtualControlLoop(Task):
         """Do the cycle released at `tick`."""
         watch, deadline = self.stopwatch, tick + self.spec.every
         watch.start(tick, self.next_cycle.skipped)
-        if self._guard is not None and watch.is_late:
-            self._guard.check(tick, self.next_cycle.skipped)
-        self.exchange(tick)
-        watch.plan_ns = monotonic_ns()
+        if watch.is_late:
+            self._handle_delay(tick)
+        if self.inputs.reads_plan:
+            self.exchange(tick)
+            watch.plan_ns = monotonic_ns()
         self.read_command_and_status(tick)
         watch.read_ns = monotonic_ns()
         self.process(tick)
@@ -68,6 +70,13 @@ class VirtualControlLoop(Task):
         in_time = self.write_command_and_status(tick, watch.now(deadline))
         watch.end_ns = monotonic_ns()
         watch.finish(in_time, deadline, done=tick)
+
+    def _handle_delay(self, tick: int) -> None:
+        """Note a pause in reading, in the first cycle too; in one that begins late, check the clock."""
+        if self.next_cycle.skipped or not self._has_cycled:
+            self.inputs.task.since, self._has_cycled = tick, True
+        if self._guard is not None:
+            self._guard.check(tick, self.next_cycle.skipped)
 
     def process(self, tick: int) -> None:
         """Let the level process, given the demand on the arm; then report its findings and the faults that acted."""

@@ -27,17 +27,18 @@ class InputPorts:
         self._by_port = self.values.__dict__
         self._plan = [(port, one.read) for port, one in found.items() if mailboxes[port] == plan]
         self._rest = [(port, one.read) for port, one in found.items() if mailboxes[port] != plan]
+        self.reads_plan = bool(self._plan)
         self._statistics = [reader.statistics for reader in self.readers.values()]
         self._counted = self._traffic
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
+        self.task.reads(tick)
         self.exchange(tick)
         self.read_command_and_status(tick)
 
     def exchange(self, tick: int) -> None:
-        """Begin the cycle released at `tick`; if the task reads a plan, transfer it over the bus."""
-        self.task.reads(tick)
+        """Transfer the plan over the bus, as of `tick`."""
         for port, read in self._plan:
             self._by_port[port] = read(tick)
 

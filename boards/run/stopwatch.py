@@ -6,16 +6,17 @@ missed deadlines, skipped releases, failed accesses, and the report to the clock
 
 from __future__ import annotations
 
-from time import monotonic_ns, process_time_ns
+from time import monotonic_ns, thread_time_ns
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import clock_semaphore
 from rack.backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
-from rack.backplane.words import Block
+from rack.backplane.words import Block, System
 from rack.boards.run.ports import InputPorts, OutputPorts
 
 # Plain integers for the hot path.
+_EPOCH = int(System.EPOCH_NS)
 _DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (
     int(Block[name])
     for name in ("DONE", "CYCLES", "MISSED", "SKIPPED", "LEVEL_STATE", "LEVEL_SINCE", "CORRUPT", "BUS_ERRORS")
@@ -33,7 +34,7 @@ class Stopwatch:
 
     def __init__(self, segment: Segment, task: str, inputs: InputPorts, outputs: OutputPorts) -> None:
         self._block = segment.block(task)
-        self._clock = SystemClock(segment)
+        self._words, self._clock = segment.words, SystemClock(segment)
         self._inputs, self._outputs, self._reading = inputs, outputs, inputs.task
         self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
@@ -44,7 +45,9 @@ class Stopwatch:
         self._closed_ns = 0  # end of the bookkeeping of the last cycle
         self._period_ns = self._clock.period_ns
         self._tick = self._skipped = 0
+        self._late_ns = self._period_ns // 2
         self._release_ns = 0  # grid point of the tick; in lockstep the start
+        self.is_late = True  # the cycle began more than half a tick late, or after skipped ones, or is the first
         self.start_ns = 0  # start of the cycle
         self.plan_ns = 0  # the plan has been transferred over the bus (C of fig. 4)
         self.read_ns = 0  # command, status and plan are read (R)
@@ -53,19 +56,16 @@ class Stopwatch:
 
     def begin(self) -> None:
         """Count processor time from here on."""
-        self._processor_ns = process_time_ns()
+        self._processor_ns = thread_time_ns()
 
     def start(self, tick: int, skipped: int) -> None:
         """Begin the cycle released at `tick`, after `skipped` missed releases."""
         self._tick, self._skipped = tick, skipped
-        self.start_ns = self.plan_ns = self._release_ns = monotonic_ns()
+        self.start_ns = self.plan_ns = release_ns = start_ns = monotonic_ns()
         if self._lockstep_clock is None:
-            self._release_ns = self._clock.time_of(tick)
-
-    @property
-    def is_late(self) -> bool:
-        """Whether the cycle began more than half a tick after its release, or releases were skipped."""
-        return self._skipped > 0 or 2 * (self.start_ns - self._release_ns) > self._period_ns
+            release_ns = self._words[_EPOCH] + tick * self._period_ns
+        self._release_ns = release_ns
+        self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
     def now(self, deadline: int) -> int | None:
         """Return the clock's tick once the level has processed; None while tick `deadline` has not come."""
@@ -93,7 +93,7 @@ class Stopwatch:
         if state != self._state:
             self._state = block[_LEVEL_STATE] = state
             block[_LEVEL_SINCE] = tick
-        used, before = process_time_ns(), self._processor_ns
+        used, before = thread_time_ns(), self._processor_ns
         self._processor_ns = used
         self._trace.write(
             tick,
@@ -122,7 +122,7 @@ class Stopwatch:
     def idle(self) -> None:
         """Close a cycle in which a planner had nothing to plan: count it, but do not trace it."""
         # Exclude its processor time from the next plan's record.
-        self._processor_ns = process_time_ns()
+        self._processor_ns = thread_time_ns()
         self._cycles = self._block[_CYCLES] = self._cycles + 1
         self._block[_DONE] = self._tick
         self.notify_clock()
