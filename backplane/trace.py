@@ -46,7 +46,7 @@ class Flag(IntFlag):
     MISSED = 1  # missed its deadline, or wrote a message too late
     SKIPPED = 2  # releases were skipped just before it
     BUS_ERROR = 4  # an access was cut off by its bound
-    CORRUPT = 8  # a message failed its CRC
+    CORRUPT = 8  # a message failed its check
     PLANNED = 16  # the record of a planner's cycle that made a plan
 
 

@@ -84,7 +84,7 @@ class Block(IntEnum):
     READ_BYTES = 11
     WRITES = 12
     WRITE_BYTES = 13
-    CORRUPT = 14  # messages that failed their CRC
+    CORRUPT = 14  # messages that failed their check
     BUS_ERRORS = 15  # accesses cut off by their bound
     TRACE_HEAD = 16  # trace records written
     LEVEL_STATE = 17  # state of the level, as in its status
@@ -119,14 +119,14 @@ class Box(IntEnum):
 class Slot(IntEnum):
     """Words in front of every message in its slot.
 
-    The CRC covers BASIS to the end of the message, and all messages before it: it begins with CHAIN, the CRC of the one
-    before. It does not cover time stamp and writer, so that equal runs have equal CRCs.
+    The checksum covers BASIS to the end of the message and, as it is seeded with CHAIN, the checksum of the message
+    before, all earlier messages. It does not cover time stamp and writer, so that equal runs have equal checksums.
     """
 
     STAMP_NS = 0
     EPOCH = 1
     CHAIN = 2
-    CRC = 3
+    CHECK = 3
     BASIS = 4
     SERIAL = 5
     TICK = 6

@@ -9,13 +9,13 @@ written before the run ends depends on timing.
 from __future__ import annotations
 
 from hashlib import blake2b
-from zlib import crc32
 
 import numpy as np
+from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.mailbox.slots import CRC_FROM, EPOCH_MASK, Slots, epoch_of, message_dtype
+from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_MASK, Slots, epoch_of, message_dtype
 from rack.backplane.ring import Drained, Ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, System
@@ -33,7 +33,7 @@ class MailboxRing(Ring):
         self._box = segment.words[address // 8 : address // 8 + len(Box)]
         memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
         super().__init__(memory, row_dtype(spec), self._box[Box.HEAD : Box.HEAD + 1])
-        self._covered = slice(CRC_FROM, SLOT_HEAD_SIZE + spec.size)
+        self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
     def drain(self) -> Drained:
         """Take every good message written since the last call."""
@@ -47,8 +47,8 @@ class MailboxRing(Ring):
             # The writer does not know of this message, and will write its own in that place.
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
-        crcs = (crc32(part.tobytes(), chain) for part, chain in zip(covered, rows["chain"].tolist(), strict=True))
-        good = lawful & (np.fromiter(crcs, np.int64, len(rows)) == rows["crc"]) & (rows["serial"] == serials)
+        checks = (xxh3(part.tobytes(), chain) >> 1 for part, chain in zip(covered, rows["chain"].tolist(), strict=True))
+        good = lawful & (np.fromiter(checks, np.int64, len(rows)) == rows["check"]) & (rows["serial"] == serials)
         return Drained(rows if good.all() else rows[good], lost)
 
 

@@ -15,7 +15,8 @@ import os
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
-from zlib import crc32
+
+from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
@@ -25,7 +26,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
 # Plain integers for the hot path.
-_EPOCH, _CHAIN, _CRC, _BASIS, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[1:])
+_EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[1:])
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -101,8 +102,8 @@ class Writer:
         """
         due = tick + self._delay
         visible_at = tick + self._shown_after if now is None else self.visible_at(tick, now)
-        written = self.publish(tick, visible_at, tick if basis is None else basis)
-        return written and (now is None or now < due)
+        self.intruder = self._slots.publish(tick, visible_at, tick if basis is None else basis)
+        return now is None or now < due
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick from which a message released at `tick` and written now is visible."""
@@ -206,7 +207,7 @@ class Reader:
         self.statistics.transfers += 1
         words, record = self._words, self._record
         record[:] = self._places[serial & self._mask]
-        if words[_SERIAL] != serial or words[_CRC] != crc32(self._covered, words[_CHAIN]):
+        if words[_SERIAL] != serial or words[_CHECK] != xxh3(self._covered, words[_CHAIN]) >> 1:
             return False
         if words[_EPOCH] != self._signature:
             if not self.slots.is_lawful(self._signature):

@@ -8,7 +8,7 @@ only then is the copy judged.
 
 from __future__ import annotations
 
-from zlib import crc32
+from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept
 from rack.backplane.mailbox.mailbox import Reader
@@ -20,7 +20,7 @@ from rack.backplane.words import Slot
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
 # Plain integers for the hot path.
-_CHAIN, _CRC, _, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[2:])
+_CHAIN, _CHECK, _, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[2:])
 
 
 class ReadFindings:
@@ -111,7 +111,7 @@ class MessageWatch:
             if (
                 head[_SERIAL] == serial
                 and self.newest < released > head[_VISIBLE] - late
-                and (serial == taken or crc32(body, head[_CHAIN]) == head[_CRC])
+                and (serial == taken or xxh3(body, head[_CHAIN]) >> 1 == head[_CHECK])
                 and slots.keeps(serial)
             ):
                 self.newest = released
