@@ -57,10 +57,14 @@ MUTANTS = (
         "checksum",
         "corrupt",
         (
-            (SLOTS, "self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN]) >> 1", "True"),
-            ("backplane/mailbox/mailbox.py", "words[_CHECK] != xxh3(self._covered, words[_CHAIN]) >> 1", "False"),
+            (SLOTS, "self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])", "True"),
+            ("backplane/mailbox/mailbox.py", "check != xxh3(self._covered, chain)", "False"),
             ("backplane/watch/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
-            ("backplane/watch/message_watch.py", "self._episodes.find(Alarm.DAMAGED, found.accesses, tick)", "pass"),
+            (
+                "backplane/watch/message_watch.py",
+                "self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)",
+                "pass",
+            ),
         ),
     ),
     Mutant(

@@ -47,17 +47,18 @@ class MailboxRing(Ring):
             # The writer does not know of this message, and will write its own in that place.
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
-        checks = (xxh3(part.tobytes(), chain) >> 1 for part, chain in zip(covered, rows["chain"].tolist(), strict=True))
-        good = lawful & (np.fromiter(checks, np.int64, len(rows)) == rows["check"]) & (rows["serial"] == serials)
+        checks = (xxh3(part.tobytes(), chain) for part, chain in zip(covered, rows["chain"].tolist(), strict=True))
+        good = lawful & (np.fromiter(checks, np.uint64, len(rows)) == rows["check"]) & (rows["serial"] == serials)
         return Drained(rows if good.all() else rows[good], lost)
 
 
 def row_dtype(spec: MailboxSpec) -> np.dtype:
     """Return the type of one row of a mailbox's ring, padding included."""
+    message = message_dtype(spec.fields, spec.size)
     return np.dtype(
         {
             "names": [word.name.lower() for word in Slot] + ["message"],
-            "formats": ["i8"] * len(Slot) + [message_dtype(spec.fields, spec.size)],
+            "formats": [*("u8" if word in (Slot.CHAIN, Slot.CHECK) else "i8" for word in Slot), message],
             "offsets": [8 * word for word in Slot] + [8 * len(Slot)],
             "itemsize": slot_stride(spec),
         }

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from enum import IntEnum
+from struct import Struct
 from typing import NamedTuple
 
 from xxhash import xxh3_64_intdigest as xxh3
@@ -26,7 +27,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
 # Plain integers for the hot path.
-_EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[1:])
+_VISIBLE = int(Slot.VISIBLE_AT)
+_HEAD = Struct(f"@{len(Slot)}Q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -136,16 +138,14 @@ class Writer:
 
 
 class ReadStatistics:
-    """Counts of one reader's reads so far."""
+    """Counts of one reader's failed reads so far."""
 
-    __slots__ = ("accesses", "bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up", "transfers")
+    __slots__ = ("bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up")
 
     def __init__(self) -> None:
-        self.accesses = 0
-        self.transfers = 0  # messages copied
         self.bad_reads = 0  # reads with any of the following
         self.bus_errors = 0  # accesses that their bound cut off
-        self.corrupt = 0  # messages that failed their CRC
+        self.corrupt = 0  # messages that failed their check
         self.forged = 0  # messages of a process that does not hold the claim
         self.forger = 0  # process id of the last such process
         self.held_up = 0  # accesses that timed out because a dead or stopped process held the lock
@@ -161,7 +161,7 @@ class Reader:
         self._mask, self._depth = slots.mask, slots.depth
         # The last good message has its own buffer: a corrupt copy never reaches it.
         good = Slots(segment, self.spec)
-        self._record, self._words, self._covered, self._good = slots.record, slots.words, slots.covered, good.record
+        self._record, self._covered, self._good = slots.record, slots.covered, good.record
         self.message = good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
         self._new, self._unchanged = self._readings[Verdict.NEW], self._readings[Verdict.NONE]
@@ -176,11 +176,15 @@ class Reader:
         """Tick from which the last good message may be read."""
         self.basis = 0
         """Tick of the oldest information that the last good message rests on."""
+        self.accesses = 0
+        """Reads so far."""
+        self.transfers = 0
+        """Messages copied so far."""
         self.statistics = ReadStatistics()
 
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, with its verdict."""
-        self.statistics.accesses += 1
+        self.accesses += 1
         serial, last = self._box[0], self.serial
         if serial != last:
             # Older messages are overwritten: a serial beyond the slots fails when it is taken.
@@ -204,17 +208,18 @@ class Reader:
 
     def _obtain(self, serial: int) -> bool:
         """Keep a message as the last good one; False when it is not good."""
-        self.statistics.transfers += 1
-        words, record = self._words, self._record
+        self.transfers += 1
+        record = self._record
         record[:] = self._places[serial & self._mask]
-        if words[_SERIAL] != serial or words[_CHECK] != xxh3(self._covered, words[_CHAIN]) >> 1:
+        _, epoch, chain, check, basis, found, tick, visible = _HEAD(record)
+        if found != serial or check != xxh3(self._covered, chain):
             return False
-        if words[_EPOCH] != self._signature:
+        if epoch != self._signature:
             if not self.slots.is_lawful(self._signature):
                 return False
-            self._signature, self._unchanged = words[_EPOCH], self._readings[Verdict.OLD]
+            self._signature, self._unchanged = epoch, self._readings[Verdict.OLD]
         self._good[:] = record
-        self.serial, self.newest, self.visible, self.basis = serial, words[_TICK], words[_VISIBLE], words[_BASIS]
+        self.serial, self.newest, self.visible, self.basis = serial, tick, visible, basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading:
@@ -278,5 +283,5 @@ class DoubleBufferReader(Reader):
 
     def read(self, tick: int) -> Reading:
         """Return the newest whole message, with its verdict."""
-        self.statistics.accesses += 1
+        self.accesses += 1
         return self._newest()

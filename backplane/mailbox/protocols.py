@@ -111,7 +111,7 @@ class LockReader(Reader):
     def read(self, tick: int) -> Reading:
         """Return the newest message; BUS_ERROR with the last good one after a timeout."""
         statistics = self.statistics
-        statistics.accesses += 1
+        self.accesses += 1
         obtained = self.lock.acquire()
         if statistics.held_up != self.lock.held_up:
             statistics.held_up = self.lock.held_up

@@ -8,7 +8,7 @@ Memory order: the one writer fills the slot before it stores the head's serial. 
 order. On weaker machines a reader may see the serial first: its copy then fails the check, or holds another serial, and
 the read steps back to the message before. Words are aligned to 8 bytes, so they are never torn.
 
-The checksum is XXH3, 63 bits of it, seeded with the checksum of the message before. So one pass over a message tells a
+The checksum is XXH3, 64 bits, seeded with the checksum of the message before. So one pass over a message tells a
 reader whether its copy is whole and undamaged; and the newest checksum stands for all that was ever written, so that
 one comparison shows whether two runs are equal (`history.digest`). Alternatives considered: CRC32 and a chained hash,
 two passes that took half of a write; CRC32 alone, seeded likewise: 32 bits are few for a digest, and on 200 bytes it
@@ -18,6 +18,7 @@ takes five times as long.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from struct import Struct
 from time import monotonic_ns
 
 import numpy as np
@@ -32,6 +33,7 @@ from rack.backplane.words import Box, Slot
 CHECKED_FROM = Slot.BASIS * 8
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
+_PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole
 _CLAIMANT = int(Box.CLAIMANT)
 EPOCH_BITS = 32
 EPOCH_MASK = (1 << EPOCH_BITS) - 1
@@ -91,8 +93,8 @@ class Slots:
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
         self.places = [segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)]
-        self.heads = [place[:SLOT_HEAD_SIZE].cast("q") for place in self.places]
-        self.words = self.record[:SLOT_HEAD_SIZE].cast("q")
+        self.heads = [place[:SLOT_HEAD_SIZE].cast("Q") for place in self.places]
+        self.words = self.record[:SLOT_HEAD_SIZE].cast("Q")
         self.covered = self.record[CHECKED_FROM:]
 
     def resume(self, signature: int) -> None:
@@ -116,12 +118,9 @@ class Slots:
         serial = before + 1
         at = serial & self.mask
         intruder = 0 if box[0] == before else self.heads[at][_EPOCH] >> EPOCH_BITS
-        words[_BASIS] = basis
-        words[_SERIAL] = serial
-        words[_TICK] = tick
-        words[_VISIBLE] = visible_at
+        _PUT_CONTENT(self.record, CHECKED_FROM, basis, serial, tick, visible_at)
         words[_CHAIN] = chain = words[_CHECK]
-        words[_CHECK] = xxh3(self.covered, chain) >> 1
+        words[_CHECK] = xxh3(self.covered, chain)
         words[_STAMP] = monotonic_ns()
         self.places[at][:] = self.record
         if damage:
@@ -158,7 +157,7 @@ class Slots:
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
         self.record[:] = self.places[serial & self.mask]
-        return self.words[_SERIAL] == serial and self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN]) >> 1
+        return self.words[_SERIAL] == serial and self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])
 
     def copy(self, serial: int) -> bool:
         """Copy that serial's slot, without any check, into the local record; False when it was reused meanwhile."""
@@ -168,7 +167,7 @@ class Slots:
     @property
     def is_sound(self) -> bool:
         """Whether the message in the local record passes its check."""
-        return self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN]) >> 1
+        return self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])
 
     @property
     def serial(self) -> int:

@@ -27,18 +27,18 @@ class ReadFindings:
     """Raises alarms for the damaged and forged messages that a reader itself has found."""
 
     def __init__(self, reader: Reader, episodes: Episodes) -> None:
-        self._statistics, self._episodes = reader.statistics, episodes
+        self._reader, self._episodes = reader, episodes
         self._corrupt = self._forged = 0
 
     def report(self, tick: int) -> None:
         """Report the findings since the last call."""
-        found = self._statistics
+        found = self._reader.statistics
         if found.corrupt != self._corrupt:
             self._corrupt = found.corrupt
-            self._episodes.find(Alarm.DAMAGED, found.accesses, tick)
+            self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)
         if found.forged != self._forged:
             self._forged = found.forged
-            self._episodes.find(Alarm.MASQUERADE, found.accesses, tick, found.forger)
+            self._episodes.find(Alarm.MASQUERADE, self._reader.accesses, tick, found.forger)
 
 
 class MessageWatch:
@@ -111,7 +111,7 @@ class MessageWatch:
             if (
                 head[_SERIAL] == serial
                 and self.newest < released > head[_VISIBLE] - late
-                and (serial == taken or xxh3(body, head[_CHAIN]) >> 1 == head[_CHECK])
+                and (serial == taken or xxh3(body, head[_CHAIN]) == head[_CHECK])
                 and slots.keeps(serial)
             ):
                 self.newest = released
@@ -154,4 +154,4 @@ class MessageWatch:
         self.newest = max(released, self.newest)
 
     def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
-        self._episodes.find(code, self._reader.statistics.accesses, tick, value, since)
+        self._episodes.find(code, self._reader.accesses, tick, value, since)

@@ -96,7 +96,7 @@ class SilenceWatch:
 
     def _is_mute(self, tick: int) -> bool:
         """Say whether the writer has finished a release that writes a message, and the newest is of an earlier one."""
-        accesses = self._reader.statistics.accesses
+        accesses = self._reader.accesses
         if any(self._episodes.is_open(code, accesses, tick) for code in (Alarm.HELD_BACK, Alarm.DISORDER)):
             # Messages come, but late.
             return False

@@ -66,8 +66,8 @@ class InputPorts:
     @property
     def _traffic(self) -> tuple[int, int]:
         readers = self.readers.values()
-        accesses = sum(reader.statistics.accesses for reader in readers)
-        return accesses, sum(reader.statistics.transfers * reader.spec.size for reader in readers)
+        accesses = sum(reader.accesses for reader in readers)
+        return accesses, sum(reader.transfers * reader.spec.size for reader in readers)
 
 
 class OutputPorts:
