@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import typer
 
 from rack.tools.console.answer import Json, config_names, print_json
 from rack.tools.console.interrupt import INTERRUPT
-
-if TYPE_CHECKING:
-    from rack.tools.benches.comparison import Comparison
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 
@@ -28,6 +25,22 @@ Plot = Annotated[Path | None, typer.Option(metavar="DIR", help="write the figure
 Against = Annotated[
     Path | None, typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one")
 ]
+Share = Annotated[
+    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
+]
+
+
+class Shown(Protocol):
+    """What a bench has found, as far as it is shown."""
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield it as text for people, fitted to `width`."""
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write its pictures into `folder`; return their paths."""
 
 
 @bench.callback()
@@ -53,6 +66,29 @@ def mailbox(
 
     with progress_for(as_json) as progress:
         found = measure(CASES, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def cycle(
+    against: Against = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")] = 6.0,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    share: Share = False,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure the processor time of a board's cycle, by part.
+
+    Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns with another checkout.
+    The servo board is also compared with bare mj_step calls: the physics of its recorded run, replayed alone. What
+    TREE needs and this environment lacks, give in PYTHONPATH.
+    """
+    from rack.tools.benches.cycle import measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(against, seconds, rounds, progress, share)
     _show(found, plot, as_json)
 
 
@@ -140,8 +176,8 @@ def response(
     raise typer.Exit(0 if measured.held else 1)
 
 
-def _show(found: Comparison, plot: Path | None, as_json: bool) -> None:
-    """Print a comparison and, if asked for, plot it."""
+def _show(found: Shown, plot: Path | None, as_json: bool) -> None:
+    """Print what a bench has found and, if asked for, plot it."""
     from rack.tools.console.tables import terminal_width
 
     _print(found.document(), found.lines(terminal_width()), as_json)

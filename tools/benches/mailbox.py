@@ -147,16 +147,17 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
     """Give a mailbox of ours, in a segment of its own."""
     rack = f"bench-{os.getpid()}-{protocol}"
     layout = _layout(rack, protocol, case)
-    with ExitStack() as stack:
+    with ExitStack() as names:
         # Before they exist: an interrupt may come at any time.
-        stack.callback(unlink, rack)
-        stack.callback(semaphores.unlink, layout)
+        names.callback(unlink, rack)
+        names.callback(semaphores.unlink, layout)
         segment = Segment.create(layout, "")
         semaphores.create(layout)
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
         readers = [_reading(open_reader(segment, box.name)) for _ in range(case.readers)]
-        yield Transport(writer.message, writer.write, readers)
+    # Open, it needs no name: nothing is left even if this process is killed.
+    yield Transport(writer.message, writer.write, readers)
 
 
 def _reading(reader: Reader) -> Callable[[int], Message]:
