@@ -35,6 +35,8 @@ CHECKED_FROM = Slot.BASIS * 8
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole
 _CLAIMANT = int(Box.CLAIMANT)
+UNSIGNED = (1 << 64) - 1
+"""Mask that turns a word of a slot's head, which is signed, into a checksum."""
 EPOCH_BITS = 32
 EPOCH_MASK = (1 << EPOCH_BITS) - 1
 
@@ -93,7 +95,7 @@ class Slots:
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
         self.places = [segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)]
-        self.heads = [place[:SLOT_HEAD_SIZE].cast("Q") for place in self.places]
+        self.heads = [place[:SLOT_HEAD_SIZE].cast("q") for place in self.places]
         self.words = self.record[:SLOT_HEAD_SIZE].cast("Q")
         self.covered = self.record[CHECKED_FROM:]
 
@@ -105,7 +107,7 @@ class Slots:
             whole -= 1
         self.words[_SERIAL] = head
         self.words[_EPOCH] = signature
-        self.words[_CHECK] = self.heads[whole & self.mask][_CHECK] if whole and self.holds(whole) else 0
+        self.words[_CHECK] = self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an intruder, 0: none.

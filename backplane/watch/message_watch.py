@@ -12,6 +12,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept
 from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.slots import UNSIGNED
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
@@ -111,7 +112,7 @@ class MessageWatch:
             if (
                 head[_SERIAL] == serial
                 and self.newest < released > head[_VISIBLE] - late
-                and (serial == taken or xxh3(body, head[_CHAIN]) == head[_CHECK])
+                and (serial == taken or xxh3(body, head[_CHAIN] & UNSIGNED) == head[_CHECK] & UNSIGNED)
                 and slots.keeps(serial)
             ):
                 self.newest = released
