@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import typer
 
@@ -21,6 +21,27 @@ Config = Annotated[
     ),
 ]
 
+Plot = Annotated[Path | None, typer.Option(metavar="DIR", help="write the figures as PNG and SVG into this folder")]
+Against = Annotated[
+    Path | None, typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one")
+]
+Share = Annotated[
+    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
+]
+
+
+class Shown(Protocol):
+    """What a bench has found, as far as it is shown."""
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield it as text for people, fitted to `width`."""
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write its pictures into `folder`; return their paths."""
+
 
 @bench.callback()
 def interruptible(context: typer.Context) -> None:
@@ -29,15 +50,46 @@ def interruptible(context: typer.Context) -> None:
 
 
 @bench.command()
-def mailbox(as_json: Json = False) -> None:
-    """Measure a write and a read of 200 bytes, by protocol.
+def mailbox(
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 60,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure a message, written and read, next to other ways of inter-process communication.
 
-    Figures are medians; on a busy machine look at the best ones.
+    Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes and queues of
+    multiprocessing, and zenoh. The ratio is to the best of these peers. A raw copy is the least that can be done, and
+    zenoh within one session never leaves its process: these two are no peers.
     """
-    from rack.tools.benches.mailbox import lines_of, measure
+    from rack.tools.benches.mailbox import CASES, measure
+    from rack.tools.console.progress import progress_for
 
-    costs = measure()
-    _print({"mailbox": [asdict(cost) for cost in costs]}, lines_of(costs), as_json)
+    with progress_for(as_json) as progress:
+        found = measure(CASES, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def cycle(
+    against: Against = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")] = 6.0,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    share: Share = False,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure the processor time of a board's cycle, by part.
+
+    Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns with another checkout.
+    The servo board is also compared with bare mj_step calls: the physics of its recorded run, replayed alone. What
+    TREE needs and this environment lacks, give in PYTHONPATH.
+    """
+    from rack.tools.benches.cycle import measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(against, seconds, rounds, progress, share)
+    _show(found, plot, as_json)
 
 
 @bench.command()
@@ -122,6 +174,18 @@ def response(
         if not as_json:
             print(f"pictures: {', '.join(map(str, paths))}")
     raise typer.Exit(0 if measured.held else 1)
+
+
+def _show(found: Shown, plot: Path | None, as_json: bool) -> None:
+    """Print what a bench has found and, if asked for, plot it."""
+    from rack.tools.console.tables import terminal_width
+
+    _print(found.document(), found.lines(terminal_width()), as_json)
+    if plot is not None:
+        plot.mkdir(parents=True, exist_ok=True)
+        paths = found.plot(plot)
+        if not as_json:
+            print(f"pictures: {', '.join(map(str, paths))}")
 
 
 def _print(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:

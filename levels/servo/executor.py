@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.levels import arm
-from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm
+from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
 from rack.levels.arm.faulty import STEPS
 from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
@@ -89,8 +88,9 @@ class ServoExecutor(Executor):
 
     @classmethod
     def preload(cls) -> None:
-        """Load the compiled functions of level and arm."""
-        for module in (arm, control, reference, sensor_monitor, actuator_monitor):
+        """Load the compiled functions of the level and of its arm."""
+        preload()
+        for module in (control, reference, sensor_monitor, actuator_monitor):
             module.preload()
 
     def inject(self, faults: Sequence[Fault]) -> None:
