@@ -20,16 +20,18 @@ from rack.backplane.layout import Layout
 from rack.backplane.segment import PREFIX, SHM_FOLDER
 
 _libc = ctypes.CDLL(None)
-_sem_open, _sem_clockwait = _libc.sem_open, _libc.sem_clockwait
+_sem_open, _sem_clockwait, _sem_trywait = _libc.sem_open, _libc.sem_clockwait, _libc.sem_trywait
 _sem_open.argtypes, _sem_open.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
 _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
+_sem_trywait.argtypes = (ctypes.c_void_p,)
 
 
 class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no types
     """An open semaphore whose waits do not depend on the wall clock.
 
-    `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. It is the C library's
-    own function, for the fastest wake-up. A signal may end it early.
+    `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. A signal may end it
+    early. `take()` does not wait, and returns 0 when it has obtained the semaphore. Both are the C library's own, for
+    the fastest wake-up.
     """
 
     def __init__(self, name: str) -> None:
@@ -40,22 +42,21 @@ class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no 
         # A struct timespec, read by the C library in place.
         self._deadline = (ctypes.c_int64 * 2)()
         self.wait = partial(_sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline))
+        self.take = partial(_sem_trywait, address)
 
-    def bind(self, timeout_s: float) -> int:
-        """Let waits end `timeout_s` from now; return that time, CLOCK_MONOTONIC, ns."""
-        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+    def bind(self, deadline_ns: int) -> None:
+        """Let waits end at that time, CLOCK_MONOTONIC."""
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
-        return deadline_ns
 
     def acquire(self, timeout_s: float) -> bool:
         """Wait at most `timeout_s`; False after that."""
-        try:
-            super().acquire(0)
-        except posix_ipc.BusyError:
-            deadline_ns = self.bind(timeout_s)
-            while self.wait():
-                if time.monotonic_ns() >= deadline_ns:
-                    return False
+        if not self.take():
+            return True
+        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        self.bind(deadline_ns)
+        while self.wait():
+            if time.monotonic_ns() >= deadline_ns:
+                return False
         return True
 
 

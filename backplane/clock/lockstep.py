@@ -49,17 +49,14 @@ class LockstepDriver(ClockDriver):
 
     def _step(self, tick: int, last: int) -> bool:
         """Do one tick; False when the launcher is gone."""
-        if not self._one_at_a_time:
-            self.release(tick, last)
-            return self._wait(lambda: all(task.is_finished(tick + 1) for task in self.tasks))
-        for task in self.tasks:
-            if task.is_due(tick, last):
-                task.release(tick)
-                if task.missed:
-                    self.watchdog.check(task, tick)
-                if not self._wait(task.is_settled):
-                    return False
-        return True
+        due = self.due(tick, last)
+        for task in due:
+            task.release(tick)
+            task.wake()
+            if self._one_at_a_time and not self._wait(task.is_settled):
+                return False
+        self.check(due, tick)
+        return self._wait(lambda: all(task.is_finished(tick + 1) for task in self.tasks))
 
     def settle(self) -> None:
         """Wait until every task has finished the work of its release, plans too."""

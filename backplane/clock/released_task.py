@@ -27,34 +27,33 @@ LEAST_NS = 1_000_000_000
 class ReleasedTask:
     """The clock's end of a task's control block.
 
-    `index` is its place in the layout. `missed` counts releases since it last finished one: 1 when it becomes late, 2
-    while it finishes each one late, more while it finishes none. `is_stopped`: a signal has stopped its process, so
-    lockstep must not wait for it.
+    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `missed` counts
+    releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
+    finishes none. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
         self.spec = spec
         self.index = segment.layout.tasks.index(spec)
         self.block = segment.block(spec.name)
+        self.sleeps = spec.wake == "timer"
         self.missed = 0
         self.is_stopped = False
         self._done = self.block[_DONE]
         self._semaphore = wake_semaphore(segment.rack, spec.name)
 
-    def is_due(self, tick: int, last: int) -> bool:
-        """Say whether the task has a release in (last, tick]; it has none while it works on a plan, or is lost."""
-        release = tick - tick % self.spec.every
-        return release > last and self.block[_DEADLINE] <= release and not self.block[_LOST]
+    def is_free(self, release: int) -> bool:
+        """Say whether the task can take a release; it can not while it works on a plan, or is lost."""
+        return self.block[_DEADLINE] <= release and not self.block[_LOST]
 
     def release(self, tick: int) -> None:
-        """Wake the task for its newest release."""
+        """Give the task its newest release."""
         block, release = self.block, tick - tick % self.spec.every
         if self.is_stopped:
             self.check_stopped()
         self._count_missed()
         block[_DEADLINE] = release + self.spec.every
         block[_RELEASED] = release
-        self._semaphore.release()
 
     def _count_missed(self) -> None:
         done, before = self.block[_DONE], self._done
@@ -83,7 +82,7 @@ class ReleasedTask:
         self.is_stopped = state_of(self.block[Block.PID]) in STOPPED
 
     def wake(self) -> None:
-        """Wake the task without a release."""
+        """Post the task's semaphore."""
         self._semaphore.release()
 
     @property
@@ -116,7 +115,7 @@ class ReleasedTask:
 
 
 def by_priority(layout: Layout) -> list[TaskSpec]:
-    """Return the tasks in the order in which the clock wakes them: executors by rate, then planners."""
+    """Return the tasks in the order in which the clock releases them: executors by rate, then planners."""
     return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.slot))
 
 

@@ -199,7 +199,6 @@ class _Examined:
             inputs=dict(ports.reads),
             outputs=dict(ports.writes),
             context=self._context(spec.board),
-            poll=(board.wake or self._config.clock.wake) == "poll" and is_executor,
             critical_priority=board.priority if critical else 0,
             guards_clock=is_executor and spec.every == min(task.every for task in layout.tasks),
             fails_self_test=fails_self_test,

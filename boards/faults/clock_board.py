@@ -198,14 +198,17 @@ class FaultStage:
         return entry[Entry.UNTIL] <= tick or has_acted or _step(entry).is_void(self._rack, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
-        """Say whether a fault begins. Its condition is read in every tick, so that no message is missed."""
+        """Say whether a fault begins. Its condition is read in every tick, so that no message is missed.
+
+        It is read as of the tick before: the clock works ahead of the grid, where messages of `tick` may be missing.
+        """
         if entry[Entry.WHEN_BOX] < 0:
             return entry[Entry.FROM] <= tick
         box = entry[Entry.WHEN_BOX]
         spec = self._segment.layout.mailboxes[box]
         if box not in self._observers:
             self._observers[box] = open_observer(self._segment, spec.name)
-        reading = self._observers[box].read(tick)
+        reading = self._observers[box].read(tick - 1)
         field = spec.fields[entry[Entry.WHEN_FIELD]].name
         return reading.is_there and int(getattr(reading.value, field)) == entry[Entry.WHEN_VALUE]
 

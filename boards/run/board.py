@@ -6,10 +6,11 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
-from rack.backplane.process import die_with_parent, name_process, set_priority, take_processor
+from rack.backplane.process import cores_kept_awake, die_with_parent, name_process, pin, set_priority, take_processor
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
 from rack.boards.classes import find_class
@@ -83,9 +84,9 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> int:
     """Take the processor and run the system clock."""
-    os.sched_setaffinity(0, {wiring.core})
-    set_priority(wiring.priority)
-    run_clock(segment, wiring, attention)
+    pin(wiring.core)
+    with cores_kept_awake() if set_priority(wiring.priority) and wiring.priority else nullcontext():
+        run_clock(segment, wiring, attention)
     return 0
 
 

@@ -151,14 +151,15 @@ class EndOfRun:
         self._heard: int | None = None
 
     def __call__(self, tick: int) -> int | None:
-        """Return the tick at which the run stops; None until it is known."""
+        """Return the tick at which the run stops, by the messages as of the tick before; None until it is known."""
         if self._stop_tick is None and self._reader is not None and self._writer is not None:
-            reading = self._reader.read(tick)
+            final = max(tick - 1, 0)
+            reading = self._reader.read(final)
             if reading.is_new or self._heard is None or self._writer[Block.LOST]:
-                self._heard = tick
+                self._heard = final
             is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
-            if is_over or tick - self._heard >= self._silent:
-                self._stop_tick = tick + self._linger
+            if is_over or final - self._heard >= self._silent:
+                self._stop_tick = max(final + self._linger, tick)
         return self._stop_tick
 
 
