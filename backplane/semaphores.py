@@ -1,4 +1,4 @@
-"""The named semaphores of a rack: one per task to wake it, one for the clock, one per locked mailbox.
+"""The named semaphores of a rack: two per task, to wake it and for its reports to lockstep; one per locked mailbox.
 
 The Rack makes them, the crate opens them before it forks the boards, and the names are then removed: the boards keep
 the open semaphores, and no name is left over even if they are killed.
@@ -68,7 +68,8 @@ def names(layout: Layout) -> list[str]:
     """Return the POSIX names of every semaphore that a rack needs."""
     wake = [_name(layout.rack, "wake", task.name) for task in layout.tasks]
     locks = [_name(layout.rack, "lock", m.name) for m in layout.mailboxes if m.protocol == "lock"]
-    return [_name(layout.rack, "clock"), *wake, *locks]
+    done = [_name(layout.rack, "done", task.name) for task in layout.tasks]
+    return [*wake, *done, *locks]
 
 
 def create(layout: Layout) -> None:
@@ -103,9 +104,9 @@ def wake_semaphore(rack: str, task: str) -> Semaphore:
     return _opened(_name(rack, "wake", task))
 
 
-def clock_semaphore(rack: str) -> Semaphore:
-    """Return the open semaphore on which lockstep waits for tasks to finish."""
-    return _opened(_name(rack, "clock"))
+def done_semaphore(rack: str, task: str) -> Semaphore:
+    """Return the open semaphore on which lockstep waits for a task's reports, or for that of its loss."""
+    return _opened(_name(rack, "done", task))
 
 
 def lock_semaphore(rack: str, mailbox: str) -> Semaphore:

@@ -110,8 +110,8 @@ class ClockDriver(ABC):
         """
 
     @abstractmethod
-    def await_state(self, condition: Callable[[], bool]) -> None:
-        """In lockstep, wait until `condition` holds."""
+    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
+        """In lockstep, wait until `condition` on the state of a task holds."""
 
     @abstractmethod
     def run(self) -> None:
@@ -173,7 +173,7 @@ class RealtimeDriver(ClockDriver):
     def settle(self) -> None:
         """Return at once: in real time a change may take effect within a cycle."""
 
-    def await_state(self, condition: Callable[[], bool]) -> None:
+    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
         """Return at once: real time does not wait."""
 
     def _release(self, tick: int, last: int) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.process import STOPPED, WAITING, processor_ns, state_of
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, TaskState
 
@@ -30,6 +30,7 @@ class ReleasedTask:
     `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `missed` counts
     releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
     finishes none. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
+    `done`: posted by the task, in lockstep.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -41,6 +42,7 @@ class ReleasedTask:
         self.is_stopped = False
         self._done = self.block[_DONE]
         self._semaphore = wake_semaphore(segment.rack, spec.name)
+        self.done = done_semaphore(segment.rack, spec.name)
 
     def is_free(self, release: int) -> bool:
         """Say whether the task can take a release; it can not while it works on a plan, or is lost."""
@@ -73,9 +75,13 @@ class ReleasedTask:
         """Say whether it has finished, or will not: there is nothing to wait for."""
         return self.is_idle() or bool(self.block[_LOST]) or self.is_stopped
 
+    def must_finish(self, tick: int) -> bool:
+        """Say whether its release must be finished before `tick` begins."""
+        return self.block[_DEADLINE] <= tick
+
     def is_finished(self, tick: int) -> bool:
         """Say whether `tick` may begin without waiting for the task."""
-        return self.block[_DEADLINE] > tick or self.is_settled()
+        return not self.must_finish(tick) or self.is_settled()
 
     def check_stopped(self) -> None:
         """Check whether a signal has stopped its process."""

@@ -86,7 +86,7 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         entry.acted(tick, time.monotonic_ns())
         os.kill(os.getpid(), signal.SIGKILL)
     elif rack.send(entry, tick, task, signal.SIGKILL):
-        rack.driver.await_state(lambda: task.lost_tick >= 0)
+        rack.driver.await_state(task, lambda: task.lost_tick >= 0)
 
 
 def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:

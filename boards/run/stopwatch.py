@@ -10,7 +10,7 @@ from time import monotonic_ns, process_time_ns
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.semaphores import done_semaphore
 from rack.backplane.trace import FIELDS, SKIPPED_SHIFT, Flag, TraceWriter
 from rack.backplane.words import Block
 from rack.boards.run.ports import InputPorts, OutputPorts
@@ -36,7 +36,7 @@ class Stopwatch:
         self._status = getattr(outputs.messages, "status", None)
         self._trace = TraceWriter(segment, task)
         self._record = self._trace.record
-        self._lockstep_clock = clock_semaphore(segment.rack) if self._clock.is_lockstep else None
+        self._lockstep_done = done_semaphore(segment.rack, task) if self._clock.is_lockstep else None
         self._troubles = self._bus_errors = self._corrupt = self._skipped = 0
         self._processor_ns = 0  # processor time used before the current record
 
@@ -73,8 +73,8 @@ class Stopwatch:
         """
         block, record, skipped = self._block, self._record, self._skipped
         tick, missed = record[_TICK], not in_time
-        lockstep_clock = self._lockstep_clock
-        if lockstep_clock is not None:
+        lockstep_done = self._lockstep_done
+        if lockstep_done is not None:
             record[_RELEASE] = record[_START]
         else:
             record[_RELEASE] = release = self._clock.time_of(tick)
@@ -95,8 +95,8 @@ class Stopwatch:
         block[_MISSED] += missed
         block[_SKIPPED] += skipped
         block[_DONE] = done
-        if lockstep_clock is not None:
-            lockstep_clock.release()
+        if lockstep_done is not None:
+            lockstep_done.release()
         if not block[_CYCLES] % BUS_COUNT_CYCLES:
             self.count_bus()
 
@@ -110,8 +110,8 @@ class Stopwatch:
 
     def notify_clock(self) -> None:
         """In lockstep, let the clock check this task again."""
-        if self._lockstep_clock is not None:
-            self._lockstep_clock.release()
+        if self._lockstep_done is not None:
+            self._lockstep_done.release()
 
     def _count_troubles(self) -> int:
         """Count failed accesses since the last cycle; return trace flags."""

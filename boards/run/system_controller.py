@@ -70,7 +70,7 @@ class SystemController:
         lockstep = self._wiring.lockstep
         if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
             return
-        self._driver.await_state(lambda: task.is_ready or task.is_given_up)
+        self._driver.await_state(task, lambda: task.is_ready or task.is_given_up)
         if task.is_ready:
             away = tick - task.lost_tick
             self._driver.settle()

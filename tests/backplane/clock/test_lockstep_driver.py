@@ -14,7 +14,7 @@ from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.semaphores import done_semaphore
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -32,7 +32,7 @@ def serve(segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, st
         time.sleep(work_s)
         log.append(("end", name, tick))
         block[Block.DONE] = tick
-        clock_semaphore(segment.rack).release()
+        done_semaphore(segment.rack, name).release()
 
 
 def lockstep(segment: Segment, stop: int, one_at_a_time: bool) -> tuple[list[tuple[str, str, int]], list[int]]:
