@@ -25,6 +25,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Head, Run, System
 
+# Plain integers for the hot path.
+_TICK, _TICK_NS, _STOP_TICK, _STOP_REQUEST = (
+    int(word) for word in (System.TICK, System.TICK_NS, System.STOP_TICK, System.STOP_REQUEST)
+)
 LEAD_NS = 300_000
 """Time by which the clock begins a tick ahead of its grid point: for its own wake-up and the work of a tick."""
 LEAD_PART = 3
@@ -68,7 +72,7 @@ class ClockDriver(ABC):
 
     def begin(self, tick: int) -> bool:
         """Publish `tick` and do the work due before its releases; False when the tick is skipped."""
-        self.words[System.TICK] = tick
+        self.words[_TICK] = tick
         if self.controller is not None:
             self.controller.begin(tick)
         if not self.skip:
@@ -100,7 +104,7 @@ class ClockDriver(ABC):
 
         No task is released twice for it: its deadline shows that it has been.
         """
-        return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
+        return self.words[_TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @abstractmethod
     def settle(self) -> None:
@@ -120,11 +124,11 @@ class ClockDriver(ABC):
     def is_over(self, tick: int) -> bool:
         """Say whether the run ends before `tick`."""
         words = self.words
-        stop = words[System.STOP_TICK]
-        if words[System.STOP_REQUEST] and (not stop or stop > tick):
-            stop = words[System.STOP_TICK] = max(tick, 1)
+        stop = words[_STOP_TICK]
+        if words[_STOP_REQUEST] and (not stop or stop > tick):
+            stop = words[_STOP_TICK] = max(tick, 1)
         if not stop and (found := self._ended(tick)) is not None:
-            stop = words[System.STOP_TICK] = max(found, 1)
+            stop = words[_STOP_TICK] = max(found, 1)
         return bool(stop) and tick >= stop
 
     @property
@@ -182,7 +186,7 @@ class RealtimeDriver(ClockDriver):
         sleeping = [task for task in due if task.sleeps]
         for task in sleeping:
             task.release(tick)
-        now = self.words[System.TICK_NS] = time.monotonic_ns()
+        now = self.words[_TICK_NS] = time.monotonic_ns()
         if now >= point:
             # They have looked for their release already, and sleep on.
             for task in sleeping:
@@ -207,7 +211,7 @@ class RealtimeDriver(ClockDriver):
         """Sleep until a tick begins; return the newest tick to begin by then, at least the one after `tick`."""
         self._sleep_until(self._time_of(tick + 1) - self._lead_ns)
         now = (time.monotonic_ns() + self._lead_ns - self._epoch_ns) // self._period_ns
-        if stop := self.words[System.STOP_TICK]:
+        if stop := self.words[_STOP_TICK]:
             # Even a late clock makes the run's last tick: tasks that are late for it are seen.
             now = min(now, stop - 1)
         next_tick = max(tick + 1, now)

@@ -70,11 +70,11 @@ class LockstepDriver(ClockDriver):
         """Wait until `tick` may begin; False when the launcher is gone."""
         order, slowest = self._last_first, None
         for task in order:
-            if not task.must_finish(tick):
+            if task.deadline > tick:
                 continue
             # Its report is taken even if its words already show it: else the semaphore would overflow.
             task.done.take()
-            if not task.is_settled():
+            if not task.is_finished(tick):
                 slowest = task
                 if not self._wait(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
                     return False

@@ -30,7 +30,8 @@ class ReleasedTask:
     `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `missed` counts
     releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
     finishes none. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
-    `done`: posted by the task, in lockstep.
+    `done`: posted by the task, in lockstep. `deadline`: tick before which its release, or plan, must be finished, as
+    last seen; it only moves later.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -40,6 +41,8 @@ class ReleasedTask:
         self.sleeps = spec.wake == "timer"
         self.missed = 0
         self.is_stopped = False
+        self.deadline = self.block[_DEADLINE]
+        self._every = spec.every
         self._done = self.block[_DONE]
         self._semaphore = wake_semaphore(segment.rack, spec.name)
         self.done = done_semaphore(segment.rack, spec.name)
@@ -50,22 +53,20 @@ class ReleasedTask:
 
     def release(self, tick: int) -> None:
         """Give the task its newest release."""
-        block, release = self.block, tick - tick % self.spec.every
+        block, every = self.block, self._every
+        release = tick - tick % every
         if self.is_stopped:
             self.check_stopped()
-        self._count_missed()
-        block[_DEADLINE] = release + self.spec.every
-        block[_RELEASED] = release
-
-    def _count_missed(self) -> None:
-        done, before = self.block[_DONE], self._done
-        self._done = done
-        if self.is_idle():
+        done = block[_DONE]
+        if done == block[_RELEASED]:
             self.missed = 0
-        elif done != before:
+        elif done != self._done:
             self.missed = min(self.missed + 1, 2)
         else:
             self.missed += 1
+        self._done = done
+        block[_DEADLINE] = self.deadline = release + every
+        block[_RELEASED] = release
 
     def is_idle(self) -> bool:
         """Say whether the newest release is finished."""
@@ -75,13 +76,10 @@ class ReleasedTask:
         """Say whether it has finished, or will not: there is nothing to wait for."""
         return self.is_idle() or bool(self.block[_LOST]) or self.is_stopped
 
-    def must_finish(self, tick: int) -> bool:
-        """Say whether its release must be finished before `tick` begins."""
-        return self.block[_DEADLINE] <= tick
-
     def is_finished(self, tick: int) -> bool:
         """Say whether `tick` may begin without waiting for the task."""
-        return not self.must_finish(tick) or self.is_settled()
+        self.deadline = self.block[_DEADLINE]
+        return self.deadline > tick or self.is_settled()
 
     def check_stopped(self) -> None:
         """Check whether a signal has stopped its process."""

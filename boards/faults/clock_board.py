@@ -185,6 +185,8 @@ class FaultStage:
 
     def within(self, tick: int) -> None:
         """Let the faults with a phase in `tick` strike at their times; call it after the releases."""
+        if not self._phased:
+            return
         clock = self._rack.clock
         for entry in sorted(self._phased, key=lambda e: e[Entry.PHASE]):
             at = clock.time_of(tick) + entry[Entry.PHASE] * clock.period_ns // PHASES

@@ -149,17 +149,23 @@ class EndOfRun:
         self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
         self._silent = wiring.silent
         self._heard: int | None = None
+        # Under time-slice a message becomes visible at a boundary of its writer's period.
+        is_by_ticks = self._reader is not None and self._reader.spec.protocol == "time-slice"
+        self._every = self._reader.spec.every if self._reader is not None and is_by_ticks else 1
+        self._next = 0
 
     def __call__(self, tick: int) -> int | None:
         """Return the tick at which the run stops, by the messages as of the tick before; None until it is known."""
-        if self._stop_tick is None and self._reader is not None and self._writer is not None:
-            final = max(tick - 1, 0)
-            reading = self._reader.read(final)
+        final = tick - 1
+        if final >= self._next and self._stop_tick is None and self._reader is not None and self._writer is not None:
+            boundary = final - final % self._every
+            self._next = boundary + self._every
+            reading = self._reader.read(boundary)
             if reading.is_new or self._heard is None or self._writer[Block.LOST]:
-                self._heard = final
+                self._heard = boundary
             is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
-            if is_over or final - self._heard >= self._silent:
-                self._stop_tick = max(final + self._linger, tick)
+            if is_over or boundary - self._heard >= self._silent:
+                self._stop_tick = max(boundary + self._linger, tick)
         return self._stop_tick
 
 
