@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
 import os
 import select
 import signal
@@ -14,6 +13,7 @@ from pathlib import Path
 from time import process_time_ns
 
 from rack.backplane.layout import TaskSpec
+from rack.backplane.memory import lock_memory
 
 GONE = "ZX"
 """States of a process that has ended."""
@@ -79,7 +79,6 @@ def pin(core: int) -> None:
 
 LATENCY_REQUEST = Path("/dev/cpu_dma_latency")
 """Device that takes the longest permitted wake-up time of a core, us, while it is open."""
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_NAME, _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 15, 1, 29
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -93,10 +92,7 @@ def take_processor(spec: TaskSpec) -> int:
     priority = spec.priority if set_priority(spec.priority) else 0
     # Ordinary processes wake up to 50 us late without this, to save power.
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    # On fault: locking every page at once would copy all memory that the boards share since their fork.
-    _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
-    gc.freeze()
-    gc.disable()
+    lock_memory()
     return priority
 
 
