@@ -86,11 +86,16 @@ def take_processor(spec: TaskSpec) -> int:
     """
     pin(spec.core)
     priority = spec.priority if set_priority(spec.priority) else 0
+    lock_memory()
+    return priority
+
+
+def lock_memory() -> None:
+    """Keep the memory of the calling process in place: no page is swapped out, and the garbage collector stops."""
     # On fault: locking every page at once would copy all memory that the boards share since their fork.
     _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
     gc.freeze()
     gc.disable()
-    return priority
 
 
 def set_priority(priority: int) -> bool:
