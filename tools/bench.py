@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from rack.tools.console.answer import Json, config_names, print_json
 from rack.tools.console.interrupt import INTERRUPT
+
+if TYPE_CHECKING:
+    from rack.tools.benches.comparison import Comparison
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 
@@ -19,6 +22,11 @@ Config = Annotated[
     typer.Option(
         "--config", metavar="CONFIG", help="config by name, or path to a .toml file", autocompletion=config_names
     ),
+]
+
+Plot = Annotated[Path | None, typer.Option(metavar="DIR", help="write the figures as PNG and SVG into this folder")]
+Against = Annotated[
+    Path | None, typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one")
 ]
 
 
@@ -122,6 +130,18 @@ def response(
         if not as_json:
             print(f"pictures: {', '.join(map(str, paths))}")
     raise typer.Exit(0 if measured.held else 1)
+
+
+def _show(found: Comparison, plot: Path | None, as_json: bool) -> None:
+    """Print a comparison and, if asked for, plot it."""
+    from rack.tools.console.tables import terminal_width
+
+    _print(found.document(), found.lines(terminal_width()), as_json)
+    if plot is not None:
+        plot.mkdir(parents=True, exist_ok=True)
+        paths = found.plot(plot)
+        if not as_json:
+            print(f"pictures: {', '.join(map(str, paths))}")
 
 
 def _print(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
