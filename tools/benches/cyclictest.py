@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rack.backplane.process import set_priority
-from rack.boards.config.resolved import PERMIT
 from rack.tools.benches.comparison import Absent, absent_program
 from rack.tools.console.answer import Failure
 
@@ -49,7 +48,7 @@ def absent_cyclictest() -> Absent | None:
     """Return what `cyclictest` lacks; None if it can run."""
     if absent := absent_program(CYCLICTEST, CYCLICTEST, "rt-tests"):
         return absent
-    return None if permits_fifo() else Absent(CYCLICTEST, "SCHED_FIFO is refused", PERMIT)
+    return None if permits_fifo() else Absent(CYCLICTEST, "SCHED_FIFO is refused", "a real-time limit, ulimit -r")
 
 
 def permits_fifo() -> bool:
