@@ -198,7 +198,8 @@ class Comparison:
 
         own = [sample for sample in self.samples if sample.case == case]
         alike = [sample for sample in self.samples if sample.unit == own[0].unit]
-        low, high = min(sample.best for sample in alike), max(sample.p99 for sample in alike)
+        # A best of 0 has no place on a logarithmic axis.
+        low, high = min(sample.best or sample.median for sample in alike), max(sample.p99 for sample in alike)
         for sample in own:
             row = self.contestants.index(sample.who)
             is_baseline = self.baselines.get(case) == sample.who
