@@ -24,7 +24,7 @@ from rack.tools.benches.chain import LONGEST, PRIORITY, Chain
 from rack.tools.benches.chain_figures import RATE_HZ, Boards, ChainFigures
 from rack.tools.benches.checkout import RackCommand, checkout, this_rack
 from rack.tools.benches.comparison import turns
-from rack.tools.benches.cyclictest import Grid, absent_cyclictest, cyclictest, overdue
+from rack.tools.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.benches.observed import Observed, missed_share, observe
 from rack.tools.console.progress import Progress
 
@@ -80,7 +80,7 @@ class _ChainRuns:
         self, chain: Chain, seconds: float, peers: tuple[int, ...], configs: list[tuple[RackCommand, Path]]
     ) -> None:
         self.chain, self._seconds = chain, seconds
-        self._grid = Grid(peers, round(1e9 / RATE_HZ), max(1, round(seconds * RATE_HZ)), PRIORITY)
+        self._grid = WakeGrid(peers, round(1e9 / RATE_HZ), max(1, round(seconds * RATE_HZ)), PRIORITY)
         self._runs: list[Observed] = []
         self._late: list[np.ndarray] = []
         self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack, _ in configs}

@@ -14,7 +14,7 @@ from rack.boards.config.schema import Wake
 from rack.levels.timing.trace_times import lateness_ns
 from rack.tools.benches.chain import PRIORITY, Chain
 from rack.tools.benches.comparison import Absent, Comparison, Sample, interleaved
-from rack.tools.benches.cyclictest import CYCLICTEST, Grid, absent_cyclictest, cyclictest, permits_fifo
+from rack.tools.benches.cyclictest import CYCLICTEST, WakeGrid, absent_cyclictest, cyclictest, permits_fifo
 from rack.tools.benches.linuxcnc import LINUXCNC, absent_linuxcnc, linuxcnc
 from rack.tools.benches.observed import SETTLE_NS, observe
 from rack.tools.benches.sleeper import sleep_loop
@@ -25,7 +25,7 @@ RATES_HZ = (50, 400, 1000, 2000)
 BARE = "clock_nanosleep, Python"
 LAUNCH_S = 1.5
 """About how long starting and ending a contestant take."""
-Contestants = dict[str, Callable[[Grid], np.ndarray]]
+Contestants = dict[str, Callable[[WakeGrid], np.ndarray]]
 
 
 def measure(rates_hz: tuple[int, ...], seconds: float, rounds: int, progress: Progress) -> Comparison:
@@ -38,7 +38,7 @@ def measure(rates_hz: tuple[int, ...], seconds: float, rounds: int, progress: Pr
     for rate_hz in rates_hz:
         progress.begin(f"{rate_hz} Hz")
         wakes = max(1, round(seconds * rate_hz))
-        grid = Grid((cores[-1],), round(1e9 / rate_hz), wakes, PRIORITY if is_fifo else 0)
+        grid = WakeGrid((cores[-1],), round(1e9 / rate_hz), wakes, PRIORITY if is_fifo else 0)
         turns = {who: partial(_attempt, one, grid) for who, one in contestants.items()}
         for who, found in interleaved(turns, rounds).items():
             reasons = [late for late in found if isinstance(late, str)]
@@ -53,7 +53,7 @@ def measure(rates_hz: tuple[int, ...], seconds: float, rounds: int, progress: Pr
     return Comparison("clock", title, tuple(samples), {f"{rate} Hz": CYCLICTEST for rate in rates_hz}, tuple(absent))
 
 
-def _attempt(contestant: Callable[[Grid], np.ndarray], grid: Grid) -> np.ndarray | str:
+def _attempt(contestant: Callable[[WakeGrid], np.ndarray], grid: WakeGrid) -> np.ndarray | str:
     """Return a contestant's lateness, or why it did not run."""
     try:
         return contestant(grid)
@@ -77,7 +77,7 @@ def _contestants() -> tuple[Contestants, list[Absent]]:
     return found, absent
 
 
-def board(wake: Wake, grid: Grid) -> np.ndarray:
+def board(wake: Wake, grid: WakeGrid) -> np.ndarray:
     """Return the lateness of an empty board's cycles, us, shape (n,): from its trace."""
     chain = Chain(1, round(1e9 / grid.period_ns), wake=wake)
     seconds = (grid.wakes * grid.period_ns + SETTLE_NS) * 1e-9

@@ -27,7 +27,7 @@ PATIENCE_S = 30.0
 
 
 @dataclass(frozen=True)
-class Grid:
+class WakeGrid:
     """Points in time to sleep to: `wakes` of them, `period_ns` apart.
 
     The first of `cores` has the sleeper; `cyclictest` has one on each. `priority` is of SCHED_FIFO.
@@ -56,7 +56,7 @@ def permits_fifo() -> bool:
     return set_priority(1) and set_priority(0)
 
 
-def cyclictest(grid: Grid) -> np.ndarray:
+def cyclictest(grid: WakeGrid) -> np.ndarray:
     """Return the lateness of every wake, us, shape (n,): smallest first, a thread at a time.
 
     Raises `Failure` if it cannot run.

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rack.tools.benches.comparison import Absent, absent_program
-from rack.tools.benches.cyclictest import Grid
+from rack.tools.benches.cyclictest import WakeGrid
 from rack.tools.console.answer import Failure
 
 LINUXCNC = "LinuxCNC thread"
@@ -48,7 +48,7 @@ def absent_linuxcnc() -> Absent | None:
     return absent_program(LINUXCNC, PROGRAM, PACKAGE)
 
 
-def linuxcnc(grid: Grid) -> np.ndarray:
+def linuxcnc(grid: WakeGrid) -> np.ndarray:
     """Return the lateness of every run of the thread, us, shape (n,). Raises `Failure` if LinuxCNC does not run it."""
     with TemporaryDirectory(prefix="rack-bench-", ignore_cleanup_errors=True) as folder:
         pipe = subprocess.PIPE
@@ -98,7 +98,7 @@ def _await_thread(hal: subprocess.Popen[str]) -> int:
     raise Failure(f"{LINUXCNC}: {_reason(hal.communicate()[1])}")
 
 
-def _schedule(thread: int, grid: Grid) -> None:
+def _schedule(thread: int, grid: WakeGrid) -> None:
     os.sched_setaffinity(thread, {grid.cores[0]})
     policy = os.SCHED_FIFO if grid.priority else os.SCHED_OTHER
     with suppress(PermissionError):

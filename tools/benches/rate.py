@@ -20,7 +20,7 @@ from rack.boards.config import RackConfig, load
 from rack.boards.config.layout import obtained_core
 from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
 from rack.tools.benches.comparison import Absent, turns
-from rack.tools.benches.cyclictest import CYCLICTEST, Grid, absent_cyclictest, cyclictest, overdue
+from rack.tools.benches.cyclictest import CYCLICTEST, WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.benches.observed import Observed, missed_share, observe
 from rack.tools.console.answer import Failure
 from rack.tools.console.pictures import paths_of, picture
@@ -183,7 +183,7 @@ def measure(name: str, rates_hz: Sequence[float], seconds: float, rounds: int, p
     for rate_hz, rack in racks.items():
         progress.begin(f"{rate_hz:g} Hz")
         priority = config.board[board].priority or 1
-        grid = Grid((core,), round(1e9 / rate_hz), max(1, round(seconds * rate_hz)), priority)
+        grid = WakeGrid((core,), round(1e9 / rate_hz), max(1, round(seconds * rate_hz)), priority)
         runs: list[Observed] = []
         late: list[np.ndarray] = []
         for _, who in turns(("rack",) if absent else ("rack", CYCLICTEST), rounds):

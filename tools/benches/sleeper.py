@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.process import die_with_parent, lock_memory, pin, set_priority
-from rack.tools.benches.cyclictest import Grid
+from rack.tools.benches.cyclictest import WakeGrid
 from rack.tools.console.answer import Failure
 
 HEAD_START_NS = 50_000_000
 
 
-def sleep_loop(grid: Grid) -> np.ndarray:
+def sleep_loop(grid: WakeGrid) -> np.ndarray:
     """Return the lateness of every wake, us, shape (n,). Raises `Failure` if the process does not finish.
 
     `time.sleep` is `clock_nanosleep` until a point of CLOCK_MONOTONIC. Like a board that is late, it skips the points
@@ -37,7 +37,7 @@ def sleep_loop(grid: Grid) -> np.ndarray:
     return found[found >= 0] * 1e-3
 
 
-def _sleep(parent: int, grid: Grid, late_ns: Any) -> None:
+def _sleep(parent: int, grid: WakeGrid, late_ns: Any) -> None:
     die_with_parent(parent)
     pin(grid.cores[0])
     set_priority(grid.priority)

@@ -11,7 +11,7 @@ import pytest
 from rack.boards.config.schema import Wake
 from rack.tools.benches import clock
 from rack.tools.benches.clock import BARE, board, measure
-from rack.tools.benches.cyclictest import CYCLICTEST, Grid
+from rack.tools.benches.cyclictest import CYCLICTEST, WakeGrid
 from rack.tools.benches.linuxcnc import LINUXCNC
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
@@ -49,7 +49,7 @@ def test_peers_that_the_machine_lacks_are_named(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_peer_that_fails_is_named_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(grid: Grid) -> np.ndarray:
+    def fail(grid: WakeGrid) -> np.ndarray:
         raise Failure("cyclictest: Unable to change scheduling policy!")
 
     monkeypatch.setattr(clock, "_contestants", lambda: ({CYCLICTEST: fail}, []))
@@ -68,5 +68,5 @@ def test_a_machine_without_real_time_says_so_and_measures(monkeypatch: pytest.Mo
 
 
 def test_the_start_of_a_run_is_left_out() -> None:
-    grid = Grid((0,), 2_500_000, 40, 80)
+    grid = WakeGrid((0,), 2_500_000, 40, 80)
     assert 0 < len(board("signal", grid)) <= grid.wakes

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from rack.tools.benches.comparison import Absent
-from rack.tools.benches.cyclictest import Grid, absent_cyclictest, cyclictest, overdue
+from rack.tools.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.console.answer import Failure
 from tests.machine import needs_fifo
 from tests.tools.benches import peers
 
-GRID = Grid((0,), 1_000_000, 50, 80)
+GRID = WakeGrid((0,), 1_000_000, 50, 80)
 needs_cyclictest = pytest.mark.skipif(shutil.which("cyclictest") is None, reason="needs cyclictest (rt-tests)")
 
 
@@ -32,7 +32,7 @@ def test_wakes_beyond_the_histogram_count_as_the_latest(tmp_path: Path, monkeypa
     assert np.unique(found, return_counts=True)[1].tolist() == [47, 1, 2]
     assert found.max() == 150_000.0
     # A thread on every core.
-    assert len(cyclictest(Grid((0, 1), 1_000_000, 50, 80))) == 100
+    assert len(cyclictest(WakeGrid((0, 1), 1_000_000, 50, 80))) == 100
 
 
 def test_a_refusal_is_a_failure_in_its_own_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

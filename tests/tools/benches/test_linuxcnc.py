@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from rack.tools.benches.comparison import Absent
-from rack.tools.benches.cyclictest import Grid, permits_fifo
+from rack.tools.benches.cyclictest import WakeGrid, permits_fifo
 from rack.tools.benches.linuxcnc import absent_linuxcnc, lateness_us, linuxcnc
 from rack.tools.console.answer import Failure
 from tests.tools.benches import peers
 
-GRID = Grid((min(os.sched_getaffinity(0)),), 1_000_000, 60, 80 if permits_fifo() else 0)
+GRID = WakeGrid((min(os.sched_getaffinity(0)),), 1_000_000, 60, 80 if permits_fifo() else 0)
 needs_linuxcnc = pytest.mark.skipif(shutil.which("halrun") is None, reason="needs LinuxCNC (linuxcnc-uspace)")
 
 
