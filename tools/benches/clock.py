@@ -49,7 +49,8 @@ def measure(rates_hz: tuple[int, ...], seconds: float, rounds: int, progress: Pr
                 absent.append(Absent(f"{who} at {rate_hz} Hz", reasons[0], "nothing is missing"))
         progress.end(turn_s * rounds * len(contestants), "done", ())
     refused = "" if is_fifo else "; SCHED_FIFO is refused, so all run under ordinary scheduling"
-    title = f"lateness: from grid point to start, on core {cores[-1]}{refused}"
+    own_grid = f"; {LINUXCNC}: after its earliest run" if LINUXCNC in contestants else ""
+    title = f"lateness: from grid point to start, on core {cores[-1]}{own_grid}{refused}"
     return Comparison("clock", title, tuple(samples), {f"{rate} Hz": CYCLICTEST for rate in rates_hz}, tuple(absent))
 
 

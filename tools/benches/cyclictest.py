@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -63,18 +63,30 @@ def cyclictest(grid: WakeGrid) -> np.ndarray:
     """
     with TemporaryDirectory(prefix="rack-bench-") as folder:
         path = Path(folder) / "found.json"
-        # The power management of the processor stays as the boards have it, too.
-        command = [CYCLICTEST, "--default-system", "--quiet", "--mlockall", "--policy=fifo"]
+        command = [CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo"]
         command += [f"--affinity={','.join(map(str, grid.cores))}", f"--threads={len(grid.cores)}"]
         command += [f"--priority={grid.priority}", f"--interval={grid.period_ns // 1000}", "--distance=0"]
         command += [f"--loops={grid.wakes}", f"--histogram={LONGEST_US}", f"--json={path}"]
-        done = subprocess.run(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, timeout=grid.patience_s, check=False
-        )
-        if done.returncode or not path.is_file():
-            raise Failure(f"{CYCLICTEST}: {' '.join(done.stderr.split()) or f'exit status {done.returncode}'}")
+        errors = _run(command, grid.patience_s)
+        if errors or not path.is_file():
+            raise Failure(f"{CYCLICTEST}: {errors or 'it wrote no figures'}")
         threads = json.loads(path.read_text())["thread"].values()
     return np.concatenate([np.fromiter(_lateness_us(thread), float) for thread in threads])
+
+
+def _run(command: Sequence[str], patience_s: float) -> str:
+    """Run it to its end; return why it failed, empty if it did not."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        _, errors = process.communicate(timeout=patience_s)
+    except subprocess.TimeoutExpired:
+        return f"still running after {patience_s:g} s"
+    finally:
+        if process.poll() is None:
+            # In order: killed, it would leave its shared memory.
+            process.terminate()
+            process.communicate()
+    return (" ".join(errors.split()) or f"exit status {process.returncode}") if process.returncode else ""
 
 
 def _lateness_us(thread: dict[str, object]) -> Iterator[float]:

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import os
 import pwd
+import signal
 import subprocess
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,7 +28,7 @@ LINUXCNC = "LinuxCNC thread"
 PACKAGE, PROGRAM = "linuxcnc-uspace", "halrun"
 THREAD = "rtapi_app:T#0"
 """Name that LinuxCNC gives to its first realtime thread."""
-START_S = 10.0
+START_S, END_S = 10.0, 5.0
 SETUP = """\
 loadrt threads name1=grid period1={period_ns} fp1=0
 loadrt timedelta count=1
@@ -50,21 +52,17 @@ def absent_linuxcnc() -> Absent | None:
 
 def linuxcnc(grid: WakeGrid) -> np.ndarray:
     """Return the lateness of every run of the thread, us, shape (n,). Raises `Failure` if LinuxCNC does not run it."""
-    with TemporaryDirectory(prefix="rack-bench-", ignore_cleanup_errors=True) as folder:
-        pipe = subprocess.PIPE
-        hal = subprocess.Popen(
-            [PROGRAM], cwd=folder, env=_environment(Path(folder)), stdin=pipe, stdout=pipe, stderr=pipe, text=True
-        )
+    with TemporaryDirectory(prefix="rack-bench-") as folder, _hal(Path(folder)) as hal:
         assert hal.stdin is not None
-        try:
+        # If it has ended, its stderr says why.
+        with suppress(BrokenPipeError):
             hal.stdin.write(SETUP.format(period_ns=grid.period_ns))
             hal.stdin.flush()
-            _schedule(_await_thread(hal), grid)
+        _schedule(_await_thread(hal), grid)
+        try:
             out, err = hal.communicate(MEASURE.format(samples=grid.wakes + LEAD), grid.patience_s)
-        finally:
-            if hal.poll() is None:
-                hal.terminate()
-                hal.communicate()
+        except subprocess.TimeoutExpired:
+            raise Failure(f"{LINUXCNC}: still running after {grid.patience_s:g} s") from None
     found = np.array([line for line in out.split() if line.lstrip("-").isdigit()][LEAD:], np.int64)
     if not len(found):
         raise Failure(f"{LINUXCNC}: {_reason(err)}")
@@ -75,6 +73,28 @@ def lateness_us(intervals_ns: np.ndarray, period_ns: int) -> np.ndarray:
     """Return how late each run came after the earliest one's grid, us, shape (n,), from the time since the last run."""
     late_ns = np.cumsum(intervals_ns - period_ns)
     return np.asarray((late_ns - late_ns.min()) * 1e-3)
+
+
+@contextmanager
+def _hal(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """Give a LinuxCNC that takes HAL commands on stdin; nothing of it is left when the context ends."""
+    pipe, environment = subprocess.PIPE, _environment(folder)
+    hal = subprocess.Popen(
+        [PROGRAM], cwd=folder, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
+    try:
+        yield hal
+    finally:
+        if hal.poll() is None:
+            os.killpg(hal.pid, signal.SIGKILL)
+            hal.wait()
+            # Its realtime process is a daemon: it outlives its command line, and keeps the pipes open.
+            end, none = [PROGRAM, "-U"], subprocess.DEVNULL
+            subprocess.run(end, cwd=folder, env=environment, stdout=none, stderr=none, timeout=END_S, check=False)
+        for stream in (hal.stdin, hal.stdout, hal.stderr):
+            if stream is not None:
+                with suppress(BrokenPipeError):
+                    stream.close()
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -94,7 +114,8 @@ def _await_thread(hal: subprocess.Popen[str]) -> int:
                 if name.read_text().strip() == THREAD:
                     return int(name.parent.name)
         time.sleep(0.02)
-    hal.terminate()
+    if hal.poll() is None:
+        raise Failure(f"{LINUXCNC}: it started no thread within {START_S:g} s")
     raise Failure(f"{LINUXCNC}: {_reason(hal.communicate()[1])}")
 
 
