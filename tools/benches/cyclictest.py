@@ -48,7 +48,11 @@ def absent_cyclictest() -> Absent | None:
     """Return what `cyclictest` lacks; None if it can run."""
     if absent := absent_program(CYCLICTEST, CYCLICTEST, "rt-tests"):
         return absent
-    return None if permits_fifo() else Absent(CYCLICTEST, "SCHED_FIFO is refused", "a real-time limit, ulimit -r")
+    return (
+        None
+        if permits_fifo()
+        else Absent(CYCLICTEST, "SCHED_FIFO is refused", "raise the limit 'rtprio', which `ulimit -r` shows")
+    )
 
 
 def permits_fifo() -> bool:

@@ -14,6 +14,7 @@ from rack.tools.benches.chain import LONGEST, Chain
 from rack.tools.benches.chain_figures import Boards, ChainFigures, Fit
 from rack.tools.console.progress import Progress
 from tests.test_architecture import ROOT
+from tests.tools.command_line import rack
 
 SHORT = ChainFigures(2, 800, 150.0, 0.0, 0.0, {2: 400}, {2: 400}, {"this tree": 120.0})
 
@@ -68,3 +69,9 @@ def test_costs_on_a_line_are_found_to_be_linear() -> None:
     assert bent is not None
     assert bent.r2 < 0.95
     assert Fit.of((1, 20), (1.0, 2.0)) is None
+
+
+def test_a_crate_takes_no_longer_chain() -> None:
+    done = rack("bench", "boards", "--count", LONGEST + 1)
+    assert done.returncode == 2
+    assert f"up to {LONGEST} boards" in done.stderr

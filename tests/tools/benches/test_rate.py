@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from tests.boards.conftest import PLAIN
 from tests.tools.benches import peers
+from tests.tools.command_line import rack
 
 HELD = RateFigures(400.0, 6000, 0.0012, 0.0005, None, 500.0, "")
 RATES = Rates("nasrem", "servo", 1, (HELD, replace(HELD, rate_hz=1000.0, missed=0.0016)), None)
@@ -22,17 +24,17 @@ RATES = Rates("nasrem", "servo", 1, (HELD, replace(HELD, rate_hz=1000.0, missed=
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 def test_only_the_servo_level_changes_its_rate(rate_hz: int) -> None:
     config = load("nasrem")
-    rack = at_rate(config, rate_hz)
-    tasks = {task.name: task for task in wire(rack).tasks}
+    found = at_rate(config, rate_hz)
+    tasks = {task.name: task for task in wire(found).tasks}
     assert tasks["servo"].every == 1
-    assert rack.clock.period_ms == pytest.approx(1000 / rate_hz)
+    assert found.clock.period_ms == pytest.approx(1000 / rate_hz)
     # Of the rates, 1250 Hz alone is no multiple of 4 Hz.
     for name in config.board:
         before = config.every(name) * config.clock.period_ms
-        assert name == "servo" or rack.every(name) * rack.clock.period_ms == pytest.approx(before, rel=0.002)
-    assert tasks["servo.planner"].within_cycles * rack.clock.period_ms == pytest.approx(20.0)
-    assert rack.robot is not None
-    step_ms = rack.clock.period_ms / rack.robot.substeps
+        assert name == "servo" or found.every(name) * found.clock.period_ms == pytest.approx(before, rel=0.002)
+    assert tasks["servo.planner"].within_cycles * found.clock.period_ms == pytest.approx(20.0)
+    assert found.robot is not None
+    step_ms = found.clock.period_ms / found.robot.substeps
     assert STEP_MS / 2 < step_ms <= STEP_MS * 1.000001
 
 
@@ -79,3 +81,15 @@ def test_late_wakes_of_cyclictest_are_a_share_of_its_own(tmp_path: Path, monkeyp
     (one,) = measure(str(path), (400,), 0.3, 2, Progress()).figures
     # Of 120 wakes two rounds have two at 2.5 ms and four at 150 ms: 1 and 60 points of this grid.
     assert one.late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
+
+
+def test_the_command_prints_one_document(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "waves.toml"
+    path.write_text(PLAIN)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    options = ("--rate", 400, "--seconds", 0.2, "--rounds", 1, "--plot", tmp_path)
+    done = rack("bench", "rate", "--config", path, *options, "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert [one["rate_hz"] for one in found["rates"]] == [400]
+    assert (tmp_path / "rate.png").is_file()
