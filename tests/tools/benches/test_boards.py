@@ -27,20 +27,20 @@ def test_a_chain_of_boards_fills_the_crate() -> None:
 
 def test_messages_take_as_many_cycles_as_there_are_boards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = measure((1, 3, 5), 0.3, 1, ROOT, Progress())
+    found = measure((2, 5), 0.2, 1, ROOT, Progress())
     assert found.exact
     assert found.trees == ("this tree", ROOT.name)
     for one in found.figures:
         assert {*one.lockstep_responses} == {one.boards}
         assert min(one.responses) == one.boards
-        assert 0 < one.cycles <= 120 * one.boards
+        assert 0 < one.cycles <= 80 * one.boards
         assert one.processor_us > 0
         assert all(one.lockstep_us[tree] > 0 for tree in found.trees)
     assert found.absent is not None
     assert any("rt-tests" in line for line in found.lines())
     assert "ratio" in "\n".join(found.lines())
-    assert json.loads(json.dumps(found.document()))["fit"]["r2"] <= 1.0
-    assert all(path.stat().st_size for path in found.plot(tmp_path))
+    # Two points are on a line whatever they are.
+    assert json.loads(json.dumps(found.document()))["fit"] is None
 
 
 def test_a_message_late_without_a_miss_is_not_exact() -> None:
@@ -69,6 +69,17 @@ def test_costs_on_a_line_are_found_to_be_linear() -> None:
     assert bent is not None
     assert bent.r2 < 0.95
     assert Fit.of((1, 20), (1.0, 2.0)) is None
+
+
+def test_costs_are_drawn_with_their_line(tmp_path: Path) -> None:
+    chains = [
+        replace(SHORT, boards=n, processor_us=50.0 * n + 100.0, lockstep_us={"ours": 40.0 * n}) for n in (1, 5, 9)
+    ]
+    found = Boards(tuple(chains), ("ours",), 2, None)
+    assert found.document()["fit"]["board_us"] == pytest.approx(50.0)
+    assert found.document()["lockstep_fit"]["ours"]["board_us"] == pytest.approx(40.0)
+    assert sum("us a board" in line for line in found.lines()) == 2
+    assert all(path.stat().st_size for path in found.plot(tmp_path))
 
 
 def test_a_crate_takes_no_longer_chain() -> None:
