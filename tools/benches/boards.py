@@ -117,13 +117,14 @@ class _ChainRuns:
     def figures(self) -> ChainFigures:
         """Return the figures of all runs; the response in lockstep is that of one more."""
         lockstep = observe(loads(self.chain._replace(mode="lockstep").text()), self._seconds, [self._last])
-        tasks = {name: np.concatenate([run.traces[name] for run in self._runs]) for name in self.chain.names}
-        late = np.concatenate(self._late) if self._late else None
+        names, late = self.chain.names, np.concatenate(self._late) if self._late else None
+        counts = [run.cycles(name) for run in self._runs for name in names]
+        rows = [np.concatenate([run.traces[name] for run in self._runs]) for name in names]
         return ChainFigures(
             boards=self.chain.boards,
-            cycles=sum(map(len, tasks.values())),
-            processor_us=sum(float(np.median(rows["processor_ns"])) for rows in tasks.values()) * 1e-3,
-            missed=missed_share(np.concatenate(list(tasks.values()))),
+            cycles=sum(count.due for count in counts),
+            processor_us=sum(float(np.median(trace["processor_ns"])) for trace in rows if len(trace)) * 1e-3,
+            missed=missed_share(counts),
             late=None if late is None else overdue(late, self._grid.period_ns),
             responses=_responses([run.messages[self._last] for run in self._runs]),
             lockstep_responses=_responses([lockstep.messages[self._last]]),

@@ -197,13 +197,12 @@ def measure(name: str, rates_hz: Sequence[float], seconds: float, rounds: int, p
 
 
 def _figures(rate_hz: float, board: str, runs: Sequence[Observed], late_us: Late, period_ns: int) -> RateFigures:
-    rows = np.concatenate([run.traces[board] for run in runs])
     settled = np.concatenate([run.settled(board) for run in runs])
     ended = [run.outcome for run in runs if not run.outcome.worked]
     return RateFigures(
         rate_hz=rate_hz,
-        cycles=len(rows),
-        missed=missed_share(rows),
+        cycles=sum(run.cycles(board).due for run in runs),
+        missed=missed_share(run.cycles(board) for run in runs),
         late=None if late_us is None else overdue(late_us, period_ns),
         lateness_us=distribution(lateness_ns(settled) * 1e-3),
         processor_us=float(np.median(settled["processor_ns"])) * 1e-3 if len(settled) else 0.0,
