@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 import typer
 
-from rack.tools.console.answer import Json, config_names, print_json
+from rack.tools.console.answer import Failure, Json, config_names, print_json
 from rack.tools.console.interrupt import INTERRUPT
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
@@ -28,6 +28,7 @@ Against = Annotated[
 Share = Annotated[
     bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
 ]
+Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
 
 
 class Shown(Protocol):
@@ -89,6 +90,30 @@ def cycle(
 
     with progress_for(as_json) as progress:
         found = measure(against, seconds, rounds, progress, share)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def lockstep(
+    against: Against = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run, at most")
+    ] = None,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure how fast nasrem, k1607 and fig4 run in lockstep.
+
+    Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one process without a rack.
+    Its messages must be those of the rack, bit for bit. What TREE needs and this environment lacks, give in PYTHONPATH.
+    """
+    from rack.tools.benches.lockstep import RACKS, measure
+    from rack.tools.console.progress import progress_for
+
+    racks = {name: min(filter(None, (own, seconds)), default=None) for name, own in RACKS.items()}
+    with progress_for(as_json) as progress:
+        found = measure(against, racks, rounds, progress)
     _show(found, plot, as_json)
 
 
@@ -174,6 +199,80 @@ def response(
         if not as_json:
             print(f"pictures: {', '.join(map(str, paths))}")
     raise typer.Exit(0 if measured.held else 1)
+
+
+@bench.command()
+def clock(
+    rate: Annotated[list[int] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 2.0,
+    rounds: Rounds = 3,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure how late a board starts: from its grid point to the start of its cycle.
+
+    An empty board waits in each of the ways that a config permits. On the same core, at the same rate and priority,
+    `cyclictest`, a bare loop of clock_nanosleep in Python and a thread of LinuxCNC are measured by turns; ratios are to
+    `cyclictest`.
+    """
+    from rack.tools.benches.clock import RATES_HZ, measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(tuple(rate or RATES_HZ), seconds, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def rate(
+    config: Config = "nasrem",
+    rate: Annotated[list[float] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one run")] = 15.0,
+    rounds: Rounds = 2,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Find the highest servo rate that a rack holds.
+
+    The board that cycles at every tick runs at each rate in turn; the other levels keep their rates. A rate is held if
+    at most 0.1 % of its cycles are missed beyond those that `cyclictest` is late by a cycle, at that rate on that core
+    in the same minutes.
+    """
+    from rack.tools.benches.rate import RATES_HZ, measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(config, rate or RATES_HZ, seconds, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def boards(
+    count: Annotated[
+        list[int] | None, typer.Option(metavar="N", min=1, help="boards; may be given several times")
+    ] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="simulated time of one run")] = 3.0,
+    rounds: Rounds = 3,
+    against: Against = None,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure what empty boards cost by their number.
+
+    They pass a message down a chain at 400 Hz on all cores. The output shows processor time a tick, missed cycles next
+    to those of `cyclictest`, and the cycles that a message takes: as many as there are boards. In lockstep it shows the
+    time of a tick, with --against also that of another checkout. Exit status 1 if a message took another time.
+    """
+    from rack.tools.benches.boards import COUNTS, measure
+    from rack.tools.benches.chain import LONGEST
+    from rack.tools.console.progress import progress_for
+
+    if max(count or COUNTS) > LONGEST:
+        raise Failure(f"--count {max(count or COUNTS)}: a crate takes up to {LONGEST} boards and the clock", 2)
+    with progress_for(as_json) as progress:
+        found = measure(sorted(set(count or COUNTS)), seconds, rounds, against, progress)
+    _show(found, plot, as_json)
+    raise typer.Exit(0 if found.exact else 1)
 
 
 def _show(found: Shown, plot: Path | None, as_json: bool) -> None:

@@ -107,12 +107,13 @@ class Lockstep:
         task: Mapping[str, Any] | None = None,
         seed: int = 1990,
         outside: Mapping[str, MessageType] | None = None,
+        clock_ns: int = CLOCK_NS,
     ) -> None:
         """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`."""
-        self.tick = 0
+        self.tick, self._clock_ns = 0, clock_ns
         self.demand = Demand.NONE
         self._coming: dict[int, list[Callable[[], None]]] = {}
-        self.sizes = sizes(build_cell(robot, scene, CLOCK_NS))
+        self.sizes = sizes(build_cell(robot, scene, clock_ns))
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
@@ -127,7 +128,7 @@ class Lockstep:
                 board=b.name,
                 every=b.every,
                 within_cycles=b.within_cycles,
-                clock_ns=CLOCK_NS,
+                clock_ns=clock_ns,
                 seed=seed,
                 robot=robot,
                 scene=scene,
@@ -199,7 +200,7 @@ class Lockstep:
 
     def run(self, seconds: float, until: Callable[[Lockstep], bool] = lambda rack: False) -> bool:
         """Run for simulated `seconds`, or until `until`, asked every 10 ticks, says so; return what it said last."""
-        end = self.tick + round(seconds * 1e9 / CLOCK_NS)
+        end = self.tick + round(seconds * 1e9 / self._clock_ns)
         while self.tick < end:
             self.step()
             if self.tick % 10 == 0 and until(self):
@@ -209,7 +210,7 @@ class Lockstep:
     @property
     def seconds(self) -> float:
         """Simulated time."""
-        return self.tick * CLOCK_NS * 1e-9
+        return self.tick * self._clock_ns * 1e-9
 
 
 def source(port: Input, board: BoardSpec) -> str:

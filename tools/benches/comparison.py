@@ -69,6 +69,11 @@ class Sample:
         return min(self.values)
 
     @property
+    def worst(self) -> float:
+        """The largest."""
+        return max(self.values)
+
+    @property
     def count(self) -> int:
         """Number of measurements."""
         return len(self.values)
@@ -151,21 +156,21 @@ class Comparison:
         }
 
     def _figures(self, sample: Sample) -> dict[str, Any]:
-        names = ("case", "who", "unit", "count", "median", "p99", "best")
+        names = ("case", "who", "unit", "count", "median", "p99", "best", "worst")
         ratios = {"ratio": self.ratio(sample), "p99_ratio": self.ratio(sample, "p99")}
         return {name: getattr(sample, name) for name in names} | ratios
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as a table for people, fitted to `width`, and the absent contestants."""
         yield self.title
-        head = ["case", "who", "count", "median", "p99", "best", "unit", "ratio", "p99 ratio"]
+        head = ["case", "who", "count", "median", "p99", "best", "worst", "unit", "ratio", "p99 ratio"]
         rows = [self._row(sample) for sample in self.samples]
-        yield from table(head, rows, width, ("count", "p99 ratio", "best"))
+        yield from table(head, rows, width, ("count", "worst", "p99 ratio", "best"))
         for one in self.absent:
             yield one.line
 
     def _row(self, sample: Sample) -> list[str]:
-        figures = [shown(getattr(sample, name)) for name in ("median", "p99", "best")]
+        figures = [shown(getattr(sample, name)) for name in ("median", "p99", "best", "worst")]
         ratios = [decimal(self.ratio(sample, name), 2) for name in ("median", "p99")]
         return [sample.case, sample.who, str(sample.count), *figures, sample.unit, *ratios]
 
@@ -193,7 +198,8 @@ class Comparison:
 
         own = [sample for sample in self.samples if sample.case == case]
         alike = [sample for sample in self.samples if sample.unit == own[0].unit]
-        low, high = min(sample.best for sample in alike), max(sample.p99 for sample in alike)
+        # A best of 0 has no place on a logarithmic axis.
+        low, high = min(sample.best or sample.median for sample in alike), max(sample.p99 for sample in alike)
         for sample in own:
             row = self.contestants.index(sample.who)
             is_baseline = self.baselines.get(case) == sample.who
