@@ -25,6 +25,7 @@ from rack.levels.messages import (
     Verb,
 )
 from rack.levels.motion.path import Path
+from rack.levels.planning import collision
 from rack.levels.planning.moves import Move, Situation, read_window
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.robot.cell import build_cell
@@ -97,6 +98,11 @@ class ElementalMovePlanner(Planner):
         self._tries = 0  # of that job
         self._answered = 0  # newest request answered
         self._answer_due = 0  # tick by which the executor must have used the answer
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of collision checks."""
+        collision.preload()
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether a path is requested, blocked or missing."""

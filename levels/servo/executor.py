@@ -28,7 +28,7 @@ SCENES = Output(SCENE, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
 
 
-class Shown(NamedTuple):
+class Circumstances(NamedTuple):
     """What of a status seldom changes."""
 
     command: int
@@ -82,7 +82,7 @@ class ServoExecutor(Executor):
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._rest = np.zeros(len(cell.home))  # (joints,), always zero: velocity and acceleration at rest
         self._wanted = Motion(cell.home, self._rest, self._rest)  # motion wanted in the last cycle: rad, rad/s, rad/s2
-        self._shown: Shown | None = None  # in the last status
+        self._shown: Circumstances | None = None  # in the last status
         self._started = False  # the first cycle has begun
         self._abandoned = False  # set points were abandoned in the last cycle: the arm was braked
 
@@ -228,10 +228,10 @@ class ServoExecutor(Executor):
             arm.fault,
         )
         if shown != self._shown:
-            self._shown = Shown(*shown)
+            self._shown = Circumstances(*shown)
             self._show(status, self._shown)
 
-    def _show(self, status: Message, shown: Shown) -> None:
+    def _show(self, status: Message, shown: Circumstances) -> None:
         """Fill in what seldom changes."""
         status.echo, status.holding, status.stopped, status.braked = shown[:4]
         status.demand, status.clipped, status.touches, status.violations, status.pushed = shown[4:9]

@@ -10,6 +10,7 @@ from rack.backplane.message import Message
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
+from rack.levels.planning import collision
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
@@ -49,6 +50,11 @@ class TaskPlanner(Planner):
         self._plan: Message | None = None  # made by this process
         self._visible_at = 0  # tick from which it is visible
         self._since: int | None = None  # tick of the first cycle
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of collision checks."""
+        collision.preload()
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether the program is still to be planned and the world is known and at rest."""
