@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -117,9 +117,7 @@ def preload() -> None:
     """Load this module's compiled functions."""
     model, none, table = mujoco.MjModel.from_xml_string("<mujoco/>"), np.zeros(0), np.zeros((0, 3, 0))
     data = mujoco.MjData(model)
-    at, warnings, contacts = (model._address, data._address), data.warning.number, contact_views(model, data)
     joints, touch = np.zeros((2, 0), dtype=int), np.zeros((0, 0), dtype=bool)
-    advance.load()(
-        1, 0.0, *Substeps(*at, none, warnings, none, none, none, none, joints, table, table, *contacts, touch)
-    )
-    copy_state.load()(*at, np.zeros(mujoco.mj_stateSize(model, STATE)))
+    state: list[Any] = [none, data.warning.number, none, none, none, none, joints, table, table]
+    advance.load()(1, 0.0, model._address, data._address, *state, *contact_views(model, data), touch)
+    copy_state.load()(model._address, data._address, np.zeros(mujoco.mj_stateSize(model, STATE)))
