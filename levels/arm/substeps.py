@@ -119,5 +119,6 @@ def preload() -> None:
     data = mujoco.MjData(model)
     joints, touch = np.zeros((2, 0), dtype=int), np.zeros((0, 0), dtype=bool)
     state: list[Any] = [none, data.warning.number, none, none, none, none, joints, table, table]
-    advance.load()(1, 0.0, model._address, data._address, *state, *contact_views(model, data), touch)
+    state += [*contact_views(model, data), touch]
+    advance.load()(1, 0.0, model._address, data._address, *state)
     copy_state.load()(model._address, data._address, np.zeros(mujoco.mj_stateSize(model, STATE)))
