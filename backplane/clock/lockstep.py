@@ -58,16 +58,12 @@ class LockstepDriver(ClockDriver):
     def _step(self, tick: int, last: int) -> bool:
         """Do one tick; False when the launcher is gone."""
         due = self.due(tick, last)
-        if self._one_at_a_time:
-            for task in due:
-                task.release(tick)
+        for task in due:
+            task.release(tick)
+            if task.is_posted:
                 task.wake()
-                if not self._wait(task, task.is_settled):
-                    return False
-        else:
-            for task in due:
-                task.release(tick)
-                task.wake()
+            if self._one_at_a_time and not self._wait(task, task.is_settled):
+                return False
         self.check(due, tick)
         return self._wait_for_all(tick + 1)
 

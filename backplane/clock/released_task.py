@@ -29,11 +29,11 @@ LEAST_NS = 1_000_000_000
 class ReleasedTask:
     """The clock's end of a task's control block.
 
-    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `missed` counts
+    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `is_posted`: it
+    waits for its semaphore, which `wake()` posts. `done`: the semaphore that it posts in lockstep. `missed` counts
     releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
-    finishes none. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
-    `wake()` posts its semaphore. `done`: posted by the task, in lockstep. `deadline`: tick before which its release, or plan, must be finished, as
-    last seen; it only moves later.
+    finishes none. `deadline`: tick before which its release, or plan, must be finished, as last seen; it only moves
+    later. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -41,6 +41,7 @@ class ReleasedTask:
         self.index = segment.layout.tasks.index(spec)
         self.block = segment.block(spec.name)
         self.sleeps = spec.wake == "timer"
+        self.is_posted = spec.wake != "poll"
         self.missed = 0
         self.is_stopped = False
         self.deadline = self.block[_DEADLINE]
