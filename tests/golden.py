@@ -23,6 +23,7 @@ from rack.boards.crate.line import environment
 FILE = Path(__file__).with_suffix(".toml")
 RUNS = (
     "nasrem --seconds 14",
+    "nasrem-1khz --seconds 8",
     "crossing --seconds 14",
     "k1607",
     "nasrem --faults bad-sensors --seconds 8",

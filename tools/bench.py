@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import typer
 
-from rack.tools.console.answer import Json, config_names, print_json
+from rack.tools.console.answer import Failure, Json, config_names, print_json
 from rack.tools.console.interrupt import INTERRUPT
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
@@ -21,6 +21,28 @@ Config = Annotated[
     ),
 ]
 
+Plot = Annotated[Path | None, typer.Option(metavar="DIR", help="write the figures as PNG and SVG into this folder")]
+Against = Annotated[
+    Path | None, typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one")
+]
+Share = Annotated[
+    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
+]
+Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
+
+
+class Shown(Protocol):
+    """What a bench has found, as far as it is shown."""
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield it as text for people, fitted to `width`."""
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write its pictures into `folder`; return their paths."""
+
 
 @bench.callback()
 def interruptible(context: typer.Context) -> None:
@@ -29,15 +51,70 @@ def interruptible(context: typer.Context) -> None:
 
 
 @bench.command()
-def mailbox(as_json: Json = False) -> None:
-    """Measure a write and a read of 200 bytes, by protocol.
+def mailbox(
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 60,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure a message, written and read, next to other ways of inter-process communication.
 
-    Figures are medians; on a busy machine look at the best ones.
+    Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes and queues of
+    multiprocessing, and zenoh. The ratio is to the best of these peers. A raw copy is the least that can be done, and
+    zenoh within one session never leaves its process: these two are no peers.
     """
-    from rack.tools.benches.mailbox import lines_of, measure
+    from rack.tools.benches.mailbox import CASES, measure
+    from rack.tools.console.progress import progress_for
 
-    costs = measure()
-    _print({"mailbox": [asdict(cost) for cost in costs]}, lines_of(costs), as_json)
+    with progress_for(as_json) as progress:
+        found = measure(CASES, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def cycle(
+    against: Against = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")] = 6.0,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    share: Share = False,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure the processor time of a board's cycle, by part.
+
+    Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns with another checkout.
+    The servo board is also compared with bare mj_step calls: the physics of its recorded run, replayed alone. What
+    TREE needs and this environment lacks, give in PYTHONPATH.
+    """
+    from rack.tools.benches.cycle import measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(against, seconds, rounds, progress, share)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def lockstep(
+    against: Against = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run, at most")
+    ] = None,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure how fast nasrem, k1607 and fig4 run in lockstep.
+
+    Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one process without a rack.
+    Its messages must be those of the rack, bit for bit. What TREE needs and this environment lacks, give in PYTHONPATH.
+    """
+    from rack.tools.benches.lockstep import RACKS, measure
+    from rack.tools.console.progress import progress_for
+
+    racks = {name: min(filter(None, (own, seconds)), default=None) for name, own in RACKS.items()}
+    with progress_for(as_json) as progress:
+        found = measure(against, racks, rounds, progress)
+    _show(found, plot, as_json)
 
 
 @bench.command()
@@ -122,6 +199,92 @@ def response(
         if not as_json:
             print(f"pictures: {', '.join(map(str, paths))}")
     raise typer.Exit(0 if measured.held else 1)
+
+
+@bench.command()
+def clock(
+    rate: Annotated[list[int] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 2.0,
+    rounds: Rounds = 3,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure how late a board starts: from its grid point to the start of its cycle.
+
+    An empty board waits in each of the ways that a config permits. On the same core, at the same rate and priority,
+    `cyclictest`, a bare loop of clock_nanosleep in Python and a thread of LinuxCNC are measured by turns; ratios are to
+    `cyclictest`.
+    """
+    from rack.tools.benches.clock import RATES_HZ, measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(tuple(rate or RATES_HZ), seconds, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def rate(
+    config: Config = "nasrem",
+    rate: Annotated[list[float] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one run")] = 15.0,
+    rounds: Rounds = 2,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Find the highest servo rate that a rack holds.
+
+    The board that cycles at every tick runs at each rate in turn; the other levels keep their rates. A rate is held if
+    at most 0.1 % of its cycles are missed beyond those that `cyclictest` is late by a cycle, at that rate on that core
+    in the same minutes.
+    """
+    from rack.tools.benches.rate import RATES_HZ, measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(config, rate or RATES_HZ, seconds, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def boards(
+    count: Annotated[
+        list[int] | None, typer.Option(metavar="N", min=1, help="boards; may be given several times")
+    ] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="simulated time of one run")] = 3.0,
+    rounds: Rounds = 3,
+    against: Against = None,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure what empty boards cost by their number.
+
+    They pass a message down a chain at 400 Hz on all cores. The output shows processor time a tick, missed cycles next
+    to those of `cyclictest`, and the cycles that a message takes: as many as there are boards. In lockstep it shows the
+    time of a tick, with --against also that of another checkout. Exit status 1 if a message took another time.
+    """
+    from rack.tools.benches.boards import COUNTS, measure
+    from rack.tools.benches.chain import LONGEST
+    from rack.tools.console.progress import progress_for
+
+    if max(count or COUNTS) > LONGEST:
+        raise Failure(f"--count {max(count or COUNTS)}: a crate takes up to {LONGEST} boards and the clock", 2)
+    with progress_for(as_json) as progress:
+        found = measure(sorted(set(count or COUNTS)), seconds, rounds, against, progress)
+    _show(found, plot, as_json)
+    raise typer.Exit(0 if found.exact else 1)
+
+
+def _show(found: Shown, plot: Path | None, as_json: bool) -> None:
+    """Print what a bench has found and, if asked for, plot it."""
+    from rack.tools.console.tables import terminal_width
+
+    _print(found.document(), found.lines(terminal_width()), as_json)
+    if plot is not None:
+        plot.mkdir(parents=True, exist_ok=True)
+        paths = found.plot(plot)
+        if not as_json:
+            print(f"pictures: {', '.join(map(str, paths))}")
 
 
 def _print(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
-from rack.levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
+from rack.levels.level import Demand, Executor, Input, LevelContext, Output, Pace, Planner, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -56,11 +56,11 @@ class Task:
         if isinstance(self.level, Executor):
             self.level.demand = demand
             self.level.process(read, self.write, tick)
-            self._publish(tick + span)
+            self._publish(tick, tick + span)
         elif self.level.wanted(read, tick):
             span *= self.spec.within_cycles
             self.level.plan(read, self.write.plan, tick)
-            self._publish(tick + span)
+            self._publish(tick, tick + span)
         self.due = tick + span
 
     def lose(self, tick: int, finished: bool) -> None:
@@ -88,9 +88,12 @@ class Task:
         self._has[port] = True
         return Reading(value, Verdict.NEW, is_lost)
 
-    def _publish(self, visible_at: int) -> None:
+    def _publish(self, tick: int, visible_at: int) -> None:
+        kinds = self.level.outputs if isinstance(self.level, Executor) else {}
         for port, box in self._outputs.items():
-            box.publish(getattr(self.write, port), visible_at)
+            kind = kinds.get(port)
+            if not isinstance(kind, Output) or kind.is_due(tick, self.spec.every):
+                box.publish(getattr(self.write, port), visible_at)
 
 
 class Lockstep:
@@ -104,17 +107,19 @@ class Lockstep:
         task: Mapping[str, Any] | None = None,
         seed: int = 1990,
         outside: Mapping[str, MessageType] | None = None,
+        clock_ns: int = CLOCK_NS,
     ) -> None:
         """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`."""
-        self.tick = 0
+        self.tick, self._clock_ns = 0, clock_ns
         self.demand = Demand.NONE
         self._coming: dict[int, list[Callable[[], None]]] = {}
-        self.sizes = sizes(build_cell(robot, scene, CLOCK_NS))
+        self.sizes = sizes(build_cell(robot, scene, clock_ns))
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
-            kinds = board.executor.outputs.items()
-            self.boxes |= {f"{board.name}.{port}": Box(kind, self.sizes, board.every) for port, kind in kinds}
+            for port, kind in board.executor.outputs.items():
+                kind, cycles = kind if isinstance(kind, Output) else (kind, 1)
+                self.boxes[f"{board.name}.{port}"] = Box(kind, self.sizes, cycles * board.every)
             if board.planner is not None:
                 self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
             self.boxes[f"{board.name}.operator"] = Box(OPERATOR_COMMAND, self.sizes)
@@ -123,7 +128,7 @@ class Lockstep:
                 board=b.name,
                 every=b.every,
                 within_cycles=b.within_cycles,
-                clock_ns=CLOCK_NS,
+                clock_ns=clock_ns,
                 seed=seed,
                 robot=robot,
                 scene=scene,
@@ -195,7 +200,7 @@ class Lockstep:
 
     def run(self, seconds: float, until: Callable[[Lockstep], bool] = lambda rack: False) -> bool:
         """Run for simulated `seconds`, or until `until`, asked every 10 ticks, says so; return what it said last."""
-        end = self.tick + round(seconds * 1e9 / CLOCK_NS)
+        end = self.tick + round(seconds * 1e9 / self._clock_ns)
         while self.tick < end:
             self.step()
             if self.tick % 10 == 0 and until(self):
@@ -205,7 +210,7 @@ class Lockstep:
     @property
     def seconds(self) -> float:
         """Simulated time."""
-        return self.tick * CLOCK_NS * 1e-9
+        return self.tick * self._clock_ns * 1e-9
 
 
 def source(port: Input, board: BoardSpec) -> str:

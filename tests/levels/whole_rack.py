@@ -30,7 +30,8 @@ class WholeRack(Lockstep):
         assert robot is not None
         task = config.task if actions is None else {"action": list(actions)}
         boards = [board(config, name, (params or {}).get(name, {})) for name in config.board]
-        super().__init__(boards, robot, scene.model_copy(update={"motion": tuple(motion)}), task, config.seed)
+        cell = scene.model_copy(update={"motion": tuple(motion)})
+        super().__init__(boards, robot, cell, task, config.seed, clock_ns=config.clock_ns)
 
     @property
     def task(self) -> Message:

@@ -27,7 +27,7 @@ from rack.levels.timing.trace_times import (
 )
 from rack.tools.analysis.report_markdown import markdown
 from rack.tools.faults.judge import faults
-from rack.tools.runs.history import counted, first_difference, holds, misses, steal
+from rack.tools.runs.history import counted, first_difference, frequency, holds, misses, steal
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
 
@@ -63,6 +63,7 @@ def report_of(recording: Recording) -> Report:
         "folder": str(recording.folder),
         "misses": found,
         "steal": steal(recording),
+        "frequency_mhz": frequency(recording),
         "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
         "holds": holds(recording),
         **faults(recording.events, layout),
@@ -78,7 +79,7 @@ def report_of(recording: Recording) -> Report:
 def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
-        *("misses", "steal", "notes", "holds", "faults", "unexplained", "restarts"),
+        *("misses", "steal", "frequency_mhz", "notes", "holds", "faults", "unexplained", "restarts"),
         *("system_response", "task", "motion", "rows_lost"),
     )
     layout = wire(config)

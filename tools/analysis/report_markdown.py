@@ -17,6 +17,9 @@ Report = dict[str, Any]
 SHOWN = 10
 """Most misses, holds and long responses in the text; report.json has them all."""
 
+CHANGED = 1.05
+"""Ratio of a core's highest to its lowest frequency from which the text mentions it."""
+
 FAULTS = ("fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after")
 COUNTS = ("task", "R", "cycles", "missed", "skipped")
 BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation", "alpha")
@@ -73,7 +76,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     )
     yield from (f"- fault: {fault}" for fault in outcome["faults"])
     yield from (f"- {note}" for note in report["notes"])
-    yield from _steal(report["steal"])
+    yield from _machine(report)
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
     if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
@@ -124,13 +127,17 @@ def _first(rows: Sequence[Any], which: str) -> str:
     return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
 
 
-def _steal(steal: Report) -> Iterator[str]:
-    """Yield how many misses the hypervisor may have caused."""
+def _machine(report: Report) -> Iterator[str]:
+    """Yield what the machine did to its cores: time that the hypervisor took, and changes of frequency."""
+    steal, frequency = report["steal"], report["frequency_mhz"] or {}
     if steal["ms"]:
-        cores = ", ".join(f"core {core} {ms} ms" for core, ms in steal["ms"].items())
-        yield (
-            f"- {steal['missed_during']} of {steal['missed']} misses while the hypervisor had the core; stolen: {cores}"
-        )
+        cores = ", ".join(f"core {core} for {steal['percent'][core]:.2f} %" for core in steal["ms"])
+        during = f"{steal['missed_during']} of {steal['missed']} misses came meanwhile"
+        yield f"- the hypervisor took {cores} of the run (steal); {during}"
+    changed = {core: mhz for core, mhz in frequency.items() if mhz["max"] > CHANGED * mhz["min"]}
+    if changed:
+        cores = ", ".join(f"core {core} {mhz['min']:.0f} to {mhz['max']:.0f} MHz" for core, mhz in changed.items())
+        yield f"- the processor changed its frequency: {cores}"
 
 
 def _against(against: Report | None) -> Iterator[str]:

@@ -1,133 +1,188 @@
-"""Measures an access to a mailbox: a message of 200 bytes, written and read, its fields included."""
+"""A message, written and read: every protocol of ours next to other ways of the same machine.
+
+Each turn numbers a message, sends it, and lets every reader receive it into fields of its own. Filling and taking the
+fields costs every contestant the same, and is left out. All happens in one process: what is compared is the work, not
+the wake-up of another process.
+"""
 
 from __future__ import annotations
 
 import os
-import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from rack.backplane import semaphores
 from rack.backplane.layout import PROTOCOLS, Layout, MailboxSpec, Protocol, TaskSpec
+from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_reader, open_writer
-from rack.backplane.message import Field, command
+from rack.backplane.message import Field, Message, command
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config.layout import field_specs
+from rack.tools.benches.comparison import Absent, Comparison, Sample, absent_package, interleaved
+from rack.tools.benches.transports import PEERS, REFERENCES, Peer, Transport
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
 
-CALLS = 20_000
-ROUNDS = 15
+SIZES = {"64 B": 64, "200 B": 200, "2 kB": 2048, "16 kB": 16384}
+"""Bytes of a message: a serial, and three arrays of numbers."""
+READERS = (1, 4)
+ROUNDS = 60
+BATCH_S = 0.004
+"""About how long one measurement takes: many exchanges, and their mean."""
+CASE_S = 5.0
+"""About how long a case takes."""
 MESSAGE = command(
     "bench",
     1,
     Field("position", "f8", "rad", "joint positions", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
-    Field("torque", "f8", "N m", "joint torques", ("joints",)),
+    Field("torque", "f8", "N m", "joint torques", ("rest",)),
 )
-SIZES = {"joints": 8}
 
 
-@dataclass(frozen=True)
-class MailboxCost:
-    """Cost of an access by one protocol, us: medians over rounds, and the fastest round."""
+class Case(NamedTuple):
+    """A message size and a number of readers."""
 
-    protocol: Protocol
-    bytes: int
-    write_us: float
-    read_us: float
-    write_best_us: float
-    read_best_us: float
+    size: str
+    readers: int
 
+    @property
+    def name(self) -> str:
+        """The case, in words."""
+        return f"{self.size}, {self.readers} reader{'s' if self.readers > 1 else ''}"
 
-def measure() -> list[MailboxCost]:
-    """Return the cost of every protocol; rounds are interleaved, as the machine's speed drifts."""
-    rack = f"bench-{os.getpid()}"
-    layout = _layout(rack)
-    segment = Segment.create(layout, "")
-    semaphores.create(layout)
-    try:
-        accesses = {p: _accesses(segment, p) for p in PROTOCOLS}
-        times: dict[Protocol, list[tuple[float, float]]] = {p: [] for p in PROTOCOLS}
-        for _ in range(ROUNDS):
-            for protocol, (write, both) in accesses.items():
-                times[protocol].append((_us_a_call(write), _us_a_call(both)))
-        return [_cost(layout, protocol, rounds) for protocol, rounds in times.items()]
-    finally:
-        semaphores.unlink(layout)
-        unlink(rack)
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Lengths of the arrays that fill the message."""
+        numbers = SIZES[self.size] // 8 - 1
+        return {"joints": numbers // 3, "rest": numbers - 2 * (numbers // 3)}
 
 
-def _layout(rack: str) -> Layout:
-    size = MESSAGE.dtype(SIZES).itemsize
-    tasks = tuple(TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", "reader")))
-    boxes = tuple(
-        MailboxSpec(
-            name=f"writer.{protocol}",
-            writer="writer",
-            readers=("reader",),
-            protocol=protocol,
-            every=1,
-            delay=1,
-            depth=64,
-            message=MESSAGE.name,
-            version=MESSAGE.version,
-            size=size,
-            fields=field_specs(MESSAGE, SIZES),
-        )
-        for protocol in PROTOCOLS
-    )
-    return Layout(rack, 2_500_000, tasks, boxes)
+CASES = tuple(Case(size, readers) for readers in READERS for size in SIZES)
 
 
-def _accesses(segment: Segment, protocol: Protocol) -> tuple[Callable[[], None], Callable[[], None]]:
-    writer, reader = open_writer(segment, f"writer.{protocol}"), open_reader(segment, f"writer.{protocol}")
-    message, joints, tick = writer.message, np.linspace(-1.0, 1.0, SIZES["joints"]), 0
-
-    def write() -> None:
-        nonlocal tick
-        tick += 1
-        message.id = tick
-        message.position[:] = joints
-        writer.write(tick)
-
-    def read() -> None:
-        reading = reader.read(tick + 1)
-        joints[0] = reading.value.position[0]
-
-    def both() -> None:
-        write()
-        read()
-
-    return write, both
+def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
+    """Measure every contestant that is installed in every case; the baseline of a case is its best peer."""
+    missing = {peer.name: absent_package(peer.name, peer.module) for peer in (*REFERENCES, *PEERS)}
+    present = [peer for peer in (*REFERENCES, *PEERS) if missing[peer.name] is None]
+    progress.total(CASE_S * len(cases))
+    samples: list[Sample] = []
+    for case in cases:
+        progress.begin(case.name)
+        samples += _measure_case(case, present, rounds)
+        progress.end(CASE_S, "done", ())
+    absent = tuple(one for one in missing.values() if one is not None)
+    return compare(samples, absent)
 
 
-def _us_a_call(call: Callable[[], None]) -> float:
-    start = time.perf_counter_ns()
-    for _ in range(CALLS):
-        call()
-    return (time.perf_counter_ns() - start) / CALLS / 1000
+def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison:
+    """Return the comparison of these samples with the best peer of each case."""
+    peers = {peer.name for peer in PEERS}
+    best: dict[str, Sample] = {}
+    for sample in samples:
+        if sample.who in peers and (sample.case not in best or sample.median < best[sample.case].median):
+            best[sample.case] = sample
+    baselines = {case: sample.who for case, sample in best.items()}
+    title = "A message written and read; ratio to the best peer of the case"
+    return Comparison("mailbox", title, tuple(samples), baselines, absent)
 
 
-def _cost(layout: Layout, protocol: Protocol, rounds: list[tuple[float, float]]) -> MailboxCost:
-    # Reading an old message again copies nothing: so a read is the time of a write and a read, less a write.
-    writes, pairs = zip(*rounds, strict=True)
-    write_us, best_us = statistics.median(writes), min(writes)
-    return MailboxCost(
+def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample]:
+    dtype = MESSAGE.dtype(case.lengths)
+    with ExitStack() as stack:
+        transports: dict[str, Transport] = {p: stack.enter_context(_mailbox(p, case)) for p in PROTOCOLS}
+        transports |= {peer.name: stack.enter_context(peer.opened(dtype, case.readers)) for peer in peers}
+        turns = {name: Exchange(name, transport, case.lengths).batch() for name, transport in transports.items()}
+        found = interleaved(turns, rounds)
+    return [Sample(case.name, name, tuple(values), "us") for name, values in found.items()]
+
+
+class Exchange:
+    """One message after another through a transport. Raises `Failure` if a reader receives another message."""
+
+    def __init__(self, name: str, transport: Transport, lengths: dict[str, int]) -> None:
+        self._name, self._transport, self._tick = name, transport, 0
+        message, _, _ = transport
+        for name, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
+            setattr(message, name, np.linspace(-9.0, 9.0, lengths[length]))
+
+    def batch(self) -> Callable[[], float]:
+        """Return a function that makes many exchanges, and returns the us that each took."""
+        self._measure(20)
+        self._check()
+        calls = max(10, int(BATCH_S * 1e6 / self._measure(20)))
+        return partial(self._measure, calls)
+
+    def _measure(self, calls: int) -> float:
+        message, send, readers = self._transport
+        start_ns = time.perf_counter_ns()
+        for tick in range(self._tick + 1, self._tick + calls + 1):
+            message.id = tick
+            send(tick)
+            for read in readers:
+                read(tick)
+        taken_ns = time.perf_counter_ns() - start_ns
+        self._tick += calls
+        return taken_ns / calls * 1e-3
+
+    def _check(self) -> None:
+        """Exchange one message more, and compare what every reader receives with what was sent."""
+        message, send, readers = self._transport
+        self._tick += 1
+        message.id = self._tick
+        message.torque[:] = self._tick
+        sent = bytes(message.raw)
+        send(self._tick)
+        if any(bytes(read(self._tick).raw) != sent for read in readers):
+            raise Failure(f"{self._name}: a reader received another message than the one sent")
+
+
+@contextmanager
+def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
+    """Give a mailbox of ours, in a segment of its own."""
+    rack = f"bench-{os.getpid()}-{protocol}"
+    layout = _layout(rack, protocol, case)
+    with ExitStack() as names:
+        # Before they exist: an interrupt may come at any time.
+        names.callback(unlink, rack)
+        names.callback(semaphores.unlink, layout)
+        segment = Segment.create(layout, "")
+        semaphores.create(layout)
+        (box,) = layout.mailboxes
+        writer = open_writer(segment, box.name)
+        readers = [_reading(open_reader(segment, box.name)) for _ in range(case.readers)]
+    # Open, it needs no name: nothing is left even if this process is killed.
+    yield Transport(writer.message, writer.write, readers)
+
+
+def _reading(reader: Reader) -> Callable[[int], Message]:
+    read, delay = reader.read, reader.spec.delay
+
+    def take(tick: int) -> Message:
+        return read(tick + delay).value
+
+    return take
+
+
+def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
+    readers = tuple(f"reader{number}" for number in range(case.readers))
+    tasks = tuple(TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers)))
+    box = MailboxSpec(
+        name="writer.command",
+        writer="writer",
+        readers=readers,
         protocol=protocol,
-        bytes=layout.mailbox(f"writer.{protocol}").size,
-        write_us=round(write_us, 3),
-        read_us=round(statistics.median(pairs) - write_us, 3),
-        write_best_us=round(best_us, 3),
-        read_best_us=round(min(pairs) - best_us, 3),
+        every=1,
+        delay=1,
+        depth=64,
+        message=MESSAGE.name,
+        version=MESSAGE.version,
+        size=MESSAGE.dtype(case.lengths).itemsize,
+        fields=field_specs(MESSAGE, case.lengths),
     )
-
-
-def lines_of(costs: Sequence[MailboxCost]) -> Iterator[str]:
-    """Yield the figures as text for people."""
-    yield f"mailbox: {costs[0].bytes} bytes, field access to numpy views included; us a call, median (best)"
-    for cost in costs:
-        write = f"{cost.write_us:.2f} ({cost.write_best_us:.2f})"
-        read = f"{cost.read_us:.2f} ({cost.read_best_us:.2f})"
-        yield f"  {cost.protocol:14} write {write:14} read {read}"
+    return Layout(rack, 2_500_000, tasks, (box,))

@@ -16,8 +16,8 @@ from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import System
+from rack.tools.runs.cores import UNMEASURED, CoreMeter
 from rack.tools.runs.spool import Frame, RunFiles, Spool
-from rack.tools.runs.steal import StealMeter
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
@@ -88,8 +88,8 @@ class Recorder:
         self._rings = traces | mailboxes
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)
-        # Lockstep has no deadlines that steal could break.
-        self._steal = None if self._words[System.LOCKSTEP] else StealMeter()
+        # Lockstep has no deadlines that the machine could break.
+        self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         self._is_follower = follower == os.getpid() or not is_alive(follower)
@@ -111,8 +111,8 @@ class Recorder:
             if self._view is not None:
                 self._view.add(name, rows)
         self._spool.flush()
-        if self._steal is not None:
-            self._steal.look()
+        if self._cores is not None:
+            self._cores.look()
         if self._view is not None:
             self._view.advance(tick, self._files.lost)
         self._report_progress(tick)
@@ -143,7 +143,7 @@ class Recorder:
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
         self._spool.flush(now=True)
-        self._files.close([] if self._steal is None else self._steal.stolen)
+        self._files.close(UNMEASURED if self._cores is None else self._cores.record())
         self._spool.remove()
         if self._view is not None:
             self._view.close(self._words[System.TICK] + 1, self._files.lost)

@@ -1,4 +1,4 @@
-"""What happened in a run: misses and steal, holds, and the tick at which two runs diverge."""
+"""What happened in a run: misses, what the machine did to its cores, holds, and the tick at which two runs diverge."""
 
 from __future__ import annotations
 
@@ -52,10 +52,11 @@ def steal(recording: Recording) -> dict[str, Any]:
     """Return the time stolen by the hypervisor, ms by core, and how many of the traced misses it may explain.
 
     A miss counts when its cycle, from release to end, overlaps a measurement in which the steal of its core rose.
+    `percent` is of the run's time. In lockstep, and where the kernel does not count it, steal is not `measured`.
     """
-    stolen_ms: dict[str, int] = {}
-    for found in recording.stolen:
-        stolen_ms[str(found.core)] = stolen_ms.get(str(found.core), 0) + found.ms
+    stolen, lasted_ms = recording.cores.stolen, recording.cores.lasted_ns * 1e-6
+    stolen_ms = {str(core): ms for core, ms in recording.cores.stolen_ms().items()}
+    percent = {core: round(100 * ms / lasted_ms, 3) if lasted_ms else 0.0 for core, ms in stolen_ms.items()}
     missed = during = 0
     ended = recording.ended.get("tasks", {})
     for task in recording.layout.tasks:
@@ -63,11 +64,17 @@ def steal(recording: Recording) -> dict[str, Any]:
         late = cycles[is_missed(cycles)]
         core = ended.get(task.name, {}).get("core", task.core)
         inside = np.zeros(len(late), bool)
-        for span in (span for span in recording.stolen if span.core == core):
+        for span in (span for span in stolen or () if span.core == core):
             inside |= (late["release_ns"] <= span.to_ns) & (late["end_ns"] >= span.from_ns)
         missed += len(late)
         during += int(inside.sum())
-    return {"ms": stolen_ms, "missed": missed, "missed_during": during}
+    measured = {"measured": stolen is not None, "ms": stolen_ms, "percent": percent}
+    return {**measured, "missed": missed, "missed_during": during}
+
+
+def frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
+    """Return lowest and highest MHz by core; None where they were not measured."""
+    return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
 
 
 def holds(recording: Recording) -> list[dict[str, Any]]:

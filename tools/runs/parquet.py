@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.backplane.trace import FIELDS
-from rack.tools.runs.steal import Stolen
+from rack.tools.runs.cores import UNMEASURED, CoreRecord
 
 TRACE_SCHEMA = pa.schema([pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS)])
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
@@ -56,10 +56,10 @@ class CyclesFile:
         self._writer.write_batch(pa.record_batch(arrays, schema=TRACE_SCHEMA), row_group_size=len(rows))
         self._waiting, self._rows = [], 0
 
-    def close(self, lost: Mapping[str, int], stolen: Sequence[Stolen] = ()) -> None:
-        """Finish the file; store the rows lost by task, and the time stolen from the cores, as metadata."""
+    def close(self, lost: Mapping[str, int], cores: CoreRecord = UNMEASURED) -> None:
+        """Finish the file; store the rows lost by task, and what the machine did to its cores, as metadata."""
         self._flush()
-        self._writer.add_key_value_metadata({"lost": json.dumps(lost), "stolen": json.dumps(stolen)})
+        self._writer.add_key_value_metadata({"lost": json.dumps(lost), "cores": cores.text()})
         self._writer.close()
 
 

@@ -20,9 +20,9 @@ from rack.boards.config import RackConfig, loads
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
+from rack.tools.runs.cores import UNMEASURED, CoreRecord
 from rack.tools.runs.parquet import HEAD
 from rack.tools.runs.spool import mend
-from rack.tools.runs.steal import Stolen
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """Errors of reading a damaged file, or a file of another kind."""
@@ -110,11 +110,11 @@ class Recording:
             return {name: count for text in texts for name, count in json.loads(text).items()}
 
     @cached_property
-    def stolen(self) -> list[Stolen]:
-        """When the hypervisor had a core, earliest first; empty if the recorder did not measure it, or was killed."""
+    def cores(self) -> CoreRecord:
+        """What the machine did to its cores; empty if the recorder did not measure it, or was killed."""
         with _naming(self.folder / "cycles.parquet"):
-            found = json.loads(self._cycles.metadata.metadata.get(b"stolen", b"[]"))
-            return [Stolen(*map(int, entry)) for entry in found]
+            text = self._cycles.metadata.metadata.get(b"cores")
+            return UNMEASURED if text is None else CoreRecord.of(text)
 
     def need_all_columns(self) -> None:
         """Raise `Failure` for a trace that lacks columns."""

@@ -14,7 +14,7 @@ import json
 import struct
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -27,8 +27,8 @@ from rack.backplane.mailbox.history import row_dtype
 from rack.backplane.segment import layout_of
 from rack.backplane.trace import RECORD
 from rack.tools.console.answer import Failure
+from rack.tools.runs.cores import UNMEASURED, CoreRecord
 from rack.tools.runs.parquet import CyclesFile, SignalsFile
-from rack.tools.runs.steal import Stolen
 
 CYCLES, SIGNALS, SPOOL = "cycles.parquet", "signals.parquet", "recorder.spool"
 MENDED = "-mended"
@@ -71,10 +71,10 @@ class RunFiles:
         self.lost[name] += lost
         self.taken[name] += lost + len(rows)
 
-    def close(self, stolen: Sequence[Stolen] = ()) -> None:
-        """Finish both files; the trace keeps the time stolen from the cores."""
+    def close(self, cores: CoreRecord = UNMEASURED) -> None:
+        """Finish both files; the trace keeps what the machine did to its cores."""
         tasks = set(self.tasks)
-        self._cycles.close({name: count for name, count in self.lost.items() if name in tasks}, stolen)
+        self._cycles.close({name: count for name, count in self.lost.items() if name in tasks}, cores)
         self._signals.close({name: count for name, count in self.lost.items() if name not in tasks})
 
 

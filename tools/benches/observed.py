@@ -1,0 +1,87 @@
+"""A rack run for its trace alone: the host side reads the rings, and no recorder takes processor time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rack.backplane.layout import Layout
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.ring import Drained, Ring
+from rack.backplane.trace import trace_ring
+from rack.boards import Rack
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Outcome
+from rack.levels.timing.trace_times import is_missed
+
+READ_S = {"realtime": 0.5, "lockstep": 0.02}
+"""Wall-clock time between two readings: the rings hold two seconds of simulated time."""
+SETTLE_NS = 250_000_000
+"""Start of a run, in which caches are cold: no peer is measured in its own."""
+
+
+class CycleCount(NamedTuple):
+    """CycleCount of a task that ended too late or never took place, of all that were due."""
+
+    missed: int
+    due: int
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a run left in its rings: trace records by task, and messages by mailbox, oldest first.
+
+    `lost` counts the records of a task that were overwritten before they were read.
+    """
+
+    traces: dict[str, np.ndarray]
+    lost: dict[str, int]
+    messages: dict[str, np.ndarray]
+    layout: Layout
+    outcome: Outcome
+
+    def settled(self, task: str) -> np.ndarray:
+        """Return the trace of a task after the start of the run."""
+        rows = self.traces[task]
+        return rows[rows["release_ns"] >= rows["release_ns"][0] + SETTLE_NS] if len(rows) else rows
+
+    def cycles(self, task: str) -> CycleCount:
+        """Count the cycles of a task by the clock's grid: skipped ones leave no record. The last tick does not count.
+
+        Its record may be written after the last reading.
+        """
+        rows, last = self.traces[task], self.outcome.ticks - 1
+        due = -(-last // self.layout.task(task).every) - self.lost[task]
+        in_time = np.count_nonzero((rows["tick"] < last) & ~is_missed(rows))
+        return CycleCount(due - int(in_time), due)
+
+
+def observe(config: RackConfig, seconds: float, mailboxes: Sequence[str] = ()) -> Observed:
+    """Run a rack for `seconds` of simulated time, or until its task ends. Raises what `Rack` raises."""
+    with Rack(config) as rack:
+        segment = rack.segment
+        tasks = [task.name for task in segment.layout.tasks]
+        rings: dict[str, Ring] = {name: trace_ring(segment, name) for name in tasks}
+        rings |= {name: MailboxRing(segment, name) for name in mailboxes}
+        drained: dict[str, list[Drained]] = {name: [] for name in rings}
+        rack.start(seconds)
+        is_on = True
+        while is_on:
+            is_on = rack.watch(READ_S[config.clock.mode])
+            for name, ring in rings.items():
+                drained[name].append(ring.drain())
+        assert rack.outcome is not None, "the run is over"
+        rows = {name: np.concatenate([block.rows for block in blocks]) for name, blocks in drained.items()}
+        lost = {name: sum(block.lost for block in drained[name]) for name in tasks}
+        layout = segment.layout
+    traces, messages = {name: rows[name] for name in tasks}, {name: rows[name] for name in mailboxes}
+    return Observed(traces, lost, messages, layout, rack.outcome)
+
+
+def missed_share(counts: Iterable[CycleCount]) -> float:
+    """Return the share of the cycles that were missed, of several tasks or runs together."""
+    missed, due = map(sum, zip(*counts, strict=True))
+    return missed / due if due else 0.0
