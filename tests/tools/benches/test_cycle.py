@@ -43,6 +43,14 @@ def test_bookkeeping_that_a_trace_does_not_separate_is_part_of_waking_up() -> No
     assert [times[0] for times in parts_of(trace(50)).values()] == [13.0, 3.0, 30.0, 4.0, 0.0]
 
 
+def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
+    one = trace(50)
+    one.rows["end_ns"] = one.rows["tick"] * 2_500_000
+    one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 90_000
+    one.rows["start_ns"][1:] = one.rows["closed_ns"][1:] + 2000
+    assert [times[0] for times in parts_of(one).values()] == [2.0, 3.0, 30.0, 4.0, 11.0]
+
+
 def given(**others: Trace) -> Found:
     found = Found(defaultdict(list), defaultdict(list), defaultdict(list))
     found.traces["servo, real time", "this tree"] = [trace(50), trace(50), trace(200)]
