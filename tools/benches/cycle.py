@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rack.backplane.trace import FIELDS
 from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Occupation, unit_times
 from rack.tools.benches.apart import apart
@@ -288,7 +287,9 @@ def parts_of(trace: Trace) -> dict[str, np.ndarray]:
     exchange, read, process, write = units.T
     beyond = rows["processor_ns"][1:] - units.sum(axis=1)
     # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it is written.
-    closed = rows["closed_ns"][1:] if "closed_ns" in FIELDS else np.zeros_like(beyond)
-    closing = np.clip(np.where(closed, closed - rows["end_ns"][:-1], 0), 0, beyond)
+    closing, gap = rows["closed_ns"][1:] - rows["end_ns"][:-1], rows["start_ns"][1:] - rows["closed_ns"][1:]
+    # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the next start is known.
+    closing = np.where(closing > beyond, beyond - np.minimum(gap, beyond), closing)
+    closing[rows["closed_ns"][1:] == 0] = 0
     times = beyond - closing, exchange + read, process, write, closing
     return {part: time * 1e-3 for part, time in zip(PARTS, times, strict=True)}

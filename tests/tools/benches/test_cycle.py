@@ -31,9 +31,24 @@ def trace(processor_us: int, cycles: int = 5) -> Trace:
 
 
 def test_the_parts_of_a_cycle_are_its_whole_processor_time() -> None:
-    found = parts_of(trace(50))
+    one = trace(50)
+    one.rows["end_ns"] = one.rows["tick"] * 2_500_000
+    one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 5000
+    found = parts_of(one)
     assert tuple(found) == PARTS
-    assert [times.tolist() for times in found.values()] == [[us] * 4 for us in (13.0, 3.0, 30.0, 4.0, 0.0)]
+    assert [times.tolist() for times in found.values()] == [[us] * 4 for us in (8.0, 3.0, 30.0, 4.0, 5.0)]
+
+
+def test_bookkeeping_that_a_trace_does_not_separate_is_part_of_waking_up() -> None:
+    assert [times[0] for times in parts_of(trace(50)).values()] == [13.0, 3.0, 30.0, 4.0, 0.0]
+
+
+def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
+    one = trace(50)
+    one.rows["end_ns"] = one.rows["tick"] * 2_500_000
+    one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 90_000
+    one.rows["start_ns"][1:] = one.rows["closed_ns"][1:] + 2000
+    assert [times[0] for times in parts_of(one).values()] == [2.0, 3.0, 30.0, 4.0, 11.0]
 
 
 def given(**others: Trace) -> Found:
