@@ -17,7 +17,7 @@ LINE = 64
 HEAD_SIZE = PAGE
 BLOCK_WORDS = 24
 BLOCK_SIZE = BLOCK_WORDS * 8
-TRACE_RECORD_SIZE = 80
+TRACE_RECORD_SIZE = 88
 ALARM_RECORD_SIZE = 64
 ALARM_DEPTH = 256
 """Records in an alarm ring: it is read many times a second, and an alarm is raised once per episode."""

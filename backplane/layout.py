@@ -36,7 +36,7 @@ class FieldSpec:
 class MailboxSpec:
     """One mailbox: its writer and readers, its message, its protocol.
 
-    `every` is the writer's period and `delay` the time from release to visibility, both in ticks;
+    `every` is the time from message to message and `delay` the time from release to visibility, both in ticks;
     `depth` is the number of slots, a power of two.
     """
 

@@ -20,7 +20,7 @@ class Ring:
     """A ring of fixed records that another process writes; `head` holds the number of records written."""
 
     def __init__(self, memory: memoryview, dtype: np.dtype, head: memoryview) -> None:
-        # As plain bytes: copying by field would skip the padding, and CRCs would not match.
+        # As plain bytes: copying by field would skip the padding, and checksums would not match.
         self._rows, self._dtype = np.frombuffer(memory, dtype=f"V{dtype.itemsize}"), dtype
         self._head = head
         self._depth = len(self._rows)

@@ -12,6 +12,7 @@ task may have been preempted.
 from __future__ import annotations
 
 from enum import IntFlag
+from struct import Struct
 
 import numpy as np
 
@@ -31,7 +32,8 @@ RECORD = np.dtype(
         ("end_ns", "i8"),  # command and status written
         ("flags", "i8"),  # Flag in the low 16 bits; above them the number of releases skipped just before
         ("state", "i8"),  # state of the level
-        ("processor_ns", "i8"),  # processor time since the last record: this cycle, and waking up for it
+        ("processor_ns", "i8"),  # processor time of its thread since the last record: this cycle, and waking up for it
+        ("closed_ns", "i8"),  # the bookkeeping of the cycle before was done; 0: there was none
     ]
 )
 FIELDS = tuple(RECORD.names or ())
@@ -44,34 +46,33 @@ class Flag(IntFlag):
     MISSED = 1  # missed its deadline, or wrote a message too late
     SKIPPED = 2  # releases were skipped just before it
     BUS_ERROR = 4  # an access was cut off by its bound
-    CORRUPT = 8  # a message failed its CRC
+    CORRUPT = 8  # a message failed its check
     PLANNED = 16  # the record of a planner's cycle that made a plan
 
 
 # Plain integers for the hot path.
 _TICK, _END, _FLAGS = (FIELDS.index(name) for name in ("tick", "end_ns", "flags"))
 _RECORD = TRACE_RECORD_SIZE // 8
+# Native alignment: each number is stored whole.
+_PACK = Struct(f"@{len(FIELDS)}q").pack_into
 _TRACE_HEAD, _BUS_ERROR = int(Block.TRACE_HEAD), int(Flag.BUS_ERROR)
 
 
 class TraceWriter:
-    """The writing end of a task's trace ring: fill `record`, in the order of `RECORD`, and call `write`."""
+    """The writing end of a task's trace ring."""
 
     def __init__(self, segment: Segment, task: str) -> None:
         spec = segment.layout.task(task)
         self._block = segment.block(task)
-        start = segment.map.traces[task] // 8
-        stride = TRACE_RECORD_SIZE // 8
-        self._slots = [segment.words[start + i * stride : start + (i + 1) * stride] for i in range(spec.depth)]
+        self._ring = segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
         self._mask = spec.depth - 1
         self._count = self._block[Block.TRACE_HEAD]
-        self.record = memoryview(bytearray(TRACE_RECORD_SIZE)).cast("q")
 
-    def write(self) -> None:
-        """Append the record."""
-        self._count += 1
-        self._slots[self._count & self._mask][:] = self.record
-        self._block[_TRACE_HEAD] = self._count
+    def write(self, *record: int) -> None:
+        """Append a record: its numbers in the order of `RECORD`."""
+        self._count = count = self._count + 1
+        _PACK(self._ring, (count & self._mask) * TRACE_RECORD_SIZE, *record)
+        self._block[_TRACE_HEAD] = count
 
 
 def trace_ring(segment: Segment, task: str) -> Ring:

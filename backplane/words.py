@@ -84,7 +84,7 @@ class Block(IntEnum):
     READ_BYTES = 11
     WRITES = 12
     WRITE_BYTES = 13
-    CORRUPT = 14  # messages that failed their CRC
+    CORRUPT = 14  # messages that failed their check
     BUS_ERRORS = 15  # accesses cut off by their bound
     TRACE_HEAD = 16  # trace records written
     LEVEL_STATE = 17  # state of the level, as in its status
@@ -119,15 +119,15 @@ class Box(IntEnum):
 class Slot(IntEnum):
     """Words in front of every message in its slot.
 
-    The chain covers SERIAL to the end of the message, the CRC also BASIS and EPOCH. The time stamp is in neither, so
-    that equal runs have equal chains.
+    The checksum covers BASIS to the end of the message and, as it is seeded with CHAIN, the checksum of the message
+    before, all earlier messages. It does not cover time stamp and writer, so that equal runs have equal checksums.
     """
 
     STAMP_NS = 0
-    CRC = 1
-    EPOCH = 2
-    BASIS = 3
-    SERIAL = 4
-    TICK = 5
-    VISIBLE_AT = 6
-    CHAIN = 7
+    EPOCH = 1
+    CHAIN = 2
+    CHECK = 3
+    BASIS = 4
+    SERIAL = 5
+    TICK = 6
+    VISIBLE_AT = 7

@@ -1,6 +1,6 @@
 """Small fixed-size algebra as machine code: a Python function that numba compiles at its first use.
 
-A few hundred numpy calls on six numbers are most of a servo cycle: each costs about a microsecond, whatever it computes.
+A few hundred numpy calls on six numbers were most of a servo cycle: each costs a microsecond, whatever it computes.
 A function marked `@compiled` is ordinary numpy code; called directly it runs as such, the reference of its tests.
 Alternatives considered: a C extension (users would need a compiler), `jit` at import (numba takes 0.4 s to import, and
 most commands compute nothing).
@@ -58,7 +58,7 @@ def _jit(function: Any) -> Any:
 @cache
 def _use_cache() -> None:
     """Let numba keep its code in a folder of these sources; remove that of their earlier states."""
-    from numba import config
+    import numba
 
     levels = Path(__file__).parent
     sources = blake2b(digest_size=8)
@@ -70,4 +70,4 @@ def _use_cache() -> None:
     if not folder.exists():
         for old in home.glob(f"{here}-*"):
             shutil.rmtree(old, ignore_errors=True)
-    config.CACHE_DIR = str(folder)
+    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba makes it from its environment

@@ -81,8 +81,12 @@ class Output(NamedTuple):
 
     type: MessageType
     cycles: int
-    """Written in every n-th cycle: the one whose release is a multiple of n cycles' ticks. If that cycle is missed,
-    the message is missing too."""
+    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, so that readers released then
+    find it fresh. If that cycle is missed, the message is missing too."""
+
+    def is_due(self, tick: int, every: int) -> bool:
+        """Return whether the cycle released at `tick`, one of those every `every` ticks, writes it."""
+        return (tick + every) % (self.cycles * every) == 0
 
 
 class Ports(SimpleNamespace):

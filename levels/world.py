@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, each
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import SCENE, WORLD_MODEL
 from rack.levels.tables import Positive, Table, read_params
@@ -38,50 +40,91 @@ class WorldModel(Executor):
         super().__init__(context)
         self._params = read_params(WorldParams, context.params)
         bodies = context.sizes["bodies"]
-        self._position, self._quaternion = np.zeros((bodies, 3)), np.zeros((bodies, 4))
-        self._rest_position, self._rest_quaternion = np.zeros((bodies, 3)), np.zeros((bodies, 4))
-        self._moving = np.zeros(bodies, dtype=bool)
-        self._slow_s = np.zeros(bodies)
-        self._seen_tick = -1
+        self._last, self._rest = np.zeros((2, bodies, 7))  # poses in the last scene, and in which bodies rested: m, 1
+        self._moving, self._slow_s = np.zeros(bodies, dtype=bool), np.zeros(bodies)
+        self._find = find_motion.load()
+        self._seen_tick, self._interval = -1, 0  # tick of the last scene, and ticks since the one before it
         self._started = False
 
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled function."""
+        poses, rules = np.zeros((1, 7)), (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+        vectors = np.zeros((1, 3))
+        find_motion.load()(
+            vectors, np.zeros((1, 4)), poses, poses, np.zeros(1, dtype=bool), np.zeros(1), vectors, rules
+        )
+
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Update from a new scene; without one, keep poses and set velocities to zero."""
+        """Update from a new scene; when one is missing, keep poses and set velocities to zero."""
+        model: Message = write.model
         if not self._started:
             self._started = True
-            write.model.copy_from(read.last.value)
+            model.copy_from(read.last.value)
         if not read.scene.is_new:
-            write.model.velocity[:] = 0.0
+            if tick - self._seen_tick > self._interval:
+                model.velocity[:] = 0.0
             return
         scene: Message = read.scene.value
         if self._seen_tick < 0:
-            self._rest_position[:], self._rest_quaternion[:] = scene.position, scene.quaternion
-            write.model.revision = tick + 1
-        else:
-            elapsed_s = (tick - self._seen_tick) * self.context.tick_s
-            self._follow(scene, write.model, elapsed_s, tick)
-        self._position[:], self._quaternion[:] = scene.position, scene.quaternion
-        write.model.position, write.model.quaternion = scene.position, scene.quaternion
-        write.model.sensed = self._seen_tick = tick
-
-    def _follow(self, scene: Message, model: Message, elapsed_s: float, tick: int) -> None:
-        """Estimate velocities, and find the bodies that start or stop moving."""
-        params = self._params
-        velocity = (scene.position - self._position) / elapsed_s
-        slow = np.linalg.norm(velocity, axis=1) < params.slow
-        slow &= turn(self._quaternion, scene.quaternion) < params.turned * elapsed_s / params.resting
-        self._slow_s[:] = np.where(slow, self._slow_s + elapsed_s, 0.0)
-        away = np.linalg.norm(scene.position - self._rest_position, axis=1) > params.moved
-        away |= turn(self._rest_quaternion, scene.quaternion) > params.turned
-        stops = self._moving & (self._slow_s >= params.resting)
-        starts = ~self._moving & away
-        self._rest_position[stops], self._rest_quaternion[stops] = scene.position[stops], scene.quaternion[stops]
-        self._moving ^= stops | starts
-        model.velocity = np.where(self._moving[:, None], velocity, 0.0)
-        if stops.any() or starts.any():
+            self._last[:, :3], self._last[:, 3:] = scene.position, scene.quaternion
+            self._rest[:] = self._last
             model.revision = tick + 1
+        else:
+            self._interval = tick - self._seen_tick
+            if self._follow(scene, model.velocity, self._interval * self.context.tick_s):
+                model.revision = tick + 1
+        model.position, model.quaternion = scene.position, scene.quaternion
+        model.sensed = self._seen_tick = tick
+
+    def _follow(self, scene: Message, velocity: Array, elapsed_s: float) -> bool:
+        """Estimate velocities; return whether a body starts or stops moving."""
+        p = self._params
+        rules = p.moved, p.turned, p.slow, p.turned / p.resting, p.resting, elapsed_s
+        memory = self._last, self._rest, self._moving, self._slow_s
+        return self._find(scene.position, scene.quaternion, *memory, velocity, rules)
 
 
-def turn(first: Array, second: Array) -> Array:
-    """Return the angles (n,), rad, between orientations (n, 4); q and -q are the same orientation."""
-    return np.asarray(2.0 * each(math.acos, np.clip(np.abs(np.sum(first * second, axis=1)), 0.0, 1.0)))
+@compiled
+def find_motion(
+    position: Array,  # (bodies, 3), m: as sensed
+    quaternion: Array,  # (bodies, 4)
+    last: Array,  # (bodies, 7): the same in the last scene; set to this one
+    rest: Array,  # (bodies, 7): where bodies rested last
+    moving: NDArray[np.bool_],  # (bodies,)
+    slow_s: Array,  # (bodies,): time for which they have been slow
+    velocity: Array,  # (bodies, 3), m/s: set; zero for bodies at rest
+    rules: tuple[float, float, float, float, float, float],
+) -> bool:
+    """Follow the bodies from scene to scene; return whether one starts or stops moving."""
+    moved, turned, slow, slow_turn, resting, elapsed_s = rules  # m, rad, m/s, rad/s, s, s: see `WorldParams`
+    changed = False
+    for body in range(len(position)):
+        speed = distance(position[body], last[body]) / elapsed_s
+        is_slow = speed < slow and turn(quaternion[body], last[body]) < slow_turn * elapsed_s
+        slow_s[body] = slow_s[body] + elapsed_s if is_slow else 0.0
+        away = distance(position[body], rest[body]) > moved or turn(quaternion[body], rest[body]) > turned
+        if moving[body] and slow_s[body] >= resting:
+            rest[body, :3], rest[body, 3:] = position[body], quaternion[body]
+            moving[body], changed = False, True
+        elif not moving[body] and away:
+            moving[body], changed = True, True
+        velocity[body] = 0.0
+        if moving[body]:
+            velocity[body] = (position[body] - last[body, :3]) / elapsed_s
+        last[body, :3], last[body, 3:] = position[body], quaternion[body]
+    return changed
+
+
+@compiled
+def distance(position: Array, pose: Array) -> float:
+    """Return the distance, m, of a position (3,) from that of a pose (7,)."""
+    x, y, z = position[0] - pose[0], position[1] - pose[1], position[2] - pose[2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def turn(quaternion: Array, pose: Array) -> float:
+    """Return the angle, rad, between a quaternion (4,) and that of a pose (7,); q and -q are the same orientation."""
+    product = quaternion[0] * pose[3] + quaternion[1] * pose[4] + quaternion[2] * pose[5] + quaternion[3] * pose[6]
+    return 2.0 * math.acos(min(abs(product), 1.0))

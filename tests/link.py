@@ -36,8 +36,8 @@ class WritingTask:
 
     def __init__(self, segment: Segment) -> None:
         self.every = segment.layout.task("writer").every
-        self.ports = OutputPorts(segment, {"point": NAME}, AlarmWriter(segment, "writer"))
-        self._inputs = InputPorts(segment, {}, AlarmWriter(segment, "writer"))
+        alarms = AlarmWriter(segment, "writer")
+        self.ports = OutputPorts(segment, {"point": NAME}, alarms, InputPorts(segment, {}, alarms))
         self._block, self._trace = segment.block("writer"), TraceWriter(segment, "writer")
 
     def cycle(self, tick: int, now: int | None = None) -> bool:
@@ -45,15 +45,14 @@ class WritingTask:
         message = self.ports.messages.point
         message.id, message.row = tick, tick
         cut_off = self.ports.bus_errors
-        in_time = self.ports.write(tick, tick if now is None else now, self._inputs)
+        in_time = self.ports.write(tick, tick if now is None else now)
         self.end(tick, int(Flag.BUS_ERROR) if self.ports.bus_errors > cut_off else 0)
         return in_time
 
     def end(self, tick: int, flags: int = 0) -> None:
         """Trace a cycle and say that it is done."""
-        for field, value in (("tick", tick), ("end_ns", monotonic_ns()), ("flags", flags)):
-            self._trace.record[FIELDS.index(field)] = value
-        self._trace.write()
+        record = dict.fromkeys(FIELDS, 0) | {"tick": tick, "end_ns": monotonic_ns(), "flags": flags}
+        self._trace.write(*record.values())
         self._block[Block.DONE] = tick
 
     def close(self) -> None:

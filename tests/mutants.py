@@ -54,12 +54,17 @@ MUTANTS = (
         (("levels/servo/actuator_monitor.py", "if not self._begun:", "if True:"),),
     ),
     Mutant(
-        "CRC",
+        "checksum",
         "corrupt",
         (
-            (SLOTS, "self._words[_CRC] == crc32(self._crc_part)", "True"),
+            (SLOTS, "self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])", "True"),
+            ("backplane/mailbox/mailbox.py", "check != xxh3(self._covered, chain)", "False"),
             ("backplane/watch/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
-            ("backplane/watch/message_watch.py", "self._episodes.find(Alarm.DAMAGED, found.accesses, tick)", "pass"),
+            (
+                "backplane/watch/message_watch.py",
+                "self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)",
+                "pass",
+            ),
         ),
     ),
     Mutant(

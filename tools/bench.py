@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
@@ -25,20 +25,23 @@ Plot = Annotated[Path | None, typer.Option(metavar="DIR", help="write the figure
 Against = Annotated[
     Path | None, typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one")
 ]
-Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
+Share = Annotated[
+    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
+]
+Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")]
 
 
-class Found(Protocol):
-    """What a bench has measured, as it is shown."""
+class Shown(Protocol):
+    """What a bench has found, as far as it is shown."""
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
 
-    def lines(self, width: int | None = None) -> Iterable[str]:
-        """Return it as text for people, fitted to `width`."""
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield it as text for people, fitted to `width`."""
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write pictures into `folder`; return their paths."""
+        """Write its pictures into `folder`; return their paths."""
 
 
 @bench.callback()
@@ -48,11 +51,7 @@ def interruptible(context: typer.Context) -> None:
 
 
 @bench.command()
-def mailbox(
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 60,
-    plot: Plot = None,
-    as_json: Json = False,
-) -> None:
+def mailbox(rounds: Rounds = 60, plot: Plot = None, as_json: Json = False) -> None:
     """Measure a message, written and read, next to other ways of inter-process communication.
 
     Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes and queues of
@@ -64,6 +63,29 @@ def mailbox(
 
     with progress_for(as_json) as progress:
         found = measure(CASES, rounds, progress)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def cycle(
+    against: Against = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")] = 6.0,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    share: Share = False,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure the processor time of a board's cycle, by part.
+
+    Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns with another checkout.
+    The servo board is also compared with bare mj_step calls: the physics of its recorded run, replayed alone. What
+    TREE needs and this environment lacks, give in PYTHONPATH.
+    """
+    from rack.tools.benches.cycle import measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(against, seconds, rounds, progress, share)
     _show(found, plot, as_json)
 
 
@@ -159,11 +181,11 @@ def clock(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how late a board starts: from its grid point to the start of its cycle.
+    """Measure how late a board starts its cycle.
 
-    An empty board waits in each of the ways that a config permits. On the same core, at the same rate and priority,
-    `cyclictest`, a bare loop of clock_nanosleep in Python and a thread of LinuxCNC are measured by turns; ratios are to
-    `cyclictest`.
+    Lateness is the time from grid point to start. An empty board waits in each of the ways that a config permits. By
+    turns with it, on the same core at the same rate and priority: `cyclictest`, a bare loop of clock_nanosleep in
+    Python, and a thread of LinuxCNC. Ratios are to `cyclictest`.
     """
     from rack.tools.benches.clock import RATES_HZ, measure
     from rack.tools.console.progress import progress_for
@@ -225,8 +247,8 @@ def boards(
     raise typer.Exit(0 if found.exact else 1)
 
 
-def _show(found: Found, plot: Path | None, as_json: bool) -> None:
-    """Print what was found and, if asked for, plot it."""
+def _show(found: Shown, plot: Path | None, as_json: bool) -> None:
+    """Print what a bench has found and, if asked for, plot it."""
     from rack.tools.console.tables import terminal_width
 
     _print(found.document(), found.lines(terminal_width()), as_json)

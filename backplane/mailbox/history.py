@@ -1,7 +1,7 @@
 """The messages of a mailbox as the host side reads them: in blocks, and as the digest of a run.
 
 The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time. Each message carries
-the running hash of its mailbox, so the digest is complete even if a recorder lost rows, and a restarted writer
+the chain of its mailbox, so the digest is complete even if a recorder lost rows, and a restarted writer
 continues it. Messages that become visible after the last tick do not count: nothing reads them, and whether they are
 written before the run ends depends on timing.
 """
@@ -9,13 +9,13 @@ written before the run ends depends on timing.
 from __future__ import annotations
 
 from hashlib import blake2b
-from zlib import crc32
 
 import numpy as np
+from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.mailbox.slots import CRC_FROM, EPOCH_MASK, Slots, epoch_of, message_dtype
+from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_MASK, Slots, epoch_of, message_dtype
 from rack.backplane.ring import Drained, Ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, System
@@ -33,7 +33,7 @@ class MailboxRing(Ring):
         self._box = segment.words[address // 8 : address // 8 + len(Box)]
         memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
         super().__init__(memory, row_dtype(spec), self._box[Box.HEAD : Box.HEAD + 1])
-        self._covered = slice(CRC_FROM, SLOT_HEAD_SIZE + spec.size)
+        self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
     def drain(self) -> Drained:
         """Take every good message written since the last call."""
@@ -47,34 +47,35 @@ class MailboxRing(Ring):
             # The writer does not know of this message, and will write its own in that place.
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
-        crcs = (crc32(part.tobytes()) for part in covered)
-        good = lawful & (np.fromiter(crcs, np.int64, len(rows)) == rows["crc"]) & (rows["serial"] == serials)
+        checks = (xxh3(part.tobytes(), chain) for part, chain in zip(covered, rows["chain"].tolist(), strict=True))
+        good = lawful & (np.fromiter(checks, np.uint64, len(rows)) == rows["check"]) & (rows["serial"] == serials)
         return Drained(rows if good.all() else rows[good], lost)
 
 
 def row_dtype(spec: MailboxSpec) -> np.dtype:
     """Return the type of one row of a mailbox's ring, padding included."""
+    message = message_dtype(spec.fields, spec.size)
     return np.dtype(
         {
             "names": [word.name.lower() for word in Slot] + ["message"],
-            "formats": ["i8"] * len(Slot) + [message_dtype(spec.fields, spec.size)],
+            "formats": [*("u8" if word in (Slot.CHAIN, Slot.CHECK) else "i8" for word in Slot), message],
             "offsets": [8 * word for word in Slot] + [8 * len(Slot)],
             "itemsize": slot_stride(spec),
         }
     )
 
 
-def chains(segment: Segment, until: int) -> dict[str, tuple[int, bytes]]:
-    """Return serial and running hash of every mailbox's newest message that was visible before tick `until`."""
+def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
+    """Return serial and chain of every mailbox's newest message that was visible before tick `until`."""
     found = {}
     for spec in segment.layout.mailboxes:
         slots = Slots(segment, spec)
         serial = head = slots.box[Box.HEAD]
         oldest = max(0, head - slots.depth)
-        # A lost, damaged or forged message has no valid hash: the one before it has.
+        # A lost, damaged or forged message has no valid chain: the one before it has.
         while serial > oldest and not (slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)):
             serial -= 1
-        found[spec.name] = (serial, slots.chain if serial > oldest else bytes(8))
+        found[spec.name] = (serial, slots.chain if serial > oldest else 0)
     return found
 
 
@@ -83,5 +84,5 @@ def digest(segment: Segment, until: int | None = None) -> str:
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)
     for name, (serial, chain) in sorted(chains(segment, stop).items()):
-        total.update(f"{name} {serial} ".encode() + chain)
+        total.update(f"{name} {serial} {chain} ".encode())
     return total.hexdigest()

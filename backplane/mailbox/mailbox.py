@@ -14,15 +14,21 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from enum import IntEnum
+from struct import Struct
 from typing import NamedTuple
+
+from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.slots import Slots, claim, pid_of
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box
+from rack.backplane.words import Box, Slot
 
+# Plain integers for the hot path.
+_VISIBLE = int(Slot.VISIBLE_AT)
+_HEAD = Struct(f"@{len(Slot)}Q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -71,6 +77,7 @@ class Writer:
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.mailbox(name)
         self._slots = Slots(segment, spec)
+        self._delay = self._shown_after = spec.delay
         self.message = self._slots.message
         self.bus_errors = 0
         self.held_up = 0
@@ -95,16 +102,18 @@ class Writer:
         It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes visible at the next
         boundary of the writer's period.
         """
-        written = self.publish(tick, self.visible_at(tick, now), tick if basis is None else basis)
-        return written and (now is None or now < tick + self.spec.delay)
+        due = tick + self._delay
+        visible_at = tick + self._shown_after if now is None else self.visible_at(tick, now)
+        self.intruder = self._slots.publish(tick, visible_at, tick if basis is None else basis)
+        return now is None or now < due
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick from which a message released at `tick` and written now is visible."""
-        in_time = tick + self.spec.delay
+        in_time = tick + self._delay
         if now is None or now < in_time:
             return in_time
-        every = self.spec.every
-        return (now // every + 1) * every
+        cycle = min(self.spec.every, self._delay)
+        return (now // cycle + 1) * cycle
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
         """Publish `message`, visible at that tick; return False when its bound cut it off.
@@ -129,16 +138,14 @@ class Writer:
 
 
 class ReadStatistics:
-    """Counts of one reader's reads so far."""
+    """Counts of one reader's failed reads so far."""
 
-    __slots__ = ("accesses", "bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up", "transfers")
+    __slots__ = ("bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up")
 
     def __init__(self) -> None:
-        self.accesses = 0
-        self.transfers = 0  # messages copied
         self.bad_reads = 0  # reads with any of the following
         self.bus_errors = 0  # accesses that their bound cut off
-        self.corrupt = 0  # messages that failed their CRC
+        self.corrupt = 0  # messages that failed their check
         self.forged = 0  # messages of a process that does not hold the claim
         self.forger = 0  # process id of the last such process
         self.held_up = 0  # accesses that timed out because a dead or stopped process held the lock
@@ -149,41 +156,49 @@ class Reader:
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
-        self.slots = Slots(segment, self.spec)
-        self._box = self.slots.box
+        self.slots = slots = Slots(segment, self.spec)
+        self._box, self._heads, self._places = slots.box, slots.heads, slots.places
+        self._mask, self._depth = slots.mask, slots.depth
         # The last good message has its own buffer: a corrupt copy never reaches it.
-        self._good = Slots(segment, self.spec)
-        self.message = self._good.message
+        good = Slots(segment, self.spec)
+        self._record, self._covered, self._good = slots.record, slots.covered, good.record
+        self.message = good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
-        self._serial = 0
+        self._new, self._unchanged = self._readings[Verdict.NEW], self._readings[Verdict.NONE]
         self._signature = 0
+        self.serial = 0
+        """Serial of the last good message; 0: none."""
         self.found = 0
         """Serial of the newest message found by the last read, good or not."""
         self.newest = NOT_YET
         """Release tick of the last good message."""
+        self.visible = 0
+        """Tick from which the last good message may be read."""
+        self.basis = 0
+        """Tick of the oldest information that the last good message rests on."""
+        self.accesses = 0
+        """Reads so far."""
+        self.transfers = 0
+        """Messages copied so far."""
         self.statistics = ReadStatistics()
 
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, with its verdict."""
-        self.statistics.accesses += 1
-        head = self._box[0]
-        self.found = serial = self._newest_visible(head, tick)
-        if serial == self._serial:
-            return self._readings[Verdict.OLD if serial else Verdict.NONE]
-        return self._take(serial, tick)
+        self.accesses += 1
+        serial, last = self._box[0], self.serial
+        if serial != last:
+            # Older messages are overwritten: a serial beyond the slots fails when it is taken.
+            oldest = last if serial - last < self._depth else serial - self._depth
+            heads, mask = self._heads, self._mask
+            while serial > oldest and heads[serial & mask][_VISIBLE] > tick:
+                serial -= 1
+        self.found = serial
+        if serial == last:
+            return self._unchanged
+        return self._new if self._obtain(serial) else self._take_older(serial, tick)
 
-    def _newest_visible(self, head: int, tick: int) -> int:
-        """Return the newest serial visible at `tick`; stop at the last one read."""
-        visible_at = self.slots.visible_at
-        # Older messages are overwritten: a serial beyond the slots fails when it is taken.
-        oldest, serial = max(self._serial, head - self.slots.depth), head
-        while serial > oldest and visible_at(serial) > tick:
-            serial -= 1
-        return serial
-
-    def _take(self, serial: int, tick: int) -> Reading:
-        if self._obtain(serial):
-            return self._readings[Verdict.NEW]
+    def _take_older(self, serial: int, tick: int) -> Reading:
+        """Judge a bad message, and take the newest good one before it."""
         # The reader came too late: the slot is being overwritten.
         if not self.slots.keeps(serial):
             return self._cut_off()
@@ -191,28 +206,34 @@ class Reader:
         self._blame(serial)
         return self._step_back(serial, tick)
 
+    def _obtain(self, serial: int) -> bool:
+        """Keep a message as the last good one; False when it is not good."""
+        self.transfers += 1
+        record = self._record
+        record[:] = self._places[serial & self._mask]
+        _, epoch, chain, check, basis, found, tick, visible = _HEAD(record)
+        if found != serial or check != xxh3(self._covered, chain):
+            return False
+        if epoch != self._signature:
+            if not self.slots.is_lawful(self._signature):
+                return False
+            self._signature, self._unchanged = epoch, self._readings[Verdict.OLD]
+        self._good[:] = record
+        self.serial, self.newest, self.visible, self.basis = serial, tick, visible, basis
+        return True
+
     def _step_back(self, serial: int, tick: int) -> Reading:
         """Take the newest good message before a lost, damaged or forged one, if it is unread."""
         slots, tries = self.slots, MAX_STEP_BACK
-        for older in range(serial - 1, max(self._serial, serial - slots.depth), -1):
+        for older in range(serial - 1, max(self.serial, serial - slots.depth), -1):
             if slots.holds(older) and slots.visible_at(older) <= tick:
                 if self._obtain(older):
-                    return self._readings[Verdict.NEW]
+                    return self._new
                 self._blame(older)
                 tries -= 1
                 if not tries:
                     break
-        return self._readings[Verdict.OLD if self._serial else Verdict.NONE]
-
-    def _obtain(self, serial: int) -> bool:
-        """Keep a message as the last good one; False when it is not good."""
-        self.statistics.transfers += 1
-        slots = self.slots
-        if not slots.fetch(serial) or not (slots.signature == self._signature or slots.is_lawful(self._signature)):
-            return False
-        self._good.record[:] = slots.record
-        self._serial, self._signature, self.newest = serial, slots.signature, slots.tick
-        return True
+        return self._unchanged
 
     def _blame(self, serial: int) -> None:
         """Count the fault of the message fetched last. If its slot holds another message, it is lost: not counted."""
@@ -229,17 +250,7 @@ class Reader:
     def _cut_off(self) -> Reading:
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
-        return self._readings[Verdict.BUS_ERROR if self._serial else Verdict.NONE]
-
-    @property
-    def serial(self) -> int:
-        """Serial of the last good message; 0: none."""
-        return self._serial
-
-    @property
-    def basis(self) -> int:
-        """Tick of the oldest information that the last good message rests on."""
-        return self._good.basis
+        return self._readings[Verdict.BUS_ERROR if self.serial else Verdict.NONE]
 
     def peek(self) -> Reading:
         """Return the newest whole message at once, under any protocol: for the host side."""
@@ -247,13 +258,17 @@ class Reader:
 
     def _newest(self) -> Reading:
         self.found = head = self._box[0]
-        if head == self._serial:
-            return self._readings[Verdict.OLD if head else Verdict.NONE]
-        return self._take(head, NOT_YET)
+        if head == self.serial:
+            return self._unchanged
+        return self._new if self._obtain(head) else self._take_older(head, NOT_YET)
 
 
 class DoubleBufferWriter(Writer):
     """A writer under protocol double-buffer: its message is visible as soon as it is whole."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        super().__init__(segment, name)
+        self._shown_after = 0
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick at which the message is written: it is visible at once."""
@@ -268,5 +283,5 @@ class DoubleBufferReader(Reader):
 
     def read(self, tick: int) -> Reading:
         """Return the newest whole message, with its verdict."""
-        self.statistics.accesses += 1
+        self.accesses += 1
         return self._newest()

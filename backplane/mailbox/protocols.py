@@ -8,7 +8,7 @@ which ends with its process. An access cut off by its bound is a bus error: a ve
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Protocol
@@ -76,15 +76,22 @@ class LockWriter(DoubleBufferWriter):
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
+    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
+        """Publish `message`; return False when it is too late, or the lock's bound cut it off."""
+        return self._locked(lambda: super(LockWriter, self).write(tick, now, basis))
+
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
         """Publish `message`; return False when the lock's bound cut it off."""
+        return self._locked(lambda: super(LockWriter, self).publish(tick, visible_at, basis, damage))
+
+    def _locked(self, access: Callable[[], bool]) -> bool:
         obtained = self.lock.acquire()
         self.held_up = self.lock.held_up
         if not obtained:
             self.bus_errors += 1
             return False
         try:
-            return super().publish(tick, visible_at, basis, damage)
+            return access()
         finally:
             self.lock.release()
 
@@ -104,7 +111,7 @@ class LockReader(Reader):
     def read(self, tick: int) -> Reading:
         """Return the newest message; BUS_ERROR with the last good one after a timeout."""
         statistics = self.statistics
-        statistics.accesses += 1
+        self.accesses += 1
         obtained = self.lock.acquire()
         if statistics.held_up != self.lock.held_up:
             statistics.held_up = self.lock.held_up

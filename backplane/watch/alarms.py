@@ -49,7 +49,7 @@ class Alarm(IntEnum):
     GAP = 22  # [mailbox; serials missing]
     HELD_BACK = 23  # [mailbox; ticks]  a message came after the end of its cycle
     DISORDER = 24  # [mailbox; ticks]  a later serial has an earlier tick
-    DAMAGED = 25  # [mailbox; -]  a message failed its CRC
+    DAMAGED = 25  # [mailbox; -]  a message failed its check
     BABBLE = 26  # [mailbox; serials per cycle]
     MASQUERADE = 27  # [mailbox; process id that the message names]  not from the writer that holds the claim
     LOCKED = 28  # [mailbox; -]  a dead or stopped process holds the lock

@@ -8,10 +8,11 @@ only then is the copy judged.
 
 from __future__ import annotations
 
-from zlib import crc32
+from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept
 from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.slots import UNSIGNED
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
@@ -20,31 +21,31 @@ from rack.backplane.words import Slot
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
 # Plain integers for the hot path.
-_CRC, _SERIAL, _TICK, _VISIBLE = (int(Slot[name]) for name in ("CRC", "SERIAL", "TICK", "VISIBLE_AT"))
+_CHAIN, _CHECK, _, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[2:])
 
 
 class ReadFindings:
     """Raises alarms for the damaged and forged messages that a reader itself has found."""
 
     def __init__(self, reader: Reader, episodes: Episodes) -> None:
-        self._statistics, self._episodes = reader.statistics, episodes
+        self._reader, self._episodes = reader, episodes
         self._corrupt = self._forged = 0
 
     def report(self, tick: int) -> None:
         """Report the findings since the last call."""
-        found = self._statistics
+        found = self._reader.statistics
         if found.corrupt != self._corrupt:
             self._corrupt = found.corrupt
-            self._episodes.find(Alarm.DAMAGED, found.accesses, tick)
+            self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)
         if found.forged != self._forged:
             self._forged = found.forged
-            self._episodes.find(Alarm.MASQUERADE, found.accesses, tick, found.forger)
+            self._episodes.find(Alarm.MASQUERADE, self._reader.accesses, tick, found.forger)
 
 
 class MessageWatch:
     """Judges the messages of one mailbox for one reader; those before its first read are not judged.
 
-    `seen` is the serial of the newest message judged; -1 before the first read.
+    `seen` is the serial of the newest message judged, -1 before the first read; `newest` is its release tick.
     """
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
@@ -53,10 +54,10 @@ class MessageWatch:
         self._slots = reader.slots
         self._heads_and_bodies = reader.slots.heads_and_bodies()
         self._cycles = CycleRecord(segment, reader.spec.writer)
-        self._newest = LONG_AGO
+        self.newest = LONG_AGO
         self._is_sliced = reader.spec.protocol == "time-slice"
         # From this delay on a message is late. A message visible at once carries the tick at which it was written.
-        self._late_from = self._spec.delay + self._is_sliced
+        self.late_from = self._spec.delay + self._is_sliced
         self._findings = ReadFindings(reader, episodes)
         self._held_up = 0
 
@@ -79,7 +80,7 @@ class MessageWatch:
         """Judge messages after a serial, and none before it."""
         self.seen = serial
         if serial and self._copies(serial):
-            self._newest = self._slots.tick
+            self.newest = self._slots.tick
 
     def _copies(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is missing or cannot be trusted."""
@@ -93,7 +94,7 @@ class MessageWatch:
             found = slots.box[0]
         if not self._copies(found):
             return False
-        count, cycles = found - self.seen, (slots.tick - self._newest) // self._spec.every
+        count, cycles = found - self.seen, (slots.tick - self.newest) // self._spec.every
         if count <= cycles + 1:
             return False
         self._find(Alarm.BABBLE, tick, count / max(1, cycles))
@@ -102,7 +103,7 @@ class MessageWatch:
     def _walk(self, found: int, tick: int) -> None:
         """Judge the messages one by one, up to the newest found."""
         slots, heads_and_bodies = self._slots, self._heads_and_bodies
-        mask, taken, late = slots.mask, self._reader.serial, self._late_from
+        mask, taken, late = slots.mask, self._reader.serial, self.late_from
         # A late reader cannot judge messages that are overwritten.
         for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
             head, body = heads_and_bodies[serial & mask]
@@ -110,11 +111,11 @@ class MessageWatch:
             # The reader has checked the message that it took, and only that one.
             if (
                 head[_SERIAL] == serial
-                and self._newest < released > head[_VISIBLE] - late
-                and (serial == taken or crc32(body) == head[_CRC])
+                and self.newest < released > head[_VISIBLE] - late
+                and (serial == taken or xxh3(body, head[_CHAIN] & UNSIGNED) == head[_CHECK] & UNSIGNED)
                 and slots.keeps(serial)
             ):
-                self._newest = released
+                self.newest = released
             elif not self._judge_odd(serial, tick):
                 break
             self.seen = serial
@@ -125,7 +126,7 @@ class MessageWatch:
         # A second look if it is not whole: the true message may just be overwriting a forged one.
         if not slots.copy(serial) or not (slots.is_sound or slots.copy(serial)):
             return True
-        expected = self._newest + self._spec.every
+        expected = self.newest + self._spec.every
         if slots.serial == serial and slots.is_sound:
             self._judge_time(slots.tick, slots.visible, tick)
         elif slots.serial == 0 or slots.is_sound:
@@ -133,25 +134,25 @@ class MessageWatch:
             # which it would have been visible.
             if self._is_sliced and expected + self._spec.delay > tick:
                 return False
-            self._newest = expected
+            self.newest = expected
             self._find(Alarm.GAP, tick, 1)
         else:
             if slots.serial == serial:
                 # Its release tick may be damaged too; no release is later than now.
-                self._newest = max(self._newest, min(slots.tick, tick))
+                self.newest = max(self.newest, min(slots.tick, tick))
             self._find(Alarm.DAMAGED, tick)
         return True
 
     def _judge_time(self, released: int, visible: int, tick: int) -> None:
         """Judge the release and the arrival of the message in the local record."""
-        if released < self._newest:
-            self._find(Alarm.DISORDER, tick, self._newest - released, since=released)
-        elif visible - released >= self._late_from:
+        if released < self.newest:
+            self._find(Alarm.DISORDER, tick, self.newest - released, since=released)
+        elif visible - released >= self.late_from:
             # Held back, not just finished late, if its cycle had ended before it was published.
             ended_ns = self._cycles.ended_ns(released)
             if ended_ns is not None and self._slots.stamp_ns > ended_ns:
                 self._find(Alarm.HELD_BACK, tick, visible - released - self._spec.delay, since=released)
-        self._newest = max(released, self._newest)
+        self.newest = max(released, self.newest)
 
     def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
-        self._episodes.find(code, self._reader.statistics.accesses, tick, value, since)
+        self._episodes.find(code, self._reader.accesses, tick, value, since)

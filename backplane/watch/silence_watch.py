@@ -23,17 +23,22 @@ _LOST, _CLAIMANT = int(Block.LOST), int(Box.CLAIMANT)
 
 
 class ReadingTask:
-    """The task that reads: the tick since which it has read without a pause, and which writers are dead or stopped."""
+    """The task that reads: the tick `since` which it has read without a pause, and which writers are dead or stopped.
+
+    After a pause of this task or of the clock, all messages are old but no writer is silent. `troubles` counts reads
+    that failed or found a bad message.
+    """
 
     def __init__(self) -> None:
         self.since = 0
+        self.troubles = 0
         self._last = LONG_AGO
         self._step = NOT_YET
         self._asked_at = -1
         self._gone: dict[int, bool] = {}
 
     def reads(self, tick: int) -> None:
-        """Note a read. After a pause of this task or of the clock, all messages are old but no writer is silent."""
+        """Note a read of a task that does not know how many cycles it skipped."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:
@@ -90,8 +95,8 @@ class SilenceWatch:
             self._report(Alarm.MUTE, tick, age)
 
     def _is_mute(self, tick: int) -> bool:
-        """Say whether the writer has finished a release, and the newest message is of an earlier one."""
-        accesses = self._reader.statistics.accesses
+        """Say whether the writer has finished a release that writes a message, and the newest is of an earlier one."""
+        accesses = self._reader.accesses
         if any(self._episodes.is_open(code, accesses, tick) for code in (Alarm.HELD_BACK, Alarm.DISORDER)):
             # Messages come, but late.
             return False
@@ -99,7 +104,8 @@ class SilenceWatch:
         finished, slots = self._cycles.finished, self._slots
         head = slots.box[0]
         # A serial without a message was lost on the way, not suppressed.
-        return slots.copy(head) and slots.serial == head and slots.tick < finished
+        due = finished - finished % self._reader.spec.every
+        return slots.copy(head) and slots.serial == head and slots.tick < due
 
     def _report(self, code: Alarm, tick: int, age: int) -> None:
         """Raise the alarm once for each last message: the next good message ends the episode."""

@@ -21,31 +21,39 @@ _LOST = int(Block.LOST)
 def watched(segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> WatchedReader | SporadicReader:
     """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have no period."""
     if segment.layout.mailbox(name).writer == CLOCK:
-        return SporadicReader(segment, name, alarms)
+        return SporadicReader(segment, name, alarms, task)
     return WatchedReader(segment, name, alarms, task)
 
 
 class WatchedReader:
-    """Reads a mailbox for a task and raises the task's alarms about it. This adds three comparisons to a clean read."""
+    """Reads a mailbox for a task and raises the task's alarms about it. A clean read costs a few comparisons more."""
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> None:
         self.reader = reader = open_reader(segment, name)
         episodes = Episodes(segment, name, alarms)
         self._messages = MessageWatch(segment, reader, episodes)
         self._silence = SilenceWatch(segment, reader, episodes, task)
-        self._quiet = self._silence.quiet
+        self._task = task
+        self._late_from, self._quiet = self._messages.late_from, self._silence.quiet
         self._writer = segment.block(reader.spec.writer)
-        self._statistics = reader.statistics
         self._bad_reads = 0
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is lost."""
-        reader = self.reader
+        reader, messages = self.reader, self._messages
         reading = reader.read(tick)
-        if reader.found > self._messages.seen or self._statistics.bad_reads != self._bad_reads:
-            self._bad_reads = self._statistics.bad_reads
-            self._messages.judge(tick)
+        if reader.statistics.bad_reads != self._bad_reads:
+            self._bad_reads = reader.statistics.bad_reads
+            self._task.troubles += 1
+            messages.judge(tick)
+        elif reader.found != messages.seen:
+            found, newest = reader.found, reader.newest
+            # The usual case of `judge`: the next message, good and in time.
+            if 0 < found == messages.seen + 1 and messages.newest < newest > reader.visible - self._late_from:
+                messages.seen, messages.newest = found, newest
+            else:
+                messages.judge(tick)
         if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
@@ -58,8 +66,9 @@ class SporadicReader:
     before it. The first read returns all that the slots hold, since a restarted board must know them.
     """
 
-    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
+    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> None:
         self.reader = open_reader(segment, name)
+        self._task = task
         self._slots = Slots(segment, self.reader.spec)
         self._findings = ReadFindings(self.reader, Episodes(segment, name, alarms))
         self._bad_reads = 0
@@ -70,6 +79,7 @@ class SporadicReader:
         reading = self.reader.read(tick)
         if self.reader.statistics.bad_reads != self._bad_reads:
             self._bad_reads = self.reader.statistics.bad_reads
+            self._task.troubles += 1
             self._findings.report(tick)
         if self.reader.serial > before + 1:
             return reading._replace(earlier=tuple(self._between(before, self.reader.serial)))

@@ -19,6 +19,7 @@ from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake
+from rack.levels.level import Output
 from rack.levels.operator import OPERATOR_COMMAND
 
 OPERATOR_DEPTH = 128
@@ -62,7 +63,7 @@ class Wiring:
         # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
         self._unknown = {place.board for place in config.tasks() if place.name not in found}
         self._unknown |= {place.removeprefix("board.") for place in broken}
-        self._writers: dict[str, tuple[TaskPorts, MessageType]] = {}
+        self._writers: dict[str, tuple[TaskPorts, Output]] = {}
         for ports in self.tasks:
             self._add_writer(ports)
         self._operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
@@ -139,7 +140,7 @@ class Wiring:
         return mailbox in self._writers or mailbox in self._operated or mailbox.partition(".")[0] in self._unknown
 
     def _kind(self, mailbox: str) -> MessageType | None:
-        return self._writers[mailbox][1] if mailbox in self._writers else self._operated.get(mailbox)
+        return self._writers[mailbox][1].type if mailbox in self._writers else self._operated.get(mailbox)
 
     def _names(self) -> str:
         return ", ".join([*self._writers, *self._operated])
@@ -147,9 +148,9 @@ class Wiring:
     def check_sizes(self, sizes: Mapping[str, int]) -> list[Mistake]:
         """Return a mistake for every message that needs a size unknown to the rack."""
         found = []
-        for mailbox, (ports, kind) in self._writers.items():
+        for mailbox, (ports, output) in self._writers.items():
             try:
-                kind.dtype(sizes)
+                output.type.dtype(sizes)
             except MailboxError as error:
                 found.append(Mistake(f"mailbox {mailbox}", ports.task, str(error)))
         return found
@@ -159,15 +160,16 @@ class Wiring:
         tasks = tuple(self._task(ports) for ports in self.tasks)
         by_name = {task.name: task for task in tasks}
         mailboxes = []
-        for name, (ports, kind) in self._writers.items():
+        for name, (ports, output) in self._writers.items():
             writer = by_name[ports.task]
+            every = writer.every * output.cycles
             delay = writer.every * writer.within_cycles
             # A reader may read as late as the end of its slice a message that was visible at its start.
             readers = [by_name[reader] for reader in self._readers(name)]
             slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
-            depth = depth_for(max(slowest + delay, self._kept_ticks), writer.every)
-            spec = partial(MailboxSpec, writer=writer.name, every=writer.every, delay=delay, depth=depth)
-            mailboxes.append(self._mailbox(name, kind, sizes, spec))
+            depth = depth_for(max(slowest + delay, self._kept_ticks), every)
+            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth)
+            mailboxes.append(self._mailbox(name, output.type, sizes, spec))
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
         mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self._operated.items()]

@@ -14,20 +14,21 @@ from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
 from rack.boards.config.schema import RackConfig, TaskPlace
 from rack.boards.errors import Mistake
-from rack.levels.level import Executor, Input, Planner
+from rack.levels.level import Executor, Input, Output, Planner
 
 
 @dataclass(frozen=True)
 class TaskPorts:
     """A task's class, and the mailbox of each port.
 
-    `reads` and `writes` map ports to mailboxes, `inputs` and `outputs` to message types.
+    `reads` and `writes` map ports to mailboxes, `inputs` to message types, `outputs` to types and the cycles from
+    message to message.
     """
 
     place: TaskPlace
     kind: type[Executor] | type[Planner]
     inputs: Mapping[str, MessageType]
-    outputs: Mapping[str, MessageType]
+    outputs: Mapping[str, Output]
     reads: Mapping[str, str]
     writes: Mapping[str, str]
 
@@ -66,14 +67,15 @@ def _wired(config: RackConfig, place: TaskPlace, mistakes: list[Mistake]) -> Tas
     )
 
 
-def _class(wanted: str, role: Role) -> tuple[type[Executor] | type[Planner], Mapping[str, MessageType]]:
+def _class(wanted: str, role: Role) -> tuple[type[Executor] | type[Planner], Mapping[str, Output]]:
     if role == "executor":
         executor = find_class(wanted, Executor)
-        return executor, executor.outputs
+        given = executor.outputs.items()
+        return executor, {port: kind if isinstance(kind, Output) else Output(kind, 1) for port, kind in given}
     planner = find_class(wanted, Planner)
     if not isinstance(getattr(planner, "output", None), MessageType):
         raise LookupError("the class has no 'output', the message type of its plan")
-    return planner, {"plan": planner.output}
+    return planner, {"plan": Output(planner.output, 1)}
 
 
 def _sources(

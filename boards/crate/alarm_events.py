@@ -49,7 +49,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.GAP: ("mailbox", "'{subject}': {messages} lost, gap in serials"),
     Alarm.HELD_BACK: ("mailbox", "'{subject}': a message was delayed by {span}"),
     Alarm.DISORDER: ("mailbox", "'{subject}': messages out of order, the last one by {span}"),
-    Alarm.DAMAGED: ("mailbox", "'{subject}': a message failed its CRC"),
+    Alarm.DAMAGED: ("mailbox", "'{subject}': a message failed its check"),
     Alarm.BABBLE: ("mailbox", "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1"),
     Alarm.MASQUERADE: ("mailbox", "'{subject}': a message comes from process {value:.0f}, which is not its writer"),
     Alarm.LOCKED: ("mailbox", "'{subject}': a dead or stopped process holds the lock"),

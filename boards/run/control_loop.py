@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from time import monotonic_ns
 
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag
 from rack.backplane.words import Block, Demand, System
-from rack.boards.run.task import Task, slowed
+from rack.boards.run.task import ClockGuard, Task, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
@@ -33,16 +34,17 @@ class VirtualControlLoop(Task):
             lock; write_command; unlock; lock; write_status; unlock
         until forever
 
-    First, the exchange (C of fig. 4) transfers the plan over the bus from the planner's processor.
+    First, the exchange (C of fig. 4) transfers the plan over the bus from the planner's processor; then it is at hand.
     """
 
     def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None) -> None:
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
+        self._guard = ClockGuard(segment, self.alarms, self.spec.every) if wiring.guards_clock else None
+        self._has_cycled = False
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
         self.read_command_and_status = slowed(self.inputs.read_command_and_status, times.read_ns)
-        self.read_plan = self.inputs.read_plan
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
 
     def run(self) -> None:
@@ -54,18 +56,27 @@ class VirtualControlLoop(Task):
 
     def cycle(self, tick: int) -> None:
         """Do the cycle released at `tick`."""
-        watch = self.stopwatch
+        watch, deadline = self.stopwatch, tick + self.spec.every
         watch.start(tick, self.next_cycle.skipped)
-        self.exchange(tick)
-        watch.exchanged()
+        if watch.is_late:
+            self._handle_delay(tick)
+        if self.inputs.reads_plan:
+            self.exchange(tick)
+            watch.plan_ns = monotonic_ns()
         self.read_command_and_status(tick)
-        self.read_plan()
-        watch.read()
+        watch.read_ns = monotonic_ns()
         self.process(tick)
-        watch.processed()
-        in_time = self.write_command_and_status(tick, self.clock.now(), self.inputs)
-        watch.written()
-        watch.finish(in_time, deadline=tick + self.spec.every, done=tick)
+        watch.process_ns = monotonic_ns()
+        in_time = self.write_command_and_status(tick, watch.now(deadline))
+        watch.end_ns = monotonic_ns()
+        watch.finish(in_time, deadline, done=tick)
+
+    def _handle_delay(self, tick: int) -> None:
+        """Note a pause in reading, in the first cycle too; in one that begins late, check the clock."""
+        if self.next_cycle.skipped or not self._has_cycled:
+            self.inputs.task.since, self._has_cycled = tick, True
+        if self._guard is not None:
+            self._guard.check(tick, self.next_cycle.skipped)
 
     def process(self, tick: int) -> None:
         """Let the level process, given the demand on the arm; then report its findings and the faults that acted."""
@@ -117,17 +128,17 @@ class PlannerLoop(Task):
         watch = self.stopwatch
         watch.start(tick, self.next_cycle.skipped)
         self.inputs.read(tick)
-        watch.read()
+        watch.read_ns = monotonic_ns()
         if not self.planner.wanted(self.inputs.values, tick):
             self._pass(tick)
             return
         self._take_time_slice(tick)
         self.plan(tick)
-        watch.processed()
+        watch.process_ns = monotonic_ns()
         with self._critical_section():
-            in_time = self.write_plan(tick, self.clock.now(), self.inputs)
+            in_time = self.write_plan(tick, watch.now(tick + self.slice))
             # Stamped inside: on leaving the section the executor may run first.
-            watch.written()
+            watch.end_ns = monotonic_ns()
         self.block[Block.PLANS] += 1
         # A plan begun late gets its whole slice, and answers any release within it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
@@ -151,8 +162,7 @@ class PlannerLoop(Task):
         if in_time and not self.next_cycle.skipped:
             self.stopwatch.idle()
             return
-        self.stopwatch.processed()
-        self.stopwatch.written()
+        self.stopwatch.process_ns = self.stopwatch.end_ns = monotonic_ns()
         self.stopwatch.finish(in_time, tick + self.slice, tick)
 
     @contextmanager

@@ -20,44 +20,33 @@ class InputPorts:
 
     def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, plan: str = "") -> None:
         """Read `mailboxes` by port; `plan` is the mailbox that holds the task's own plan."""
-        self._task = ReadingTask()
-        found = {port: watched(segment, name, alarms, self._task) for port, name in mailboxes.items()}
+        self.task = ReadingTask()
+        found = {port: watched(segment, name, alarms, self.task) for port, name in mailboxes.items()}
         self.readers = {port: one.reader for port, one in found.items()}
         self.values = Ports(**{port: Reading(r.message, Verdict.NONE) for port, r in self.readers.items()})
         self._by_port = self.values.__dict__
         self._plan = [(port, one.read) for port, one in found.items() if mailboxes[port] == plan]
         self._rest = [(port, one.read) for port, one in found.items() if mailboxes[port] != plan]
-        self._exchanged: list[tuple[str, Reading]] = []
+        self.reads_plan = bool(self._plan)
         self._statistics = [reader.statistics for reader in self.readers.values()]
         self._counted = self._traffic
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
+        self.task.reads(tick)
         self.exchange(tick)
         self.read_command_and_status(tick)
-        self.read_plan()
 
     def exchange(self, tick: int) -> None:
-        """Begin the cycle released at `tick`; if the task reads a plan, transfer it over the bus."""
-        self._task.reads(tick)
-        if self._plan:
-            self._exchanged = [(port, read(tick)) for port, read in self._plan]
+        """Transfer the plan over the bus, as of `tick`."""
+        for port, read in self._plan:
+            self._by_port[port] = read(tick)
 
     def read_command_and_status(self, tick: int) -> None:
         """Read every other mailbox as of `tick`: commands, statuses, world model."""
         values = self._by_port
         for port, read in self._rest:
             values[port] = read(tick)
-
-    def read_plan(self) -> None:
-        """Take the plan from the exchange."""
-        for port, reading in self._exchanged:
-            self._by_port[port] = reading
-
-    @property
-    def bad_reads(self) -> int:
-        """Number of failed reads."""
-        return sum([statistics.bad_reads for statistics in self._statistics])
 
     @property
     def bus_errors(self) -> int:
@@ -69,11 +58,6 @@ class InputPorts:
         """Number of reads that found a damaged message."""
         return sum([statistics.corrupt for statistics in self._statistics])
 
-    def basis(self, port: str, tick: int) -> int:
-        """Return the tick of the oldest information that a port's message rests on; `tick` if there is no message."""
-        reader = self.readers.get(port)
-        return reader.basis if reader is not None and reader.serial else tick
-
     def take_traffic(self) -> tuple[int, int]:
         """Return the number of accesses and of bytes read since the last call."""
         before, self._counted = self._counted, self._traffic
@@ -82,16 +66,21 @@ class InputPorts:
     @property
     def _traffic(self) -> tuple[int, int]:
         readers = self.readers.values()
-        accesses = sum(reader.statistics.accesses for reader in readers)
-        return accesses, sum(reader.statistics.transfers * reader.spec.size for reader in readers)
+        accesses = sum(reader.accesses for reader in readers)
+        return accesses, sum(reader.transfers * reader.spec.size for reader in readers)
 
 
 class OutputPorts:
-    """The mailboxes that a task writes; `messages` holds the outgoing message of each port."""
+    """The mailboxes that a task writes; `messages` holds the outgoing message of each port.
 
-    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter) -> None:
+    Each message carries the tick of the oldest information that it rests on. A command inherits the tick of the command
+    that it follows, a status that of the status below. So the system's response time can be measured.
+    """
+
+    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, inputs: InputPorts) -> None:
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
         self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
+        self._rests_on = {port: inputs.readers.get(port) for port in mailboxes}
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
         self._faulty: dict[str, FaultyWriter] = {}
@@ -111,29 +100,36 @@ class OutputPorts:
 
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
-        self._lines = [(port, w, getattr(self._faulty.get(port), "write", w.write)) for port, w in self.writers.items()]
+        self._lines = [
+            (port, w, getattr(self._faulty.get(port), "write", w.write), self._rests_on[port], w.spec.every)
+            for port, w in self.writers.items()
+        ]
 
     @property
     def bus_errors(self) -> int:
         """Number of writes that timed out."""
         return sum([writer.bus_errors for writer in self._writers])
 
-    def write(self, tick: int, now: int, inputs: InputPorts) -> bool:
-        """Write every mailbox; return False if a message was too late.
+    def write(self, tick: int, now: int | None) -> bool:
+        """Write every mailbox that is due at `tick`; return False if a message was too late.
 
-        Each message carries the tick of the oldest information that it rests on. A command inherits the tick of the
-        command that it follows, a status that of the status below. So the system's response time can be measured.
+        `now`: the clock's tick, if the cycle's end may have passed.
         """
         in_time = True
-        for port, writer, write in self._lines:
-            in_time = write(tick, now, inputs.basis(port, tick)) and in_time
+        for port, writer, write, source, every in self._lines:
+            if tick % every:
+                if port in self._faulty:
+                    self._faulty[port].flush(tick, now)
+                continue
+            if not write(tick, now, source.basis if source is not None and source.serial else tick):
+                in_time = False
             if writer.intruder or writer.held_up:
                 self._report(port, writer, tick)
         if self._faulty:
             self._drop_faulty_writers()
         return in_time
 
-    def flush(self, tick: int, now: int) -> None:
+    def flush(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due, in a cycle that writes nothing."""
         if self._faulty:
             for faulty in self._faulty.values():

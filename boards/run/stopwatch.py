@@ -6,17 +6,17 @@ missed deadlines, skipped releases, failed accesses, and the report to the clock
 
 from __future__ import annotations
 
-from time import monotonic_ns, process_time_ns
+from time import monotonic_ns, thread_time_ns
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import clock_semaphore
-from rack.backplane.trace import FIELDS, SKIPPED_SHIFT, Flag, TraceWriter
-from rack.backplane.words import Block
+from rack.backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
+from rack.backplane.words import Block, System
 from rack.boards.run.ports import InputPorts, OutputPorts
 
 # Plain integers for the hot path.
-_TICK, _RELEASE, _START, _PLAN, _READ, _PROCESS, _END, _FLAGS, _STATE, _PROCESSOR = range(len(FIELDS))
+_EPOCH = int(System.EPOCH_NS)
 _DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (
     int(Block[name])
     for name in ("DONE", "CYCLES", "MISSED", "SKIPPED", "LEVEL_STATE", "LEVEL_SINCE", "CORRUPT", "BUS_ERRORS")
@@ -27,85 +27,104 @@ BUS_COUNT_CYCLES = 64
 
 
 class Stopwatch:
-    """Times one task. A cycle calls `start`, then one stamp after each part, then `finish` or `idle`."""
+    """Times one task: a cycle calls `start`, stamps the end of each part, and calls `finish` or `idle`.
+
+    Stamps are of CLOCK_MONOTONIC.
+    """
 
     def __init__(self, segment: Segment, task: str, inputs: InputPorts, outputs: OutputPorts) -> None:
         self._block = segment.block(task)
-        self._clock = SystemClock(segment)
-        self._inputs, self._outputs = inputs, outputs
-        self._status = getattr(outputs.messages, "status", None)
+        self._words, self._clock = segment.words, SystemClock(segment)
+        self._inputs, self._outputs, self._reading = inputs, outputs, inputs.task
+        self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
-        self._record = self._trace.record
         self._lockstep_clock = clock_semaphore(segment.rack) if self._clock.is_lockstep else None
-        self._troubles = self._bus_errors = self._corrupt = self._skipped = 0
+        self._troubles = self._bus_errors = self._corrupt = 0
+        self._cycles, self._state = self._block[_CYCLES], self._block[_LEVEL_STATE]
         self._processor_ns = 0  # processor time used before the current record
+        self._closed_ns = 0  # end of the bookkeeping of the last cycle
+        self._period_ns = self._clock.period_ns
+        self._tick = self._skipped = 0
+        self._late_ns = self._period_ns // 2
+        self._release_ns = 0  # grid point of the tick; in lockstep the start
+        self.is_late = True  # the cycle began more than half a tick late, or after skipped ones, or is the first
+        self.start_ns = 0  # start of the cycle
+        self.plan_ns = 0  # the plan has been transferred over the bus (C of fig. 4)
+        self.read_ns = 0  # command, status and plan are read (R)
+        self.process_ns = 0  # the level has processed, or planned (X, P)
+        self.end_ns = 0  # every output is written (W, U)
 
     def begin(self) -> None:
         """Count processor time from here on."""
-        self._processor_ns = process_time_ns()
+        self._processor_ns = thread_time_ns()
 
     def start(self, tick: int, skipped: int) -> None:
         """Begin the cycle released at `tick`, after `skipped` missed releases."""
-        self._skipped = skipped
-        self._record[_TICK] = tick
-        self._record[_START] = self._record[_PLAN] = monotonic_ns()
+        self._tick, self._skipped = tick, skipped
+        self.start_ns = self.plan_ns = release_ns = start_ns = monotonic_ns()
+        if self._lockstep_clock is None:
+            release_ns = self._words[_EPOCH] + tick * self._period_ns
+        self._release_ns = release_ns
+        self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
-    def exchanged(self) -> None:
-        """Stamp: the plan has been transferred over the bus (C of fig. 4)."""
-        self._record[_PLAN] = monotonic_ns()
-
-    def read(self) -> None:
-        """Stamp: command, status and plan are read (R)."""
-        self._record[_READ] = monotonic_ns()
-
-    def processed(self) -> None:
-        """Stamp: the level has processed, or planned (X, P)."""
-        self._record[_PROCESS] = monotonic_ns()
-
-    def written(self) -> None:
-        """Stamp: every output is written (W, U)."""
-        self._record[_END] = monotonic_ns()
+    def now(self, deadline: int) -> int | None:
+        """Return the clock's tick once the level has processed; None while tick `deadline` has not come."""
+        if self._lockstep_clock is None and self.process_ns < self._time_of(deadline):
+            return None
+        now = self._clock.now()
+        return now if now >= deadline else None
 
     def finish(self, in_time: bool, deadline: int, done: int, flags: int = 0) -> None:
         """Close the cycle: trace it, count it, and report all releases up to tick `done` as done.
 
         `in_time`: no message was too late. `deadline` is a tick.
         """
-        block, record, skipped = self._block, self._record, self._skipped
-        tick, missed = record[_TICK], not in_time
-        lockstep_clock = self._lockstep_clock
-        if lockstep_clock is not None:
-            record[_RELEASE] = record[_START]
-        else:
-            record[_RELEASE] = release = self._clock.time_of(tick)
-            missed = missed or record[_END] > release + (deadline - tick) * self._clock.period_ns
-        troubles = self._inputs.bad_reads + self._outputs.bus_errors
-        if troubles != self._troubles:
-            self._troubles = troubles
+        block, tick, skipped, lockstep_clock = self._block, self._tick, self._skipped, self._lockstep_clock
+        is_missed = not in_time or (lockstep_clock is None and self.end_ns > self._time_of(deadline))
+        if self._reading.troubles != self._troubles or not in_time:
             flags |= self._count_troubles()
-        record[_FLAGS] = flags | missed * _MISS | (skipped > 0) * _SKIP | skipped << SKIPPED_SHIFT
-        state = self._status.state if self._status is not None else 0
-        if state != block[_LEVEL_STATE]:
+        if is_missed:
+            flags |= _MISS
+            block[_MISSED] += 1
+        if skipped:
+            flags |= _SKIP | skipped << SKIPPED_SHIFT
+            block[_SKIPPED] += skipped
+        state = self._status[self._state_at]
+        if state != self._state:
+            self._state = block[_LEVEL_STATE] = state
             block[_LEVEL_SINCE] = tick
-        record[_STATE] = block[_LEVEL_STATE] = state
-        used = process_time_ns()
-        record[_PROCESSOR], self._processor_ns = used - self._processor_ns, used
-        self._trace.write()
-        block[_CYCLES] += 1
-        block[_MISSED] += missed
-        block[_SKIPPED] += skipped
+        used, before = thread_time_ns(), self._processor_ns
+        self._processor_ns = used
+        self._trace.write(
+            tick,
+            self._release_ns,
+            self.start_ns,
+            self.plan_ns,
+            self.read_ns,
+            self.process_ns,
+            self.end_ns,
+            flags,
+            state,
+            used - before,
+            self._closed_ns,
+        )
+        self._cycles = block[_CYCLES] = self._cycles + 1
         block[_DONE] = done
         if lockstep_clock is not None:
             lockstep_clock.release()
-        if not block[_CYCLES] % BUS_COUNT_CYCLES:
+        if not self._cycles % BUS_COUNT_CYCLES:
             self.count_bus()
+        self._closed_ns = monotonic_ns()
+
+    def _time_of(self, tick: int) -> int:
+        return self._release_ns + (tick - self._tick) * self._period_ns
 
     def idle(self) -> None:
         """Close a cycle in which a planner had nothing to plan: count it, but do not trace it."""
         # Exclude its processor time from the next plan's record.
-        self._processor_ns = process_time_ns()
-        self._block[_CYCLES] += 1
-        self._block[_DONE] = self._record[_TICK]
+        self._processor_ns = thread_time_ns()
+        self._cycles = self._block[_CYCLES] = self._cycles + 1
+        self._block[_DONE] = self._tick
         self.notify_clock()
 
     def notify_clock(self) -> None:
@@ -115,6 +134,7 @@ class Stopwatch:
 
     def _count_troubles(self) -> int:
         """Count failed accesses since the last cycle; return trace flags."""
+        self._troubles = self._reading.troubles
         bus_errors, corrupt = self._inputs.bus_errors + self._outputs.bus_errors, self._inputs.corrupt
         new_errors, new_corrupt = bus_errors - self._bus_errors, corrupt - self._corrupt
         self._bus_errors, self._corrupt = bus_errors, corrupt
@@ -129,3 +149,10 @@ class Stopwatch:
         block[Block.READ_BYTES] += reads[1]
         block[Block.WRITES] += writes[0]
         block[Block.WRITE_BYTES] += writes[1]
+
+
+def _state_of(outputs: OutputPorts) -> tuple[int, memoryview]:
+    """Return where, in which bytes, a level's status holds its state, one byte; always 0 without a status."""
+    status = getattr(outputs.messages, "status", None)
+    at = (status.record.dtype.fields or {}).get("state") if status is not None else None
+    return (at[1], status.raw) if status is not None and at is not None else (0, memoryview(bytes(1)))

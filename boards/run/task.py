@@ -42,11 +42,10 @@ class Task(ABC):
         self.alarms = AlarmWriter(segment, wiring.task, attention)
         self.next_cycle = NextCycle(segment, wiring.task, wiring.poll, self.alarms if wiring.guards_clock else None)
         self.inputs = InputPorts(segment, wiring.inputs, self.alarms, f"{spec.board}.plan")
-        self.outputs = OutputPorts(segment, wiring.outputs, self.alarms)
+        self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs)
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
         self.faults = TaskFaults(segment, spec, self.outputs, level)
         self._generation = 0
-        self._guard = ClockGuard(segment, self.alarms) if wiring.guards_clock else None
 
     def begin(self) -> None:
         """Mark the task as running on the backplane, and start to count its processor time."""
@@ -56,15 +55,13 @@ class Task(ABC):
     def wait_until_next_cycle(self) -> int | None:
         """Wait for the next release and return its tick; None when the run is over.
 
-        Between cycles, here, faults take effect and the clock is checked.
+        Between cycles, here, faults take effect.
         """
         tick = self.next_cycle.wait()
         if tick is None:
             return None
         if self.words[_FAULTS] != self._generation:
             self._generation = self.faults.refresh()
-        if self._guard is not None:
-            self._guard.check(tick, self.next_cycle.skipped)
         return tick
 
     @abstractmethod
@@ -73,15 +70,15 @@ class Task(ABC):
 
 
 class ClockGuard:
-    """A fast task's check of the clock: at every release it compares the tick with monotonic time.
+    """A fast task's check of the clock, whenever a cycle begins late: did the clock release it late, or skip ticks?
 
     A missing release counts as skipped by the clock, not by the task, if the clock has counted it as skipped.
     """
 
-    def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
+    def __init__(self, segment: Segment, alarms: AlarmWriter, every: int) -> None:
         self._words = segment.words
         self._clock = SystemClock(segment)
-        self._alarms = alarms
+        self._alarms, self._every = alarms, every
         self._late_ns = self._clock.period_ns // 2
         self._skipped = self._words[_CLOCK_SKIPPED]
         self._quiet_from = 0
@@ -89,10 +86,11 @@ class ClockGuard:
     def check(self, tick: int, skipped: int) -> None:
         """Check the clock in the cycle released at `tick`, after `skipped` missed releases."""
         words = self._words
-        if skipped and words[_CLOCK_SKIPPED] != self._skipped:
-            by_clock = words[_CLOCK_SKIPPED] - self._skipped
-            self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=by_clock, since=tick - by_clock)
+        # Ticks skipped earlier cost the task no release.
+        by_clock = min(words[_CLOCK_SKIPPED] - self._skipped, skipped * self._every)
         self._skipped = words[_CLOCK_SKIPPED]
+        if by_clock:
+            self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=by_clock, since=tick - by_clock)
         late_ns = words[_TICK_NS] - self._clock.time_of(tick)
         # Checked after the read: the time is this tick's only if the clock has not advanced meanwhile.
         if self._clock.is_lockstep or words[_TICK] != tick:

@@ -25,6 +25,8 @@ it moves fast, and its support pushes it back as it is put down."""
 
 ANY_DISTANCE = -np.inf
 """Required distance of a pair that may overlap."""
+NONE: Array = np.zeros(0)
+"""Shortfalls where no pair is close."""
 
 
 def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
@@ -56,7 +58,7 @@ class CollisionChecker:
         self._row_geoms = [np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b) for b in cell.bodies]
         self._offset = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
         self._tool_quaternion = np.zeros(4)
-        self._short = np.zeros(0)
+        self._short = NONE
         self._contype = self._filter_to_arm()
         self._base = self._required_distances()
         self._required = self._base.copy()
@@ -92,7 +94,8 @@ class CollisionChecker:
 
     def free(self, q: Array, clearance: float | None = None) -> bool:
         """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may lower the scene's."""
-        return not bool(np.any(self._shortfalls(q, clearance) > 0))
+        short = self._shortfalls(q, clearance)
+        return not (len(short) and (short > 0.0).any())
 
     def room(self, q: Array) -> float:
         """Return the largest clearance, in m and at most the scene's, with which `q` is free; negative: with none."""
@@ -129,6 +132,9 @@ class CollisionChecker:
             self._carry(self.held)
             mujoco.mj_kinematics(m, d)
         mujoco.mj_collision(m, d)
+        if not d.ncon:  # the usual case
+            self._short = NONE
+            return NONE
         contact = d.contact
         pairs = contact.geom
         required = self._required[pairs[:, 0], pairs[:, 1]]

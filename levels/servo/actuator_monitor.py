@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array, each, mat_vec
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
@@ -25,8 +27,12 @@ DEAD_PART = 0.5
 """Part of its torque that a motor must lack to count as dead where dry friction hides its torque."""
 URGENT_SPEED_PART = 0.99
 """Part of a velocity limit: if a joint may reach it while motors lack torque, there is no time to be certain."""
-TURNING = np.array([[-2.0], [2.0]])
-"""Velocities, in `FRICTION_SPEED`, between which dry friction may be anything up to its full value."""
+TURNING = 2.0
+"""Speed, in `FRICTION_SPEED`, up to which dry friction may be anything up to its full value."""
+
+
+EXPLAINED, LEFT_OVER, ASTRAY = 0, 1, 2
+"""Verdicts on a cycle: nothing, or some torque, is left unexplained; a joint has strayed from its set points."""
 
 
 class ActuatorMonitor:
@@ -39,20 +45,25 @@ class ActuatorMonitor:
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
-        self._limits, self._dry = cell.bounds.torque, np.array(cell.model.dof_frictionloss[cell.dof])
-        self._following, self._period_s = following, period_s
+        model, dof, joints = cell.model, cell.dof, len(cell.dof)
+        self._limits, self._following, self._fastest = (
+            cell.bounds.torque,
+            following,
+            URGENT_SPEED_PART * cell.bounds.velocity,
+        )
+        self._table = np.zeros((12 + joints, joints))  # in the rows of `left_over`
+        self._velocity, self._bias, self._torque, self._dry, early, least, uncertain, self._off = self._table[:8]
+        self._left, self._noise, *self._friction = self._table[8:12]
+        self._inertia = self._table[12:]
+        self._dry[:] = model.dof_frictionloss[dof]
         # Simulated friction slows a joint as a damper of that time constant does: if the joint brakes harder, the
         # friction changes sign before the velocity does.
-        model, dof = cell.model, cell.dof
-        self._early = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
-        self._fastest = URGENT_SPEED_PART * cell.bounds.velocity
-        self._least, self._speed_off = NOISE_PART * self._limits, cell.encoders.speed_off
-        self._exact, self._off = cell.encoders.exact, cell.encoders.off
-        self._noise = self._least
-        joints = len(self._dry)
-        self._inertia, self._twice_inertia = np.zeros((joints, joints)), np.zeros((joints, joints))
-        self._bias, self._velocity, self._torque = np.zeros((3, joints))
-        self._friction = np.zeros((2, joints))
+        early[:] = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
+        least[:] = NOISE_PART * self._limits
+        # The change in velocity that the encoders' errors may simulate.
+        uncertain[:] = 2.0 * cell.encoders.speed_off / period_s
+        self._off[:] = cell.encoders.off
+        self._judge = partial(left_over.load(), self._table, period_s, following)
         self._begun = False
         self._pushed = False  # weak motors do not explain the difference
         self._cycles, self._joint = 0, -1  # cycles for which a motor has lacked torque, and its joint
@@ -61,10 +72,8 @@ class ActuatorMonitor:
 
     def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
         """Record velocity, rad/s, terms and commanded torques, N m, at the beginning of a cycle."""
-        np.copyto(self._velocity, velocity)
-        np.copyto(self._inertia, terms.inertia)
-        np.copyto(self._bias, terms.bias)
-        np.copyto(self._torque, torque)
+        self._velocity[...], self._bias[...], self._torque[...] = velocity, terms.bias, torque
+        self._inertia[...] = terms.inertia
         self._begun = True
 
     def drop(self) -> None:
@@ -79,38 +88,14 @@ class ActuatorMonitor:
         """
         if not self._begun:
             return None
-        far = np.abs(astray) - self._off
-        if np.count_nonzero(far > self._following):
-            joint = int(far.argmax())
-            return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
-        left = self._left_over(velocity, terms)
-        if not self._exact:
-            # The change in velocity that the encoders' errors may simulate.
-            self._noise = self._least + mat_vec(np.abs(terms.inertia), 2.0 * self._speed_off / self._period_s)
-        if not np.count_nonzero(np.abs(left) > self._noise):
+        verdict = self._judge(velocity, terms.inertia, terms.bias, astray)
+        if verdict == EXPLAINED:
             self._cycles, self._pushed = 0, False
             return None
-        return self._lacking(left, velocity, holds)
-
-    def _left_over(self, velocity: Array, terms: Terms) -> Array:
-        """Return the torques, N m, taken neither by the motion nor by dry friction."""
-        gain = velocity - self._velocity
-        gain *= 0.5 / self._period_s
-        np.add(self._inertia, terms.inertia, out=self._twice_inertia)
-        left = self._bias + terms.bias
-        left *= -0.5
-        left += self._torque
-        left -= mat_vec(self._twice_inertia, gain)
-        gain *= self._early
-        gain += velocity
-        friction = self._friction
-        np.minimum(gain, self._velocity, out=friction[0])
-        np.maximum(gain, self._velocity, out=friction[1])
-        friction /= FRICTION_SPEED
-        friction += TURNING
-        friction[:] = each(math.tanh, friction)
-        friction *= self._dry
-        return np.asarray(left - np.minimum(np.maximum(left, friction[0]), friction[1]))
+        if verdict == ASTRAY:
+            joint = int((np.abs(astray) - self._off).argmax())
+            return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
+        return self._lacking(self._left, velocity, holds)
 
     def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
         """Follow cycles in which motors that lack torque explain the difference, until it is certain."""
@@ -155,3 +140,45 @@ class ActuatorMonitor:
         certain = 2.0 * self._noise[joint]
         hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD_PART * commanded else 0.0
         return bool(self._most <= certain + hidden or (more > certain and rise < RISE_PART * more))
+
+
+@compiled
+def left_over(
+    table: Array,  # (12 + joints, joints): rows as below
+    period_s: float,
+    following: float,  # rad
+    velocity: Array,  # (joints,), and so on: now
+    inertia: Array,
+    bias: Array,
+    astray: Array,  # (joints,), rad
+) -> int:
+    """Compare the torques that a motion took with those commanded; return the verdict."""
+    velocity_before, bias_before, torque = table[0], table[1], table[2]  # rad/s, N m, N m: at the cycle's beginning
+    inertia_before = table[12:]  # kg m2
+    dry, early = table[3], table[4]  # friction, N m; time constant of the simulated one, s
+    noise, uncertain = table[5], table[6]  # N m, rad/s2: of exact encoders, and acceleration that others may simulate
+    off = table[7]  # rad: error of the positions
+    verdict = EXPLAINED
+    for j in range(len(velocity)):
+        left, unsure = torque[j] - 0.5 * (bias_before[j] + bias[j]), noise[j]
+        for k in range(len(velocity)):
+            left -= (inertia_before[j, k] + inertia[j, k]) * ((0.5 / period_s) * (velocity[k] - velocity_before[k]))
+            unsure += abs(inertia[j, k]) * uncertain[k]
+        ahead = velocity[j] + early[j] * ((0.5 / period_s) * (velocity[j] - velocity_before[j]))
+        slowest, fastest = min(ahead, velocity_before[j]), max(ahead, velocity_before[j])
+        least = dry[j] * math.tanh(slowest / FRICTION_SPEED - TURNING)
+        most = dry[j] * math.tanh(fastest / FRICTION_SPEED + TURNING)
+        left -= min(max(left, least), most)
+        # Set, N m: what is left over, what of it may be noise, least and most friction.
+        table[8, j], table[9, j], table[10, j], table[11, j] = left, unsure, least, most
+        if abs(left) > unsure:
+            verdict = max(verdict, LEFT_OVER)
+        if abs(astray[j]) - off[j] > following:
+            verdict = ASTRAY
+    return verdict
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    square, joints = np.zeros((1, 1)), np.zeros(1)
+    left_over.load()(np.zeros((13, 1)), 1.0, 1.0, joints, square, joints, joints)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, mat_vec
+from rack.levels.algebra import Array
 from rack.levels.arm import find_arm
+from rack.levels.compiled import compiled
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.dynamics import Dynamics, Payload, Terms
+from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
 from rack.levels.tables import GripperConfig, Positive, Table
 
@@ -57,28 +59,57 @@ class ComputedTorque:
 
     def __init__(self, cell: Cell, params: ServoParams) -> None:
         self._dynamics = Dynamics(cell)
-        self._limits = cell.bounds.torque
-        self._stiffness = params.bandwidth**2
-        self._damping = 2.0 * params.damping * params.bandwidth
+        gains = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
+        dry, limits = np.array((cell.model.dof_frictionloss[cell.dof], cell.bounds.torque))
+        self._set = partial(set_torque.load(), *gains, dry, limits)
+        self.holds = False  # the gripper holds a part, says the plan
         self.cut = 0  # cycles in which a torque limit cut a torque
+        self._payload: Payload | None = None
+        self._inertia: Array | None = None  # (joints, joints), kg m2: planned
 
-    def terms(self, position: Array, velocity: Array, plan: Message | None) -> Terms:
+    def take(self, plan: Message) -> None:
+        """Take a new plan."""
+        self.holds = plan.held >= 0
+        self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
+        self._inertia = plan.inertia.copy()
+
+    def terms(self, position: Array, velocity: Array) -> Terms:
         """Return the equation of motion at rad, rad/s, with the held object. Valid until the next call."""
-        payload = None if plan is None else Payload(plan.payload_mass, plan.payload_offset)
-        return self._dynamics.terms(position, velocity, payload)
+        return self._dynamics.terms(position, velocity, self._payload)
 
-    def torque(self, wanted: Motion, position: Array, velocity: Array, terms: Terms, plan: Message | None) -> Array:
+    def torque(self, wanted: Motion, position: Array, velocity: Array, terms: Terms) -> Array:
         """Return the torques, (joints,), N m, for the wanted motion."""
-        inertia = terms.inertia if plan is None else plan.inertia
-        acceleration = (
-            wanted.acceleration
-            + self._damping * (wanted.velocity - velocity)
-            + self._stiffness * (wanted.position - position)
-        )
-        torque = mat_vec(inertia, acceleration) + terms.bias + self._dynamics.friction(wanted.velocity)
-        possible = np.minimum(np.maximum(torque, -self._limits), self._limits)
-        self.cut += bool(np.count_nonzero(possible != torque))
-        return np.asarray(possible)
+        torque = np.empty(len(position))
+        inertia = terms.inertia if self._inertia is None else self._inertia
+        self.cut += self._set(*wanted, position, velocity, inertia, terms.bias, torque)
+        return torque
+
+
+@compiled
+def set_torque(
+    stiffness: float,  # 1/s2
+    damping: float,  # 1/s
+    dry: Array,  # (joints,), N m: friction
+    limits: Array,  # (joints,), N m
+    wanted: Array,  # (joints,), rad; then rad/s and rad/s2
+    wanted_velocity: Array,
+    wanted_acceleration: Array,
+    position: Array,  # (joints,), rad
+    velocity: Array,  # (joints,), rad/s
+    inertia: Array,  # (joints, joints), kg m2
+    bias: Array,  # (joints,), N m
+    torque: Array,  # (joints,), N m: set
+) -> bool:
+    """Set the torques of `ComputedTorque`; return whether a limit cut one."""
+    acceleration = wanted_acceleration + damping * (wanted_velocity - velocity) + stiffness * (wanted - position)
+    cut = False
+    for j in range(len(torque)):
+        needed = bias[j] + dry[j] * math.tanh(wanted_velocity[j] / FRICTION_SPEED)
+        for k in range(len(torque)):
+            needed += inertia[j, k] * acceleration[k]
+        torque[j] = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
+        cut = cut or needed != torque[j]
+    return cut
 
 
 class Grip:
@@ -97,13 +128,22 @@ class Grip:
         """Keep `force`, N, until the first set point: the grip on an object must survive a restart of the board."""
         self._kept = force
 
-    def force(self, command: Message, opening: float, velocity: float) -> float:
-        """Return the force, N, at `opening`, m, and its `velocity`, m/s, given the newest `JOINT_SET_POINT`."""
+    def take(self, command: Message) -> None:
+        """Take a new `JOINT_SET_POINT`."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
             self._limit = min(max(command.force, 0.0), self._config.force)
             self._kept = None
+
+    def force(self, opening: float, velocity: float) -> float:
+        """Return the force, N, at `opening`, m, and its `velocity`, m/s."""
         if self._kept is not None:
             return self._kept
         force = self._config.stiffness * (self._opening - opening) - self._config.damping * velocity
         return min(max(force, -self._limit), self._limit)
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    square, one = np.zeros((1, 1)), np.zeros(1)
+    set_torque.load()(0.0, 0.0, one, one, one, one, one, one, one, square, one, one)

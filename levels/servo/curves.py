@@ -1,12 +1,20 @@
-"""Curves that the set point follows in joint space. Times are seconds from the curve's start; arrays are (joints,)."""
+"""Curves that the set point follows in joint space. Times are seconds from the curve's start; arrays are (joints,).
+
+Every curve is a table of seven rows: the coefficients of a polynomial in u = time / duration, lowest first, and where
+the joints rest after it. So one compiled function gives the motion on any of them.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
+
+REST = 6
+"""Row of a curve's table: where the joints rest after it."""
 
 
 class Motion(NamedTuple):
@@ -17,56 +25,95 @@ class Motion(NamedTuple):
     acceleration: Array
 
 
-class Curve(Protocol):
-    """A motion in time."""
+class Curve:
+    """A motion in time, for all joints, that goes over to rest at `ends_s`."""
+
+    def __init__(self, *coefficients: Array, duration_s: float, rest: Array | None = None) -> None:
+        """Take coefficients of u^0, u^1, ..., rad; without `rest`, rad, the motion goes on after `duration_s`."""
+        self.table: Array = np.zeros((REST + 1, len(coefficients[0])))  # (7, joints), rad
+        self.table[: len(coefficients)] = coefficients
+        self.duration_s = duration_s
+        self.ends_s = np.inf if rest is None else duration_s
+        if rest is not None:
+            self.table[REST] = rest
 
     def at(self, time_s: float) -> Motion:
-        """Return the motion at `time_s`."""
+        """Return the motion at `time_s` from 0 on."""
+        motion = np.zeros((3, self.table.shape[1]))
+        set_motion.load()(self.table, self.duration_s, self.ends_s, time_s, motion)
+        return Motion(*motion)
 
 
-class Hermite:
-    """The cubic between two points with given velocities, `duration_s` apart."""
-
-    def __init__(self, start: Array, start_velocity: Array, end: Array, end_velocity: Array, duration_s: float) -> None:
-        first, second = start_velocity * duration_s, end_velocity * duration_s
-        way = end - start
-        self._duration_s = duration_s
-        self._coefficients = (start, first, 3.0 * way - 2.0 * first - second, first + second - 2.0 * way)
-
-    def at(self, time_s: float) -> Motion:
-        """Return the motion at `time_s`, from 0 to the duration."""
-        c0, c1, c2, c3 = self._coefficients
-        h, u = self._duration_s, time_s / self._duration_s
-        position = c0 + u * (c1 + u * (c2 + u * c3))
-        velocity = (c1 + u * (2.0 * c2 + 3.0 * u * c3)) / h
-        return Motion(position, velocity, (2.0 * c2 + 6.0 * u * c3) / (h * h))
-
-    def hardest(self) -> Array:
-        """Return the largest |acceleration| on the curve, rad/s2: it is at one of the ends."""
-        _, _, c2, c3 = self._coefficients
-        return np.asarray(np.maximum(np.abs(2.0 * c2), np.abs(2.0 * c2 + 6.0 * c3)) / self._duration_s**2)
+@compiled
+def set_motion(table: Array, duration_s: float, ends_s: float, time_s: float, motion: Array) -> None:
+    """Set position, velocity and acceleration, (3, joints), to those on a curve."""
+    if time_s >= ends_s:
+        motion[0] = table[REST]
+        motion[1:] = 0.0
+        return
+    h, u = duration_s, time_s / duration_s
+    for j in range(table.shape[1]):
+        c0, c1, c2, c3, c4, c5 = table[0, j], table[1, j], table[2, j], table[3, j], table[4, j], table[5, j]
+        motion[0, j] = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
+        motion[1, j] = (c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
+        motion[2, j] = (2.0 * c2 + u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5))) / (h * h)
 
 
-class Ramp:
+class Bridge(Curve):
+    """The cubic from the motion on another curve to a position and a velocity."""
+
+    def __init__(self, before: Curve, begin_s: float, end: tuple[Array, Array], duration_s: float) -> None:
+        """Leave `before` at its `begin_s`; reach `end`, rad, rad/s, `duration_s` later."""
+        position, velocity = end
+        super().__init__(position, duration_s=duration_s)
+        set_bridge.load()(
+            before.table, before.duration_s, before.ends_s, begin_s, position, velocity, duration_s, self.table
+        )
+
+    def is_within(self, acceleration: Array) -> bool:
+        """Return whether no joint needs more than its `acceleration`, rad/s2."""
+        return bool(is_within.load()(self.table, self.duration_s, acceleration))
+
+
+@compiled
+def set_bridge(
+    before: Array,
+    before_duration_s: float,
+    before_ends_s: float,
+    begin_s: float,
+    position: Array,
+    velocity: Array,
+    duration_s: float,
+    table: Array,
+) -> None:
+    """Set the coefficients of the cubic Hermite curve in `table`, (7, joints)."""
+    motion = np.zeros((3, table.shape[1]))
+    set_motion(before, before_duration_s, before_ends_s, begin_s, motion)
+    first, second, way = motion[1] * duration_s, velocity * duration_s, position - motion[0]
+    table[0] = motion[0]
+    table[1] = first
+    table[2] = 3.0 * way - 2.0 * first - second
+    table[3] = first + second - 2.0 * way
+
+
+@compiled
+def is_within(table: Array, duration_s: float, acceleration: Array) -> bool:
+    """Return whether the acceleration of a cubic is within bounds, rad/s2: it is largest at one of the ends."""
+    begin, end = 2.0 * table[2] / duration_s**2, (2.0 * table[2] + 6.0 * table[3]) / duration_s**2
+    return bool(np.all((np.abs(begin) <= acceleration) & (np.abs(end) <= acceleration)))
+
+
+class Ramp(Curve):
     """From a velocity to rest, all joints at the same time, so that they stay on a straight line; then rest."""
 
     def __init__(self, start: Array, velocity: Array, acceleration: Array) -> None:
         """Decelerate no joint harder than its `acceleration`, rad/s2."""
-        self.duration_s = float(np.max(np.abs(velocity) / acceleration))
-        self._start, self._velocity = start, velocity
-        self._end = start + 0.5 * velocity * self.duration_s
-        self._rest = np.zeros_like(start)
-
-    def at(self, time_s: float) -> Motion:
-        """Return the motion at `time_s` from 0 on."""
-        if time_s >= self.duration_s:
-            return Motion(self._end, self._rest, self._rest)
-        braking = self._velocity / self.duration_s
-        position = self._start + time_s * (self._velocity - 0.5 * time_s * braking)
-        return Motion(position, self._velocity - time_s * braking, -braking)
+        duration_s = float(np.max(np.abs(velocity) / acceleration))
+        half = 0.5 * velocity * duration_s
+        super().__init__(start, 2.0 * half, -half, duration_s=duration_s, rest=start + half)
 
 
-class Decay:
+class Decay(Curve):
     """A difference in position and velocity that decays: a quintic that ends with all derivatives zero; then 0."""
 
     def __init__(self, position: Array, velocity: Array, fastest: Array, hardest: Array) -> None:
@@ -74,31 +121,25 @@ class Decay:
         # Peaks of the quintic over a time T: 1.875 p / T in velocity; 5.774 p / T^2 + 3.94 v / T in acceleration.
         linear = 3.94 * np.abs(velocity)
         by_acceleration = (linear + np.sqrt(linear**2 + 4.0 * 5.774 * hardest * np.abs(position))) / (2.0 * hardest)
-        self.duration_s = float(max(np.max(1.875 * np.abs(position) / fastest), np.max(by_acceleration)))
-        p, w = position, velocity * self.duration_s
-        self._coefficients = (p, w, -10.0 * p - 6.0 * w, 15.0 * p + 8.0 * w, -6.0 * p - 3.0 * w)
-        self._zero = np.zeros_like(position)
-
-    def at(self, time_s: float) -> Motion:
-        """Return the remaining difference at `time_s` from 0 on."""
-        if time_s >= self.duration_s:
-            return Motion(self._zero, self._zero, self._zero)
-        c0, c1, c3, c4, c5 = self._coefficients
-        h, u = self.duration_s, time_s / self.duration_s
-        position = c0 + u * (c1 + u * u * (c3 + u * (c4 + u * c5)))
-        velocity = (c1 + u * u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5))) / h
-        return Motion(position, velocity, u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5)) / (h * h))
+        duration_s = float(max(np.max(1.875 * np.abs(position) / fastest), np.max(by_acceleration)))
+        p, w = position, velocity * duration_s
+        c3, c4, c5 = -10.0 * p - 6.0 * w, 15.0 * p + 8.0 * w, -6.0 * p - 3.0 * w
+        super().__init__(p, w, np.zeros_like(p), c3, c4, c5, duration_s=duration_s, rest=np.zeros_like(p))
 
 
-class Passage:
+class Passage(Decay):
     """From rest to rest at another place, all joints at the same time, straight in joint space; then rest."""
 
     def __init__(self, start: Array, end: Array, fastest: Array, hardest: Array) -> None:
         """Last as long as it takes to keep every joint within `fastest`, rad/s, and `hardest`, rad/s2."""
-        self._end = end
-        self._left = Decay(start - end, np.zeros_like(start), fastest, hardest)
+        super().__init__(start - end, np.zeros_like(start), fastest, hardest)
+        self.table[0] += end
+        self.table[REST] += end
 
-    def at(self, time_s: float) -> Motion:
-        """Return the motion at `time_s` from 0 on."""
-        left = self._left.at(time_s)
-        return Motion(self._end + left.position, left.velocity, left.acceleration)
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    table, joints = np.zeros((REST + 1, 1)), np.zeros(1)
+    set_motion.load()(table, 1.0, 1.0, 0.0, table[:3])
+    set_bridge.load()(table, 1.0, 1.0, 0.0, joints, joints, 1.0, table)
+    is_within.load()(table, 1.0, joints)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm
 from rack.levels.arm.faulty import STEPS
-from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports
+from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell
+from rack.levels.servo import actuator_monitor, control, reference, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams
 from rack.levels.servo.curves import Motion
@@ -21,6 +23,26 @@ from rack.levels.servo.reference import Reference
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
 from rack.levels.tables import read_params
+
+SCENES = Output(SCENE, cycles=8)
+"""At 400 Hz, a scene for every cycle of the levels that read it."""
+
+
+class Shown(NamedTuple):
+    """What of a status seldom changes."""
+
+    command: int
+    holding: bool
+    stopped: bool
+    braked: bool
+    demand: Demand
+    clipped: int
+    touches: int
+    violations: int
+    pushed: int
+    kept: str  # why the arm does not follow its set points
+    error: Error  # latched
+    fault: str  # of the arm
 
 
 class ServoExecutor(Executor):
@@ -54,13 +76,21 @@ class ServoExecutor(Executor):
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
+        self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
         self.operator = OperatorControl(self.commands, context.robot.joints, cell.limits.position)
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._rest = np.zeros(len(cell.home))  # (joints,), always zero: velocity and acceleration at rest
         self._wanted = Motion(cell.home, self._rest, self._rest)  # motion wanted in the last cycle: rad, rad/s, rad/s2
+        self._shown: Shown | None = None  # in the last status
         self._started = False  # the first cycle has begun
         self._abandoned = False  # set points were abandoned in the last cycle: the arm was braked
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the level."""
+        for module in (control, reference, sensor_monitor, actuator_monitor):
+            module.preload()
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
@@ -69,33 +99,41 @@ class ServoExecutor(Executor):
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the arm to `tick`, sense, interpolate, drive, report."""
-        missed = self._catch_up(read.before.value if read.before.is_there else None, tick)
+        missed = self._catch_up(read.before, tick)
+        self._take_messages(read)
         sensed, sensors = self._link.sense(), self.sensors
         contact = self.arm.contact
         sensors.look(sensed, tick, None if missed or self._abandoned else self._wanted.velocity, contact is not None)
-        self.operator.take(read.operator)
         if contact is not None:
             self.stopping.struck(contact, self.arm.named(contact), tick)
         reaction = self.stopping.decide(self.demand, sensors, tick)
-        self._take_findings()
         if reaction is Reaction.BRAKE:
             self._brake()
         elif sensors.fresh:
-            self._drive(read, sensed, reaction, missed, tick)
+            self._drive(read.command.value, sensed, reaction, missed, tick)
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
         self._brakes.after_cycle(tick, self.findings)
-        self._report(write.status, read.command.value, sensed, reaction)
+        self._report(write.status, read.command.value.id, sensed, reaction)
         self.operator.orders.report(write.status, read.command.value.operator)
         self.arm.save(write.state)
         sensors.remember(write.state)
         self.stopping.remember(write.state)
-        self.arm.look(write.scene)
+        if SCENES.is_due(tick, self.context.every):
+            self.arm.look(write.scene)
 
-    def _catch_up(self, before: Message | None, tick: int) -> bool:
+    def _take_messages(self, read: Ports) -> None:
+        """Take over what is new."""
+        self.operator.take(read.operator)
+        if read.plan.is_new:
+            self._loop.take(read.plan.value)
+        if read.command.is_new and self._grip is not None:
+            self._grip.take(read.command.value)
+
+    def _catch_up(self, before: Reading, tick: int) -> bool:
         """Advance the arm to `tick`; return whether cycles were missed. A restarted board first restores the arm."""
         if not self._started:
-            self._start(before, tick)
+            self._start(before.value if before.is_there else None, tick)
             return False
         ticks = tick - self.arm.tick
         self.arm.step(ticks)
@@ -118,12 +156,6 @@ class ServoExecutor(Executor):
         self._brakes.after_waiting(tick, self.findings)
         self._started = self._abandoned = True
 
-    def _take_findings(self) -> None:
-        for findings in (self.sensors.findings, self.stopping.findings):
-            if findings:
-                self.findings += findings
-                findings.clear()
-
     def _brake(self) -> None:
         """Brake, and abandon the set points."""
         self.arm.brake()
@@ -131,21 +163,18 @@ class ServoExecutor(Executor):
         self._wanted = Motion(self.sensors.position, self.sensors.velocity, self._rest)
         self._abandoned = True
 
-    def _drive(self, read: Ports, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
+    def _drive(self, command: Message, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
         """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is complete."""
-        command: Message = read.command.value
-        plan: Message | None = read.plan.value if read.plan.is_there else None
         position, velocity = self.sensors.position, self.sensors.velocity
         wanted = self._next_motion(command, reaction, missed, tick)
-        terms = self._loop.terms(position, velocity, plan)
-        holds = plan is not None and plan.held >= 0
-        failed = self.motors.look(velocity, terms, wanted.position - position, holds)
+        terms = self._loop.terms(position, velocity)
+        failed = self.motors.look(velocity, terms, wanted.position - position, self._loop.holds)
         if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
             return self._brake()
         if reaction is Reaction.STOP and (self._abandoned or not wanted.velocity.any()):
             return self._brake()
-        torque = self._loop.torque(wanted, position, velocity, terms, plan)
-        grip_force = 0.0 if self._grip is None else self._grip.force(command, sensed.opening, sensed.opening_velocity)
+        torque = self._loop.torque(wanted, position, velocity, terms)
+        grip_force = 0.0 if self._grip is None else self._grip.force(sensed.opening, sensed.opening_velocity)
         refused = self._link.drive(torque, grip_force)
         if refused is not None:
             return self._refuse(refused, tick)
@@ -159,7 +188,7 @@ class ServoExecutor(Executor):
             reference.start(sensors.position, sensors.velocity, tick)
         elif missed:
             reference.meet(sensors.position, sensors.velocity, tick)
-        if reaction is not Reaction.NONE:
+        if reaction:
             return reference.rest(tick)
         return self.operator.wanted(reference, tick) if self.operator.stands else reference.at(command, tick)
 
@@ -176,26 +205,41 @@ class ServoExecutor(Executor):
         self.stopping.refuse(finding, tick)
         self._brake()
 
-    def _report(self, status: Message, command: Message, sensed: Sensed, reaction: Reaction) -> None:
+    def _report(self, status: Message, command: int, sensed: Sensed, reaction: Reaction) -> None:
+        """Fill the status that answers `command`; what seldom changes only when it does."""
         arm, sensors, wanted = self.arm, self.sensors, self._wanted
-        holding = self._abandoned or self.reference.holding
-        status.echo = command.id
-        status.position, status.velocity, status.torque = sensors.position, sensors.velocity, arm.torque
-        status.target, status.target_velocity = wanted.position, wanted.velocity
+        status.position[...], status.velocity[...], status.torque[...] = sensors.position, sensors.velocity, arm.torque
+        status.target[...], status.target_velocity[...] = wanted.position, wanted.velocity
         status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
         status.grip_force = arm.grip_force
-        status.holding, status.braked = holding, arm.braked
-        status.stopped = self._abandoned or reaction is not Reaction.NONE or self.operator.stands
-        status.demand = self.demand
-        status.clipped = arm.clipped + self.reference.refused + self._loop.cut
-        status.touches, status.violations, status.pushed = arm.touches, arm.violations, arm.pushed
-        kept = self.stopping.reason or self.operator.reason
-        if arm.fault:
-            status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, arm.fault
-        elif self.stopping.error:
-            status.state, status.error, status.reason = State.ERROR, self.stopping.error, kept
+        shown = (
+            command,
+            self._abandoned or self.reference.holding,
+            self._abandoned or reaction > 0 or self.operator.stands,
+            arm.braked,
+            self.demand,
+            arm.clipped + self.reference.refused + self._loop.cut,
+            arm.touches,
+            arm.violations,
+            arm.pushed,
+            self.stopping.reason or self.operator.reason,
+            self.stopping.error,
+            arm.fault,
+        )
+        if shown != self._shown:
+            self._shown = Shown(*shown)
+            self._show(status, self._shown)
+
+    def _show(self, status: Message, shown: Shown) -> None:
+        """Fill in what seldom changes."""
+        status.echo, status.holding, status.stopped, status.braked = shown[:4]
+        status.demand, status.clipped, status.touches, status.violations, status.pushed = shown[4:9]
+        if shown.fault:
+            status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, shown.fault
+        elif shown.error:
+            status.state, status.error, status.reason = State.ERROR, shown.error, shown.kept
         else:
-            resting = State.IDLE if holding else State.EXECUTING
-            status.state = State.HOLDING if kept and command.id else resting
-            status.error = Error.LIMIT if arm.violations else Error.TOUCHED if arm.touches else Error.NONE
-            status.reason = kept or (arm.first_violation if arm.violations else arm.first_touch)
+            resting = State.IDLE if shown.holding else State.EXECUTING
+            status.state = State.HOLDING if shown.kept and shown.command else resting
+            status.error = Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
+            status.reason = shown.kept or (self.arm.first_violation if shown.violations else self.arm.first_touch)

@@ -13,8 +13,10 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
 from rack.levels.robot.limits import Bounds, Limits
-from rack.levels.servo.curves import Curve, Decay, Hermite, Motion, Passage, Ramp
+from rack.levels.servo import curves
+from rack.levels.servo.curves import REST, Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
 
 MAX_ACCELERATION = 2.0
 """Multiple of the acceleration limits that the curve between two set points may need: planned motion, interpolated,
@@ -25,6 +27,8 @@ ASTRAY_RAD = 0.005
 """Distance from the reference beyond which an arm is led back gradually after missed cycles."""
 MAX_AHEAD_S = 2.0
 """Time ahead at which a set point may be due: beyond that it is a broken command, not a slow level."""
+WRONG, CUT, WITHIN = 0, 1, 2
+"""Verdicts on a set point: not finite, cut at the bounds, within them."""
 
 
 class SetPoint(NamedTuple):
@@ -39,9 +43,13 @@ class Reference:
     """Interpolates set points: tick by tick, `at(command, tick)` gives the motion wanted at that tick."""
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
-        self._bounds, self._limits, self._tick_s = bounds, limits, tick_s
+        self._limits, self._tick_s = limits, tick_s
+        self._low, self._high = bounds.position.T.copy()
+        self._fastest, self._hardest = bounds.velocity, MAX_ACCELERATION * limits.acceleration
         joints = len(limits.velocity)
-        self._nothing = Decay(np.zeros(joints), np.zeros(joints), limits.velocity, limits.acceleration)
+        self._motions = np.zeros((2, 3, joints))  # on the curve, and the difference
+        self._wanted = Motion(*self._motions[0])
+        self._interpolate, self._admit = interpolate.load(), admit.load()
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # the set point to follow after that
         self.goal: Array | None = None  # (joints,), rad: goal of `to`, until another motion begins; None: none
@@ -51,9 +59,9 @@ class Reference:
 
     def start(self, position: Array, velocity: Array, tick: int) -> None:
         """Start from a motion at `tick`, rad, rad/s: ramp to rest and hold."""
-        self._curve: Curve = Ramp(position.copy(), velocity.copy(), self._limits.acceleration)
+        self._curve: Curve = Ramp(position, velocity, self._limits.acceleration)
         self._from = tick
-        self._difference, self._differs_from = self._nothing, tick
+        self._difference: Curve | None = None  # from the arm's motion to the curve
         self.goal = None
         self.holding = True
 
@@ -99,19 +107,18 @@ class Reference:
             return now
         limits = self._limits
         self._curve, self._from = Passage(now.position, goal, limits.velocity, limits.acceleration), tick
-        self._difference, self.goal = self._nothing, goal
+        self._difference, self.goal = None, goal
         return self._motion(tick)
 
     def _receive(self, command: Message, due: int, tick: int) -> None:
         """Copy a set point. It waits until the one before it is due: some protocols deliver early."""
-        finite = bool(np.isfinite(command.position).all() and np.isfinite(command.velocity).all())
-        if not finite or (due - tick) * self._tick_s > MAX_AHEAD_S:
-            self.refused += 1
-            return
-        position = np.clip(command.position, self._bounds.position[:, 0], self._bounds.position[:, 1])
-        velocity = np.clip(command.velocity, -self._bounds.velocity, self._bounds.velocity)
-        self.refused += not (np.array_equal(position, command.position) and np.array_equal(velocity, command.velocity))
-        self._next = SetPoint(due, position, velocity)
+        position, velocity = np.array(command.position), np.array(command.velocity)
+        verdict = WRONG
+        if (due - tick) * self._tick_s <= MAX_AHEAD_S:
+            verdict = self._admit(position, velocity, self._low, self._high, self._fastest)
+        self.refused += verdict != WITHIN
+        if verdict != WRONG:
+            self._next = SetPoint(due, position, velocity)
 
     def _advance(self, tick: int) -> None:
         """Begin the curve to the waiting set point when its time has come."""
@@ -120,22 +127,19 @@ class Reference:
         (due, position, velocity), self._next = self._next, None
         if due <= tick:
             return
-        now = self._motion(tick)
         begin = tick if self.holding else self._due
-        curve = self._bridge(begin, position, velocity, due)
-        joined = not self.holding and bool((curve.hardest() <= MAX_ACCELERATION * self._limits.acceleration).all())
-        self._due, self.holding = due, False
-        if joined:
-            self._curve, self._from = curve, begin
+        begin_s = (begin - self._from) * self._tick_s
+        curve = Bridge(self._curve, begin_s, (position, velocity), (due - begin) * self._tick_s)
+        if not self.holding and curve.is_within(self._hardest):
+            self._curve, self._from, self._due = curve, begin, due
+            if self._difference is not None and (begin - self._differs_from) * self._tick_s >= self._difference.ends_s:
+                self._difference = None
             return
+        now = self._motion(tick)
         left_s = (due - tick) * self._tick_s
-        self._curve, self._from = Hermite(position - velocity * left_s, velocity, position, velocity, left_s), tick
+        self._curve = Curve(position - velocity * left_s, velocity * left_s, duration_s=left_s)
+        self._from, self._due, self.holding = tick, due, False
         self._join(now.position, now.velocity, tick)
-
-    def _bridge(self, begin: int, position: Array, velocity: Array, due: int) -> Hermite:
-        """Return the curve from the present one at tick `begin` to a set point."""
-        start = self._curve.at((begin - self._from) * self._tick_s)
-        return Hermite(start.position, start.velocity, position, velocity, (due - begin) * self._tick_s)
 
     def _join(self, position: Array, velocity: Array, tick: int) -> None:
         """Let the difference between a motion at `tick` and the curve decay."""
@@ -147,14 +151,44 @@ class Reference:
         self._differs_from = tick
 
     def _motion(self, tick: int) -> Motion:
-        """Return the motion at `tick`; the acceleration is that of the middle of the coming cycle."""
-        curve_s = (tick - self._from) * self._tick_s
-        differs_s = (tick - self._differs_from) * self._tick_s
-        half_s = 0.5 * self._tick_s
-        curve, difference = self._curve.at(curve_s), self._difference.at(differs_s)
-        ahead, apart = self._curve.at(curve_s + half_s), self._difference.at(differs_s + half_s)
-        return Motion(
-            curve.position + difference.position,
-            curve.velocity + difference.velocity,
-            ahead.acceleration + apart.acceleration,
-        )
+        """Return the motion at `tick`, valid until the next call; its acceleration is mid-cycle."""
+        curve, difference = self._curve, self._difference
+        time_s, half_s = (tick - self._from) * self._tick_s, 0.5 * self._tick_s
+        self._interpolate(curve.table, curve.duration_s, curve.ends_s, time_s, half_s, self._motions[0])
+        if difference is not None:
+            time_s = (tick - self._differs_from) * self._tick_s
+            lasts_s, ends_s = difference.duration_s, difference.ends_s
+            self._interpolate(difference.table, lasts_s, ends_s, time_s, half_s, self._motions[1])
+            self._motions[0] += self._motions[1]
+        return self._wanted
+
+
+@compiled
+def interpolate(table: Array, duration_s: float, ends_s: float, time_s: float, half_s: float, motion: Array) -> None:
+    """Set position, velocity and, `half_s` later, acceleration, (3, joints), to those on a curve."""
+    set_motion(table, duration_s, ends_s, time_s + half_s, motion)
+    acceleration = motion[2].copy()
+    set_motion(table, duration_s, ends_s, time_s, motion)
+    motion[2] = acceleration
+
+
+@compiled
+def admit(position: Array, velocity: Array, low: Array, high: Array, fastest: Array) -> int:
+    """Cut a set point at its bounds, (joints,) each; return `WRONG`, `CUT` or `WITHIN`."""
+    verdict = WITHIN
+    for j in range(len(position)):
+        if not (np.isfinite(position[j]) and np.isfinite(velocity[j])):
+            return WRONG
+        allowed = min(max(position[j], low[j]), high[j]), min(max(velocity[j], -fastest[j]), fastest[j])
+        if allowed != (position[j], velocity[j]):
+            verdict = CUT
+        position[j], velocity[j] = allowed
+    return verdict
+
+
+def preload() -> None:
+    """Load the compiled functions of set points and curves."""
+    curves.preload()
+    table, joints = np.zeros((REST + 1, 1)), np.zeros(1)
+    interpolate.load()(table, 1.0, 1.0, 0.0, 0.0, table[:3])
+    admit.load()(joints, joints, joints, joints, joints)

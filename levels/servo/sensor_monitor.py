@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
+from rack.levels.compiled import compiled
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.servo.control import ServoParams
@@ -37,6 +40,8 @@ STRUCK_SPEED = 5.0
 """Multiple of the fastest velocity that a blow may give a joint within a cycle."""
 SILENT_CYCLES = 2
 """Cycles without a new sample after which the sensors are silent."""
+DOUBTFUL, GOOD, TAKEN = 0, 1, 2
+"""Verdicts on a sample; a good one is taken at once where no joint was in doubt."""
 
 
 class SensorMonitor:
@@ -51,29 +56,34 @@ class SensorMonitor:
         self._good_cycles = params.good_cycles
         self._retry_cycles = max(round(params.retry / (every * tick_s)), params.good_cycles)
         encoders, bounds, home = cell.encoders, cell.bounds, cell.home
-        self._room, self._speed_room = FIT_RAD + 2.0 * encoders.off, encoders.speed_off
         self._coarse = not encoders.exact
-        self._unshown = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
         self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
         self._fastest = BEYOND_SPEED * bounds.velocity
         self._braking, self._tick_s, self._every = cell.limits.acceleration, tick_s, every
         joints = len(home)
-        self.position = home.copy()  # (joints,), rad: as sensed; estimated for joints whose sensor is suspect
-        self.velocity = np.zeros(joints)  # (joints,), rad/s, likewise; unknown ones are estimated as braked
-        self.doubt = np.zeros(joints)  # (joints,), rad: largest error of `position`
+        self._table = np.zeros((15, joints))  # in the rows of `check`
+        self._q, self._qd, *self._raw = self._table[:4]  # the sample, and the one before it
+        # (joints,), rad: as sensed; estimated for joints whose sensor is suspect. (joints,), rad/s, likewise; unknown
+        # ones are estimated as braked. (joints,), rad: largest error of `position`.
+        self.position, self.velocity, self.doubt = self._table[4:7]
+        self._room, self._speed_room, self._unshown = self._table[7:10]
+        self._still, self._still_way, self._claimed = self._table[10:13]
+        self._way, self._allowed = self._table[13:]
+        self._room[:], self._speed_room[:] = FIT_RAD + 2.0 * encoders.off, encoders.speed_off
+        self._unshown[:] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
+        self.position[:] = self._raw[0][:] = home
         self.fresh = True  # there is a sample of this cycle
         self.faulty = False  # a sensor is, or was until fewer than `good_cycles` ago, at fault
         self.drivable = True  # velocities are known, so the arm could still be driven
         self.blamed = (-1, 0.0, 0.0)  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
-        self.findings: list[Finding] = []  # new ones, one per episode; the executor removes them
-        self._raw = (home.copy(), np.zeros(joints))  # position and velocity of the last sample
-        self._unchanged = np.zeros(joints, dtype=bool)  # the last sample trusted showed the position before it
-        self._still = np.zeros(joints, dtype=int)  # cycles without a change while the set point moves
-        self._still_way = np.zeros(joints)  # rad: motion of the set point in that time
-        self._claimed = np.zeros(joints)  # rad: integrated sensed velocity while the sample does not change
+        self.findings: list[Finding] = []  # new ones, one per episode; the reader clears it
+        self._marks = np.zeros((2, joints), dtype=bool)  # fits; the last sample trusted showed the position before it
+        self._fits, self._unchanged = self._marks
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
         self._sent = self._everyone  # its set point moves, or may have moved
+        self._nothing = np.zeros(joints)
+        self._check = partial(check.load(), self._table, self._marks, self._coarse)
         self._tick: int | None = None
         self._streak = 0  # good samples in a row
         self._rung: set[Alarm] = set()  # alarms raised in this episode
@@ -99,73 +109,53 @@ class SensorMonitor:
         if not self.fresh:
             self._estimate_blind(passed_s, tick - sensed.tick)
             return
-        q, qd = sensed.position, sensed.velocity
-        change = qd - self.velocity
-        way = (0.5 * passed_s) * (qd + self.velocity)
-        room = self._room + passed_s * (np.abs(change) + self._speed_room)
-        if passed > self._every:
+        q, qd = self._q, self._qd
+        q[...], qd[...] = sensed.position, sensed.velocity
+        fastest = STRUCK_SPEED * self._fastest if struck else self._fastest
+        further = self._nothing
+        if struck or passed > self._every:
             # Driven for a while, then braked: in between it was faster than at both ends.
-            room += passed_s * 4.0 * self._every * self._tick_s * self._braking
-        fastest = self._fastest
-        if struck:
-            fastest = STRUCK_SPEED * fastest
-            room += passed_s * fastest
-        # Never true for NaN.
-        fits = np.abs(q - self.position - way) <= (room + self.doubt if self.faulty else room)
-        stirs = self._stirs(q, qd, change, wanted, passed_s)
-        if self._coarse:
-            # An exact sensor that is stuck shows it in the next sample.
-            self._claim(q, qd, passed_s)
-            stirs = stirs and bool((self._claimed <= self._room).all())
-        if self.faulty or not stirs or np.count_nonzero(fits) < fits.size:
-            self._sent = self._everyone if wanted is None else wanted != 0.0
-            self._doubtful(q, qd, way, fits & (np.abs(qd) <= fastest), room, passed_s)
+            between = 4.0 * self._every * self._tick_s * self._braking * (passed > self._every)
+            further = passed_s * (between + fastest * struck)
+        driven_at = self._nothing if wanted is None else wanted
+        verdict = self._check(driven_at, further, passed_s, wanted is not None, self.faulty)
+        if verdict == TAKEN:
             return
-        self._take(q, qd, way, room)
+        if verdict == GOOD:
+            self._take(self._allowed)
+            return
+        self._sent = self._everyone if wanted is None else wanted != 0.0
+        if self.faulty:
+            self._fits |= np.abs(q - self.position - self._way) <= self._allowed + self.doubt
+        self._doubtful(self._fits & (np.abs(qd) <= fastest), passed_s)
 
-    def _take(self, q: Array, qd: Array, way: Array, room: Array) -> None:
-        """Trust a sample; report a joint that this moves by more than `room`, rad."""
+    def _take(self, room: Array) -> None:
+        """Trust the sample; report a joint that this moves by more than `room`, rad."""
+        q, way = self._q, self._way
         np.equal(q, self._raw[0], out=self._unchanged)
-        if np.count_nonzero(self.doubt):
+        if self.doubt.any():
             off = q - self.position - way
             for joint in np.flatnonzero(np.abs(off) > room):
                 self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
             # A sensor that does not change proves nothing: it may be stuck.
             self.doubt[~self._unchanged] = 0.0
-        np.copyto(self.position, q)
-        np.copyto(self.velocity, qd)
-        np.copyto(self._raw[0], q)
-        np.copyto(self._raw[1], qd)
+        self._table[4:6] = self._table[2:4] = self._table[:2]
 
-    def _stirs(self, q: Array, qd: Array, change: Array, wanted: Array | None, passed_s: float) -> bool:
-        """Return whether every joint has moved, or its set point has not, in the last `STILL_CYCLES`."""
-        if wanted is None or np.count_nonzero(change) == change.size:
-            if np.count_nonzero(self._still):
-                self._still[:] = 0
-                self._still_way[:] = 0.0
-            return True
-        still = (change == 0.0) & (q == self._raw[0]) & (wanted != 0.0)
-        self._still += 1
-        self._still *= still
-        self._still_way += passed_s * wanted
-        self._still_way *= still
-        return not self._is_still().any()
-
-    def _claim(self, q: Array, qd: Array, passed_s: float) -> None:
+    def _claim(self, unchanged: Mask, passed_s: float) -> None:
         """Integrate the least motion that a joint's sensed velocity implies while its sample does not change."""
-        self._claimed += passed_s * np.maximum(np.abs(qd) - self._speed_room, 0.0)
-        self._claimed *= (q == self._raw[0]) & (qd == self._raw[1])
+        least = np.maximum(np.abs(self._qd) - self._speed_room, 0.0)
+        self._claimed[:] = np.where(unchanged, self._claimed + passed_s * least, 0.0)
 
     def _is_still(self) -> Mask:
         return np.asarray((self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown))
 
-    def _doubtful(self, q: Array, qd: Array, way: Array, fits: Mask, room: Array, passed_s: float) -> None:
+    def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
+        q, qd, (last_q, last_qd), way, room = self._q, self._qd, self._raw, self._way, self._allowed
         finite, inside = np.isfinite(q) & np.isfinite(qd), (q >= self._low) & (q <= self._high)
-        last_q, last_qd = self._raw
         unchanged = (q == last_q) & (qd == last_qd)
         if not self._coarse:
-            self._claim(q, qd, passed_s)
+            self._claim(unchanged, passed_s)
         frozen = self._claimed > self._room
         still, begins = self._is_still(), not self.faulty
         room += passed_s * np.abs(qd - last_qd)
@@ -188,10 +178,9 @@ class SensorMonitor:
         self._blame(good, q, q - self.position - way)
         self._suspect |= ~good
         if self._settled(bool(good.all())):
-            self._take(q, qd, way, self._room)
+            self._take(self._room)
             return
-        np.copyto(self._raw[0], q)
-        np.copyto(self._raw[1], qd)
+        self._table[2:4] = self._table[:2]
         self._estimate(q, qd, way, np.isfinite(qd) & ~frozen, passed_s)
 
     def _blame(self, good: Mask, q: Array, off: Array) -> None:
@@ -259,3 +248,52 @@ class SensorMonitor:
         self._suspect[:] = False
         self._rung.clear()
         return True
+
+
+@compiled
+def check(
+    table: Array,  # (15, joints): rows as below
+    marks: Mask,  # (2, joints): set where positions agree with velocities; if taken, where they are as before
+    coarse: bool,
+    wanted: Array,  # (joints,), rad/s: velocities at which the arm was driven
+    further: Array,  # (joints,), rad: more room, in unusual cycles
+    passed_s: float,
+    driven: bool,
+    faulty: bool,
+) -> int:
+    """Check a sample against the estimate, and take it if nothing is in doubt; return the verdict."""
+    q, qd, last_q, last_qd = table[0], table[1], table[2], table[3]  # this sample and the one before it: rad, rad/s
+    position, velocity, doubt = table[4], table[5], table[6]  # the estimate: rad, rad/s, rad
+    room, speed_room, unshown = table[7], table[8], table[9]  # for errors, rad, rad/s; motion that must show, rad
+    # Cycles without a change while the set point moves, and its motion in that time, rad; integrated velocity while the
+    # sample does not change, rad.
+    still, still_way, claimed = table[10], table[11], table[12]
+    way, allowed = table[13], table[14]  # set: motion since the last sample, and room for its errors, rad
+    good, in_doubt, at_rest = not faulty, False, driven and bool(np.any(qd == velocity))
+    for j in range(len(q)):
+        change = qd[j] - velocity[j]
+        way[j] = (0.5 * passed_s) * (qd[j] + velocity[j])
+        allowed[j] = room[j] + passed_s * (abs(change) + speed_room[j]) + further[j]
+        marks[0, j] = abs(q[j] - position[j] - way[j]) <= allowed[j]  # never true for NaN
+        same = q[j] == last_q[j]
+        unmoved = at_rest and change == 0.0 and same and wanted[j] != 0.0
+        still[j] = still[j] + 1.0 if unmoved else 0.0
+        still_way[j] = still_way[j] + passed_s * wanted[j] if unmoved else 0.0
+        good = good and marks[0, j] and not (still[j] >= STILL_CYCLES and abs(still_way[j]) >= unshown[j])
+        if coarse:  # an exact sensor that is stuck shows it in the next sample
+            least = max(abs(qd[j]) - speed_room[j], 0.0)
+            claimed[j] = claimed[j] + passed_s * least if same and qd[j] == last_qd[j] else 0.0
+            good = good and claimed[j] <= room[j]
+        in_doubt = in_doubt or doubt[j] != 0.0
+    if not good or in_doubt:
+        return GOOD if good else DOUBTFUL
+    marks[1] = q == last_q
+    table[2:4] = table[:2]
+    table[4:6] = table[:2]
+    return TAKEN
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    joints = np.zeros(1)
+    check.load()(np.zeros((15, 1)), np.zeros((2, 1), dtype=bool), False, joints, joints, 0.0, False, False)

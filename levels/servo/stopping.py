@@ -58,8 +58,9 @@ class Stopping:
         self.refused: Finding | None = None  # the last cycle's torque, if the arm refused it
         self.error = Error.NONE  # latched fault
         self.reason = ""  # why the arm does not follow its set points, in one line; empty: it does
-        self.findings: list[Finding] = []  # new ones, one per episode; the executor removes them
+        self.findings: list[Finding] = []  # new ones, one per episode; the reader clears it
         self._kept = 0  # ticks for which faults have kept the arm from its set points
+        self._remembered: tuple[int, Error] | None = None  # in the last state
         self._tick: int | None = None
         self._retry_at: int | None = None  # tick at which a failed motor is retried; None: none has failed
         self._on_failure = self._on_motors  # reaction until then
@@ -73,9 +74,9 @@ class Stopping:
 
     def remember(self, state: Message) -> None:
         """Fill in the state for `recall`."""
-        state.kept = self._kept
-        if self.error != state.error:
-            state.error, state.reason = self.error, self.reason
+        if (self._kept, self.error) != self._remembered:
+            self._remembered = self._kept, self.error
+            state.kept, state.error, state.reason = self._kept, self.error, self.reason if self.error else ""
 
     @property
     def trying(self) -> bool:
@@ -122,7 +123,7 @@ class Stopping:
             self._wait_for(cause, tick)
         else:
             self.reason = ""
-        return max(reaction, DEMANDED[demand])
+        return max(reaction, DEMANDED[demand]) if demand else reaction
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
         """Set `reason`: the fault that must end, and the tick at which it is latched."""

@@ -11,9 +11,7 @@ DEPTH = 16
 
 def trace(writer: TraceWriter, ticks: range) -> None:
     for tick in ticks:
-        for at in range(len(FIELDS)):
-            writer.record[at] = 100 * tick + at
-        writer.write()
+        writer.write(*(100 * tick + at for at in range(len(FIELDS))))
 
 
 def test_records_are_read_as_they_were_written(make_bus: MakeBus) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
-from rack.levels.level import Demand, Executor, Input, LevelContext, Pace, Planner, Ports
+from rack.levels.level import Demand, Executor, Input, LevelContext, Output, Pace, Planner, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -56,11 +56,11 @@ class Task:
         if isinstance(self.level, Executor):
             self.level.demand = demand
             self.level.process(read, self.write, tick)
-            self._publish(tick + span)
+            self._publish(tick, tick + span)
         elif self.level.wanted(read, tick):
             span *= self.spec.within_cycles
             self.level.plan(read, self.write.plan, tick)
-            self._publish(tick + span)
+            self._publish(tick, tick + span)
         self.due = tick + span
 
     def lose(self, tick: int, finished: bool) -> None:
@@ -88,9 +88,12 @@ class Task:
         self._has[port] = True
         return Reading(value, Verdict.NEW, is_lost)
 
-    def _publish(self, visible_at: int) -> None:
+    def _publish(self, tick: int, visible_at: int) -> None:
+        kinds = self.level.outputs if isinstance(self.level, Executor) else {}
         for port, box in self._outputs.items():
-            box.publish(getattr(self.write, port), visible_at)
+            kind = kinds.get(port)
+            if not isinstance(kind, Output) or kind.is_due(tick, self.spec.every):
+                box.publish(getattr(self.write, port), visible_at)
 
 
 class Lockstep:
@@ -114,8 +117,9 @@ class Lockstep:
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
-            kinds = board.executor.outputs.items()
-            self.boxes |= {f"{board.name}.{port}": Box(kind, self.sizes, board.every) for port, kind in kinds}
+            for port, kind in board.executor.outputs.items():
+                kind, cycles = kind if isinstance(kind, Output) else (kind, 1)
+                self.boxes[f"{board.name}.{port}"] = Box(kind, self.sizes, cycles * board.every)
             if board.planner is not None:
                 self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
             self.boxes[f"{board.name}.operator"] = Box(OPERATOR_COMMAND, self.sizes)

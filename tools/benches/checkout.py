@@ -21,6 +21,7 @@ from rack.tools.console.answer import Failure
 
 ENTRY = "rack.tools.cli:main"
 """This tree's own entry point."""
+THIS = "this tree"
 RUN = "import sys; from {module} import {function} as main; sys.argv[0] = 'rack'; sys.exit(main())"
 END_S = 1.2
 """Longest wait for a command that was asked to end."""
@@ -64,7 +65,7 @@ class RackCommand:
 
 def this_rack() -> RackCommand:
     """Return the command line of the tree that is running, as it is installed."""
-    return RackCommand("this tree", _argv(ENTRY), os.environ.copy(), "rack.")
+    return RackCommand(THIS, _argv(ENTRY), os.environ.copy(), "rack.")
 
 
 @contextmanager

@@ -2,7 +2,8 @@
 
 All are used as their users use them from Python, in their fastest form: a local message with numpy views of its fields
 is filled, its bytes are handed over, and every reader gets them into a local message of its own. Nothing listens on a
-network, and what is made in shared memory or in files has names of its own, removed when the context ends.
+network. Names in shared memory and in the file system are removed as soon as both ends are open, so that nothing is
+left even if the process is killed.
 """
 
 from __future__ import annotations
@@ -65,31 +66,35 @@ def raw_copy(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 def iceoryx2_publish_subscribe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Publish a copy on an iceoryx2 service; every subscriber takes it from shared memory."""
     message = Message(dtype)
-    with _iceoryx2_node() as (iceoryx2, node):
+    with _iceoryx2_names() as (iceoryx2, node):
         payload = _structure(dtype)
         name = iceoryx2.ServiceName.new(KEY)
         service = node.service_builder(name).publish_subscribe(payload).max_subscribers(readers).create()
         publisher, own = service.publisher_builder().create(), payload.from_buffer(message.raw)
         subscribers = [service.subscriber_builder().create() for _ in range(readers)]
+        # The first message connects them, by name.
+        publisher.send_copy(own)
+        for subscriber in subscribers:
+            subscriber.receive()
 
-        def taker(subscriber: Any) -> Callable[[int], Message]:
-            received = Message(dtype)
-            place, size, receive = _address(received), dtype.itemsize, subscriber.receive
+    def taker(subscriber: Any) -> Callable[[int], Message]:
+        received = Message(dtype)
+        place, size, receive = _address(received), dtype.itemsize, subscriber.receive
 
-            def take(tick: int) -> Message:
-                ctypes.memmove(place, receive().payload_ptr, size)
-                return received
+        def take(tick: int) -> Message:
+            ctypes.memmove(place, receive().payload_ptr, size)
+            return received
 
-            return take
+        return take
 
-        yield Transport(message, lambda tick: publisher.send_copy(own), [taker(one) for one in subscribers])
+    yield Transport(message, lambda tick: publisher.send_copy(own), [taker(one) for one in subscribers])
 
 
 @contextmanager
 def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Update an entry of an iceoryx2 blackboard; every reader copies its newest value."""
     message = Message(dtype)
-    with _iceoryx2_node() as (iceoryx2, node):
+    with _iceoryx2_names() as (iceoryx2, node):
         payload, key = _structure(dtype), ctypes.c_uint64(0)
         creator = node.service_builder(iceoryx2.ServiceName.new(KEY)).blackboard_creator(ctypes.c_uint64)
         service = creator.add(key, payload()).max_readers(readers).create()
@@ -97,16 +102,16 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         entry = writer.entry(key, payload)
         entries = [service.reader_builder().create().entry(key, payload) for _ in range(readers)]
 
-        def fetcher(one: Any) -> Callable[[memoryview], None]:
-            get = one.get
+    def fetcher(one: Any) -> Callable[[memoryview], None]:
+        get = one.get
 
-            def fetch(raw: memoryview) -> None:
-                raw[:] = get().data
+        def fetch(raw: memoryview) -> None:
+            raw[:] = get().data
 
-            return fetch
+        return fetch
 
-        takers = [_into(Message(dtype), fetcher(one)) for one in entries]
-        yield Transport(message, lambda tick: entry.update_with_copy(own), takers)
+    takers = [_into(Message(dtype), fetcher(one)) for one in entries]
+    yield Transport(message, lambda tick: entry.update_with_copy(own), takers)
 
 
 @contextmanager
@@ -162,10 +167,11 @@ def zenoh_sessions(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
     They are connected through a socket in the file system: nothing listens on a network.
     """
-    with TemporaryDirectory(prefix="rack-bench-") as folder, ExitStack() as stack:
-        place = f"unixsock-stream/{folder}/zenoh"
-        session = stack.enter_context(_zenoh(listen=place, connect=""))
-        others = [stack.enter_context(_zenoh(listen="", connect=place)) for _ in range(readers)]
+    with ExitStack() as stack:
+        with TemporaryDirectory(prefix="rack-bench-") as folder:
+            place = f"unixsock-stream/{folder}/zenoh"
+            session = stack.enter_context(_zenoh(listen=place, connect=""))
+            others = [stack.enter_context(_zenoh(listen="", connect=place)) for _ in range(readers)]
         publisher, subscribers = _publisher(session), _subscribers(others)
         _await(session, others)
         yield _zenoh_transport(publisher, dtype, subscribers)
@@ -258,8 +264,8 @@ def _into(message: Message, fetch: Callable[[memoryview], object]) -> Callable[[
 
 
 @contextmanager
-def _iceoryx2_node() -> Iterator[tuple[Any, Any]]:
-    """Give iceoryx2 and a node whose files and shared memory have names of this process."""
+def _iceoryx2_names() -> Iterator[tuple[Any, Any]]:
+    """Give iceoryx2 and a node to open services with: files and shared memory have names while the context lasts."""
     import iceoryx2
 
     iceoryx2.set_log_level(iceoryx2.LogLevel.Fatal)

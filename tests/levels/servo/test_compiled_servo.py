@@ -1,0 +1,117 @@
+"""The servo level's compiled functions: equal to their numpy selves, bit for bit, and loaded before the first cycle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
+from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, reference, sensor_monitor
+from tests.levels.arms import config
+from tests.levels.servo.rig import Course, ServoRig
+
+JOINTS = 7
+MODULES = (curves, reference, sensor_monitor, actuator_monitor, control)
+FUNCTIONS = {name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)}
+
+
+def noise(seed: int, *shape: int) -> Array:
+    return np.random.default_rng(seed).normal(size=shape or (JOINTS,))
+
+
+def sample_of(seed: int, error: float) -> tuple[Any, ...]:
+    """Return the arguments of `check` for a sample off by up to `error`, rad; one joint shows no change."""
+    estimate, passed_s = np.abs(noise(seed, 3, JOINTS)), 0.0025
+    sample = estimate[:2] + 1e-3 * noise(seed + 1, 2, JOINTS)
+    sample[1, seed % JOINTS] = estimate[1, seed % JOINTS]
+    sample[0] = estimate[0] + 0.5 * passed_s * (sample[1] + estimate[1]) + error * noise(seed + 2)
+    estimate[2] *= seed % 3 == 0
+    last, rules = estimate[:2].copy(), np.full((3, JOINTS), 1e-4)
+    last[0, seed % JOINTS] = sample[0, seed % JOINTS]
+    motionless = np.abs(noise(seed + 3, 3, JOINTS)) * np.array([[9.0], [1e-3], [1e-5]])
+    table = np.concatenate((sample, last, estimate, rules, motionless, np.zeros((2, JOINTS))))
+    return (
+        table,
+        np.zeros((2, JOINTS), dtype=bool),
+        seed % 2 == 0,
+        noise(seed + 4),
+        np.zeros(JOINTS),
+        passed_s,
+        seed % 5 > 0,
+        seed % 7 == 0,
+    )
+
+
+def table(seed: int) -> Array:
+    return noise(seed, curves.REST + 1, JOINTS)
+
+
+def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
+    """Return the arguments of `left_over`."""
+    before, inertia = noise(seed, 3, JOINTS), noise(seed + 1, 2, JOINTS, JOINTS)
+    table = np.concatenate((before, rules * np.abs(noise(seed + 2, 5, JOINTS)), np.zeros((4, JOINTS)), inertia[0]))
+    return table, 0.0025, float(following), noise(seed + 3), inertia[1], noise(seed + 4), noise(seed + 5)
+
+
+def wanted_of(seed: int, limit: float) -> tuple[Any, ...]:
+    """Return the arguments of `set_torque`; one seed has a bias that is NaN."""
+    inertia, bias = noise(seed, JOINTS, JOINTS), noise(seed + 1) * (np.nan if seed == 9 else 1.0)
+    constants = 3600.0, 120.0, np.abs(noise(seed + 2)), np.full(JOINTS, limit)
+    return *constants, *noise(seed + 3, 5, JOINTS), inertia, bias, np.zeros(JOINTS)
+
+
+CASES: dict[str, list[tuple[Any, ...]]] = {
+    "set_motion": [(table(1), 0.02, ends_s, 0.013, noise(2, 3, JOINTS)) for ends_s in (0.01, np.inf)],
+    "set_bridge": [(table(3), 0.02, 0.02, 0.013, noise(4), noise(5), 0.02, table(6))],
+    "is_within": [(table(7), 0.02, size * np.ones(JOINTS)) for size in (1e3, 1e5)],
+    "interpolate": [(table(8), 0.02, 0.02, time_s, 0.00125, noise(9, 3, JOINTS)) for time_s in (0.013, 0.019, 0.02)],
+    "admit": [
+        (noise(k), noise(k + 1), -size, size, size) for k, size in ((1, np.ones(JOINTS)), (3, np.full(JOINTS, 9.0)))
+    ]
+    + [(np.full(JOINTS, np.nan), noise(1), noise(2), noise(3), noise(4))],
+    "check": [sample_of(seed, error) for seed in range(35) for error in (1e-6, 1e-2, np.nan)],
+    "left_over": [
+        motion_of(k, following, size) for k in range(20) for following, size in ((0.02, 1), (9, 1), (9, 1e6))
+    ],
+    "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
+}
+VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2}
+"""Kinds of verdicts that the cases reach; else: None."""
+
+
+def test_every_compiled_function_has_its_cases() -> None:
+    assert set(CASES) == set(FUNCTIONS)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_compiled_code_gives_the_bits_of_numpy(name: str) -> None:
+    verdicts = set()
+    for case in CASES[name]:
+        under_numpy, compiled_ = ([np.array(a, copy=True) if np.ndim(a) else a for a in case] for _ in range(2))
+        verdict = FUNCTIONS[name](*under_numpy)
+        verdicts.add(verdict)
+        assert FUNCTIONS[name].load()(*compiled_) == verdict
+        for expected, found in zip(under_numpy, compiled_, strict=True):
+            assert np.array_equal(np.asarray(expected), np.asarray(found), equal_nan=np.asarray(expected).dtype != bool)
+    assert len(verdicts) == VERDICTS.get(name, 1)
+
+
+def test_no_cycle_waits_for_a_compiler() -> None:
+    ServoExecutor.preload()
+    loaded = {name: list(f.load().signatures) for name, f in FUNCTIONS.items()}  # type: ignore[attr-defined]
+    rig = ServoRig(*config("puma560"))
+    home = np.array(config("puma560")[0].home)
+    move = Course(home, home + 0.2, 1.0)
+    rig.run(100, move.at)
+    rig.inject("sensor-bias", joint=1, size=0.02)
+    rig.run(20, move.at)
+    rig.heal()
+    rig.run(100, move.at)
+    rig.miss(10)
+    rig.run(50, move.at)
+    rig.restart()
+    rig.run(50)
+    assert {name: list(f.load().signatures) for name, f in FUNCTIONS.items()} == loaded  # type: ignore[attr-defined]

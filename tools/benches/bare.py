@@ -1,0 +1,160 @@
+"""A rack's work without the rack: the same `process` and `plan` calls in one process, one after another.
+
+Levels, ports and delays are those of the resolved config; a message becomes visible by ticks alone, as under protocol
+time-slice, so every level reads what it reads in a rack in lockstep, and does the same. No clock, no shared memory, no
+checks and no trace: this is the limit that a rack can approach, but not pass on one processor.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.message import Message
+from rack.boards.classes import find_class
+from rack.boards.wiring import TaskWiring
+from rack.levels.level import Executor, Planner, Ports, Reading, Verdict
+
+
+@dataclass(frozen=True)
+class BareRun:
+    """A finished run. `processor_s` is the time of its ticks; `last` holds the last message of each mailbox."""
+
+    ticks: int
+    processor_s: float
+    written: Mapping[str, int]
+    last: Mapping[str, np.ndarray]
+
+
+class Post:
+    """One mailbox: `message` to fill, and the messages written so far that a reader may still need."""
+
+    def __init__(self, spec: MailboxSpec) -> None:
+        self.spec = spec
+        self.dtype = message_dtype(spec.fields, spec.size)
+        self.message = Message(self.dtype)
+        self.serial = 0
+        # All that are not visible yet, and the newest that is.
+        self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
+
+    def write(self, tick: int) -> None:
+        """Write the message in the cycle released at `tick`, if the mailbox is written in that cycle."""
+        if not tick % self.spec.every:
+            self.serial += 1
+            self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
+
+
+class PostReader:
+    """One reader of a mailbox."""
+
+    def __init__(self, post: Post) -> None:
+        self._post, self._serial, self._message = post, 0, Message(post.dtype)
+        self._readings = {verdict: Reading(self._message, verdict) for verdict in Verdict}
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message visible at `tick`, and its verdict."""
+        for visible_at, serial, data in reversed(self._post.kept):
+            if visible_at <= tick:
+                if serial == self._serial:
+                    return self._readings[Verdict.OLD]
+                self._serial = serial
+                self._message.raw[:] = data
+                return self._readings[Verdict.NEW]
+        return self._readings[Verdict.NONE]
+
+
+class BareTask:
+    """An executor or a planner with its ports."""
+
+    def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post]) -> None:
+        self.spec = layout.task(wiring.task)
+        self._readers = [(port, PostReader(posts[name]).read) for port, name in wiring.inputs.items()]
+        self._values = Ports(**{port: read(-1) for port, read in self._readers})
+        self._posts = [posts[name] for name in wiring.outputs.values()]
+        self._messages = Ports(**{port: posts[name].message for port, name in wiring.outputs.items()})
+        self._busy_until = 0
+        kind: type[Executor] | type[Planner] = find_class(
+            wiring.target,
+            Executor if self.spec.role == "executor" else Planner,
+        )
+        kind.preload()
+        self.level = kind(wiring.context)
+        self.cycle = self._execute if isinstance(self.level, Executor) else self._plan
+
+    def _execute(self, tick: int) -> None:
+        self._read(tick)
+        assert isinstance(self.level, Executor), "a planner plans"
+        self.level.process(self._values, self._messages, tick)
+        self.level.findings.clear()
+        self._write(tick)
+
+    def _plan(self, tick: int) -> None:
+        if tick < self._busy_until:
+            return
+        self._read(tick)
+        assert isinstance(self.level, Planner), "an executor executes"
+        if self.level.wanted(self._values, tick):
+            self.level.plan(self._values, self._messages.plan, tick)
+            self._busy_until = tick + self.spec.every * self.spec.within_cycles
+            self._write(tick)
+
+    def _read(self, tick: int) -> None:
+        values = self._values.__dict__
+        for port, read in self._readers:
+            values[port] = read(tick)
+
+    def _write(self, tick: int) -> None:
+        for post in self._posts:
+            post.write(tick)
+
+
+def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:
+    """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it."""
+    posts = {spec.name: Post(spec) for spec in layout.mailboxes}
+    tasks = [BareTask(layout, wiring, posts) for wiring in wirings]
+    try:
+        for task in tasks:
+            task.level.self_test()
+        cycles = [(task.spec.every, task.cycle) for task in tasks]
+        with _undisturbed():
+            start_ns = time.process_time_ns()
+            _run(cycles, ticks)
+            processor_s = (time.process_time_ns() - start_ns) * 1e-9
+    finally:
+        for task in tasks:
+            task.level.close()
+    written = {name: post for name, post in posts.items() if post.serial}
+    return BareRun(
+        ticks=ticks,
+        processor_s=processor_s,
+        written={name: post.serial for name, post in written.items()},
+        last={name: np.frombuffer(post.kept[-1][2], post.dtype)[0] for name, post in written.items()},
+    )
+
+
+def _run(cycles: Sequence[tuple[int, Callable[[int], None]]], ticks: int) -> None:
+    for tick in range(ticks):
+        for every, cycle in cycles:
+            if not tick % every:
+                cycle(tick)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Collect no garbage meanwhile, as in a board."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
