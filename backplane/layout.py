@@ -14,6 +14,9 @@ PROTOCOLS: tuple[Protocol, ...] = ("time-slice", "double-buffer", "lock")
 
 Role = Literal["executor", "planner"]
 
+Wake = Literal["signal", "timer", "poll"]
+"""How a task waits for its next cycle: see `rack.backplane.clock.wake`."""
+
 
 @dataclass(frozen=True)
 class FieldSpec:
@@ -59,7 +62,8 @@ class TaskSpec:
 
     `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in
     ticks; `within_cycles` the cycles that one plan may take. `priority` is SCHED_FIFO's, 0 for
-    ordinary scheduling. `depth` is the number of records in its trace ring, a power of two.
+    ordinary scheduling. `depth` is the number of records in its trace ring, a power of two. `wake`: how it waits for
+    its next cycle in real time.
     """
 
     name: str
@@ -71,6 +75,7 @@ class TaskSpec:
     every: int
     within_cycles: int
     depth: int
+    wake: Wake = "signal"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The named semaphores of a rack: one per task to wake it, one for the clock, one per locked mailbox.
+"""The named semaphores of a rack: two per task, to wake it and for its reports to lockstep; one per locked mailbox.
 
 The Rack makes them, the crate opens them before it forks the boards, and the names are then removed: the boards keep
 the open semaphores, and no name is left over even if they are killed.
@@ -20,16 +20,18 @@ from rack.backplane.layout import Layout
 from rack.backplane.segment import PREFIX, SHM_FOLDER
 
 _libc = ctypes.CDLL(None)
-_sem_open, _sem_clockwait = _libc.sem_open, _libc.sem_clockwait
+_sem_open, _sem_clockwait, _sem_trywait = _libc.sem_open, _libc.sem_clockwait, _libc.sem_trywait
 _sem_open.argtypes, _sem_open.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
 _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
+_sem_trywait.argtypes = (ctypes.c_void_p,)
 
 
 class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no types
     """An open semaphore whose waits do not depend on the wall clock.
 
-    `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. It is the C library's
-    own function, for the fastest wake-up. A signal may end it early.
+    `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. A signal may end it
+    early. `take()` does not wait, and returns 0 when it has obtained the semaphore. Both are the C library's own, for
+    the fastest wake-up.
     """
 
     def __init__(self, name: str) -> None:
@@ -40,22 +42,21 @@ class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no 
         # A struct timespec, read by the C library in place.
         self._deadline = (ctypes.c_int64 * 2)()
         self.wait = partial(_sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline))
+        self.take = partial(_sem_trywait, address)
 
-    def bind(self, timeout_s: float) -> int:
-        """Let waits end `timeout_s` from now; return that time, CLOCK_MONOTONIC, ns."""
-        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+    def bind(self, deadline_ns: int) -> None:
+        """Let waits end at that time, CLOCK_MONOTONIC."""
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
-        return deadline_ns
 
     def acquire(self, timeout_s: float) -> bool:
         """Wait at most `timeout_s`; False after that."""
-        try:
-            super().acquire(0)
-        except posix_ipc.BusyError:
-            deadline_ns = self.bind(timeout_s)
-            while self.wait():
-                if time.monotonic_ns() >= deadline_ns:
-                    return False
+        if not self.take():
+            return True
+        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        self.bind(deadline_ns)
+        while self.wait():
+            if time.monotonic_ns() >= deadline_ns:
+                return False
         return True
 
 
@@ -67,7 +68,8 @@ def names(layout: Layout) -> list[str]:
     """Return the POSIX names of every semaphore that a rack needs."""
     wake = [_name(layout.rack, "wake", task.name) for task in layout.tasks]
     locks = [_name(layout.rack, "lock", m.name) for m in layout.mailboxes if m.protocol == "lock"]
-    return [_name(layout.rack, "clock"), *wake, *locks]
+    done = [_name(layout.rack, "done", task.name) for task in layout.tasks]
+    return [*wake, *done, *locks]
 
 
 def create(layout: Layout) -> None:
@@ -102,9 +104,9 @@ def wake_semaphore(rack: str, task: str) -> Semaphore:
     return _opened(_name(rack, "wake", task))
 
 
-def clock_semaphore(rack: str) -> Semaphore:
-    """Return the open semaphore on which lockstep waits for tasks to finish."""
-    return _opened(_name(rack, "clock"))
+def done_semaphore(rack: str, task: str) -> Semaphore:
+    """Return the open semaphore on which lockstep waits for a task's reports, or for that of its loss."""
+    return _opened(_name(rack, "done", task))
 
 
 def lock_semaphore(rack: str, mailbox: str) -> Semaphore:

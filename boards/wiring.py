@@ -32,7 +32,6 @@ class TaskWiring:
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
     context: LevelContext
-    poll: bool = False
     critical_priority: int = 0
     guards_clock: bool = False
     fails_self_test: bool = False

@@ -28,7 +28,7 @@ Against = Annotated[
 Share = Annotated[
     bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
 ]
-Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")]
+Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
 
 
 class Shown(Protocol):
@@ -86,6 +86,30 @@ def cycle(
 
     with progress_for(as_json) as progress:
         found = measure(against, seconds, rounds, progress, share)
+    _show(found, plot, as_json)
+
+
+@bench.command()
+def lockstep(
+    against: Against = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run, at most")
+    ] = None,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure how fast nasrem, k1607 and fig4 run in lockstep.
+
+    Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one process without a rack.
+    Its messages must be those of the rack, bit for bit. What TREE needs and this environment lacks, give in PYTHONPATH.
+    """
+    from rack.tools.benches.lockstep import RACKS, measure
+    from rack.tools.console.progress import progress_for
+
+    racks = {name: min(filter(None, (own, seconds)), default=None) for name, own in RACKS.items()}
+    with progress_for(as_json) as progress:
+        found = measure(against, racks, rounds, progress)
     _show(found, plot, as_json)
 
 

@@ -1,4 +1,10 @@
-"""The clock in lockstep: a tick begins when every task due before it has finished. Exact, repeatable, and fast."""
+"""The clock in lockstep: a tick begins when every task due before it has finished. Exact, repeatable, and fast.
+
+Tasks on different cores run at once. Each reports by a semaphore of its own, and the clock waits for one of them at a
+time, first for the one that finished last in the tick before: the reports of the others are then there, and the clock
+wakes up once in a tick. Alternatives considered: one semaphore for all (the clock wakes up for every report, and takes
+the core from a task that still works), and a word that names the awaited task (it needs a memory barrier on each side).
+"""
 
 from __future__ import annotations
 
@@ -6,10 +12,10 @@ import time
 from collections.abc import Callable
 
 from rack.backplane.clock.driver import ClockDriver, Ended
+from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import clock_semaphore
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Run, System
 
@@ -17,6 +23,8 @@ IDLE_S = 5.0
 """Bound of the wait for a recorder that is stopped, or dead and not restarted."""
 SLOW_S = 30.0
 """Bound of the wait for a recorder that runs but reads no rows: a new one may still be importing its libraries."""
+# Plain integers for the hot path.
+_FOLLOWER_PID, _FOLLOWER_TICK = int(System.FOLLOWER_PID), int(System.FOLLOWER_TICK)
 
 
 class LockstepDriver(ClockDriver):
@@ -30,9 +38,9 @@ class LockstepDriver(ClockDriver):
         self, segment: Segment, ended: Ended, one_at_a_time: bool, history_ticks: int, alarms: AlarmWriter | None = None
     ) -> None:
         super().__init__(segment, ended, alarms)
-        self._done = clock_semaphore(segment.rack)
         self._one_at_a_time = one_at_a_time
         self._history_ticks = history_ticks
+        self._last_first = list(reversed(self.tasks))
 
     def run(self) -> None:
         """Make ticks until the run is over or the launcher is gone."""
@@ -49,47 +57,64 @@ class LockstepDriver(ClockDriver):
 
     def _step(self, tick: int, last: int) -> bool:
         """Do one tick; False when the launcher is gone."""
-        if not self._one_at_a_time:
-            self.release(tick, last)
-            return self._wait(lambda: all(task.is_finished(tick + 1) for task in self.tasks))
-        for task in self.tasks:
-            if task.is_due(tick, last):
-                task.release(tick)
-                if task.missed:
-                    self.watchdog.check(task, tick)
-                if not self._wait(task.is_settled):
+        due = self.due(tick, last)
+        for task in due:
+            task.release(tick)
+            task.wake()
+            if self._one_at_a_time and not self._wait(task, task.is_settled):
+                return False
+        self.check(due, tick)
+        return self._wait_for_all(tick + 1)
+
+    def _wait_for_all(self, tick: int) -> bool:
+        """Wait until `tick` may begin; False when the launcher is gone."""
+        order, slowest = self._last_first, None
+        for task in order:
+            if task.deadline > tick:
+                continue
+            # Its report is taken even if its words already show it: else the semaphore would overflow.
+            task.done.take()
+            if not task.is_finished(tick):
+                slowest = task
+                if not self._wait(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
                     return False
+        if slowest is not None and slowest is not order[0]:
+            order.remove(slowest)
+            order.insert(0, slowest)
         return True
 
     def settle(self) -> None:
         """Wait until every task has finished the work of its release, plans too."""
-        self._wait(lambda: all(task.is_settled() for task in self.tasks))
+        for task in self.tasks:
+            self._wait(task, task.is_settled)
 
-    def await_state(self, condition: Callable[[], bool]) -> None:
-        """Wait until `condition` holds."""
-        self._wait(condition)
+    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
+        """Wait until `condition` on the state of a task holds."""
+        self._wait(task, condition)
 
-    def _wait(self, condition: Callable[[], bool]) -> bool:
+    def _wait(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
+        """Wait until `condition` holds, which the task's reports make true; False when the launcher is gone."""
         while not condition():
-            if self._done.acquire(CHECK_S):
+            if task.done.acquire(CHECK_S):
                 continue
             if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
                 return False
-            # A signal may have stopped a task: time must not wait for it.
-            for task in self.tasks:
-                task.check_stopped()
+            # A signal may have stopped the task: time must not wait for it.
+            task.check_stopped()
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:
         """Wait for a recorder before its rings overflow: in lockstep time stands still meanwhile."""
         words = self.words
-        seen, since = words[System.FOLLOWER_TICK], time.monotonic()
-        while (pid := words[System.FOLLOWER_PID]) and tick - words[System.FOLLOWER_TICK] > self._history_ticks:
-            if words[System.FOLLOWER_TICK] != seen:
-                seen, since = words[System.FOLLOWER_TICK], time.monotonic()
+        if not words[_FOLLOWER_PID] or tick - words[_FOLLOWER_TICK] <= self._history_ticks:
+            return True
+        seen, since = words[_FOLLOWER_TICK], time.monotonic()
+        while (pid := words[_FOLLOWER_PID]) and tick - words[_FOLLOWER_TICK] > self._history_ticks:
+            if words[_FOLLOWER_TICK] != seen:
+                seen, since = words[_FOLLOWER_TICK], time.monotonic()
             bound_s = IDLE_S if state_of(pid) in (*STOPPED, *GONE) else SLOW_S
             if time.monotonic() - since > bound_s:
-                words[System.FOLLOWER_PID] = 0
+                words[_FOLLOWER_PID] = 0
             if words[System.STOP_REQUEST] or not self.launcher_is_alive:
                 return False
             # Polled, since the recorder posts no semaphore: it must not be able to disturb the clock in real time.

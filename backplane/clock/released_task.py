@@ -10,7 +10,7 @@ from __future__ import annotations
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.process import STOPPED, WAITING, processor_ns, state_of
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, TaskState
 
@@ -27,44 +27,46 @@ LEAST_NS = 1_000_000_000
 class ReleasedTask:
     """The clock's end of a task's control block.
 
-    `index` is its place in the layout. `missed` counts releases since it last finished one: 1 when it becomes late, 2
-    while it finishes each one late, more while it finishes none. `is_stopped`: a signal has stopped its process, so
-    lockstep must not wait for it.
+    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `missed` counts
+    releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
+    finishes none. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
+    `done`: posted by the task, in lockstep. `deadline`: tick before which its release, or plan, must be finished, as
+    last seen; it only moves later.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
         self.spec = spec
         self.index = segment.layout.tasks.index(spec)
         self.block = segment.block(spec.name)
+        self.sleeps = spec.wake == "timer"
         self.missed = 0
         self.is_stopped = False
+        self.deadline = self.block[_DEADLINE]
+        self._every = spec.every
         self._done = self.block[_DONE]
         self._semaphore = wake_semaphore(segment.rack, spec.name)
+        self.done = done_semaphore(segment.rack, spec.name)
 
-    def is_due(self, tick: int, last: int) -> bool:
-        """Say whether the task has a release in (last, tick]; it has none while it works on a plan, or is lost."""
-        release = tick - tick % self.spec.every
-        return release > last and self.block[_DEADLINE] <= release and not self.block[_LOST]
+    def is_free(self, release: int) -> bool:
+        """Say whether the task can take a release; it can not while it works on a plan, or is lost."""
+        return self.block[_DEADLINE] <= release and not self.block[_LOST]
 
     def release(self, tick: int) -> None:
-        """Wake the task for its newest release."""
-        block, release = self.block, tick - tick % self.spec.every
+        """Give the task its newest release."""
+        block, every = self.block, self._every
+        release = tick - tick % every
         if self.is_stopped:
             self.check_stopped()
-        self._count_missed()
-        block[_DEADLINE] = release + self.spec.every
-        block[_RELEASED] = release
-        self._semaphore.release()
-
-    def _count_missed(self) -> None:
-        done, before = self.block[_DONE], self._done
-        self._done = done
-        if self.is_idle():
+        done = block[_DONE]
+        if done == block[_RELEASED]:
             self.missed = 0
-        elif done != before:
+        elif done != self._done:
             self.missed = min(self.missed + 1, 2)
         else:
             self.missed += 1
+        self._done = done
+        block[_DEADLINE] = self.deadline = release + every
+        block[_RELEASED] = release
 
     def is_idle(self) -> bool:
         """Say whether the newest release is finished."""
@@ -76,14 +78,15 @@ class ReleasedTask:
 
     def is_finished(self, tick: int) -> bool:
         """Say whether `tick` may begin without waiting for the task."""
-        return self.block[_DEADLINE] > tick or self.is_settled()
+        self.deadline = self.block[_DEADLINE]
+        return self.deadline > tick or self.is_settled()
 
     def check_stopped(self) -> None:
         """Check whether a signal has stopped its process."""
         self.is_stopped = state_of(self.block[Block.PID]) in STOPPED
 
     def wake(self) -> None:
-        """Wake the task without a release."""
+        """Post the task's semaphore."""
         self._semaphore.release()
 
     @property
@@ -116,7 +119,7 @@ class ReleasedTask:
 
 
 def by_priority(layout: Layout) -> list[TaskSpec]:
-    """Return the tasks in the order in which the clock wakes them: executors by rate, then planners."""
+    """Return the tasks in the order in which the clock releases them: executors by rate, then planners."""
     return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.slot))
 
 

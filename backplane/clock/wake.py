@@ -1,27 +1,34 @@
 """Waiting for the next cycle: `waituntil(next-cycle)` of the paper's pseudo-code.
 
-A board blocks on its semaphore ("signal"). A board with its own core may busy-wait for its release ("poll") instead, if
-a context switch is too large a part of its cycle.
+"timer": the task sleeps to its own grid point and finds its release there, since the clock works a little ahead of the
+grid (`rack.backplane.clock.driver`). Its lateness is then that of one wake-up, not of two in a row (clock, then task).
+If the release is missing, the clock is late, stopped, or has skipped a tick: the task sleeps on to its next grid point,
+and the late clock wakes it with a post. The sleep is a wait for the task's semaphore with the grid point as its bound.
+Alternative considered: `clock_nanosleep`. It is no faster, and neither a late clock nor the end of a run could end it.
+
+"signal": the task blocks on its semaphore until the clock posts it at the grid point.
+
+"poll": a task with its own core busy-waits for its release, if a context switch is too large a part of its cycle.
+
+In lockstep there is no grid: a task that would sleep is woken by a signal.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from time import monotonic_ns
 
-from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.process import GONE, STOPPED, WAITING, is_alive, state_of
+from rack.backplane.clock.silence import SilentClock
+from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
-from rack.backplane.watch.alarms import Alarm, AlarmWriter
-from rack.backplane.words import Block, Head, System
+from rack.backplane.watch.alarms import AlarmWriter
+from rack.backplane.words import Block, Head, Run, System
 
-_RELEASED = int(Block.RELEASED)
-_TICK = int(System.TICK)
-CLOCK_TICKS = 2
-"""Ticks after a missing release before the clock is checked."""
-CLOCK_SILENT_S = 0.5
-"""Time without a tick before the clock counts as stopped while its process waits: it cannot be waiting for a tick."""
+# Plain integers for the hot path.
+_RELEASED, _STATE, _STOPPED = int(Block.RELEASED), int(System.STATE), int(Run.STOPPED)
+_EPOCH, _PERIOD = int(System.EPOCH_NS), int(System.PERIOD_NS)
 CHECK_S = 0.25
 """A longer wait checks whether the launcher is still alive."""
 SPINS = 100_000
@@ -35,23 +42,22 @@ class NextCycle:
     then it is taken late, as of its own tick, since its result depends on ticks alone.
     """
 
-    def __init__(
-        self, segment: Segment, task: str, poll: bool = False, clock_alarms: AlarmWriter | None = None
-    ) -> None:
+    def __init__(self, segment: Segment, task: str, clock_alarms: AlarmWriter | None = None) -> None:
         """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and raise an alarm there."""
-        self._spec = segment.layout.task(task)
-        self._clock = SystemClock(segment)
-        self._block = segment.block(task)
+        self._spec = spec = segment.layout.task(task)
+        self._words, self._block = segment.words, segment.block(task)
         self._semaphore = wake_semaphore(segment.rack, task)
         self._launcher = segment.words[Head.LAUNCHER_PID], segment.words[Head.LAUNCHER_START]
-        self._words = segment.words
-        self._poll = poll
-        self._clock_alarms = None if self._clock.is_lockstep else clock_alarms
-        self._clock_is_silent = False
-        self._waited_at = -1
+        is_lockstep = bool(segment.words[System.LOCKSTEP])
+        self._sleeps = spec.wake == "timer" and not is_lockstep
+        self._is_posted = not self._sleeps and spec.wake != "poll"
+        self._pause: Callable[[], bool] = self._block_on_semaphore if self._is_posted else self._spin
+        if self._sleeps:
+            self._pause = self._sleep
+        self._silent_clock = None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
         # A restarted planner takes no release from before its start.
         self._slack = 0
-        self._last = self._block[Block.RELEASED]
+        self._last = self._block[_RELEASED]
         self._not_before = 0
         self.skipped = 0
 
@@ -60,64 +66,63 @@ class NextCycle:
 
         Sets `skipped` to the releases that passed since the last one.
         """
+        words, block, is_posted = self._words, self._block, self._is_posted
         while True:
             # Read first: a task that is late for the run's last release still takes it, so that the miss is seen.
-            is_over = self._clock.is_stopped
+            is_over = words[_STATE] == _STOPPED
             # The task's own release, not the clock's tick: in lockstep its turn may come later in a tick.
-            newest = self._block[_RELEASED]
-            if newest > self._last and newest >= self._not_before:
+            newest = block[_RELEASED]
+            if newest > self._last and newest >= self._not_before and not (self._sleeps and self._is_ahead(newest)):
+                if is_posted:
+                    # Its post, which nobody waited for: else the semaphore would overflow within weeks.
+                    self._semaphore.take()
                 return self._take(newest)
-            if is_over or not (self._spin() if self._poll else self._block_on_semaphore()):
+            if is_over or not self._pause():
                 return None
+            is_posted = False
 
     def _take(self, newest: int) -> int:
         """Take the oldest release that has not passed."""
-        every = self._spec.every
-        expected = max(self._last + 1, self._not_before)
-        expected += -expected % every
+        every, expected = self._spec.every, self._expected
         release = max(expected, newest - self._slack)
-        self._clock_is_silent = False
         self.skipped = (release - expected) // every
         self._last = release
         self._slack = every * (self._spec.within_cycles - 1)
-        if self._poll:
-            self._take_posts(1 + self.skipped)
+        if self._silent_clock is not None:
+            self._silent_clock.has_ticked()
         return release
 
-    def _block_on_semaphore(self) -> bool:
-        self._semaphore.bind(CHECK_S if self._clock_alarms is None else self._patience_s())
-        if not self._semaphore.wait():
+    @property
+    def _expected(self) -> int:
+        """Tick of the task's next release on the grid."""
+        tick = max(self._last + 1, self._not_before)
+        return tick + -tick % self._spec.every
+
+    def _is_ahead(self, release: int) -> bool:
+        """Say whether the grid point of a release is yet to come."""
+        return monotonic_ns() < self._words[_EPOCH] + release * self._words[_PERIOD]
+
+    def _sleep(self) -> bool:
+        """Sleep to the next release's grid point or, if that has passed, to the task's next one or a late release."""
+        words, now = self._words, monotonic_ns()
+        deadline = bound = now + int(CHECK_S * 1e9)
+        is_due = False
+        # Before its start the clock has no grid. It then wakes every task once.
+        if epoch := words[_EPOCH]:
+            point, step = epoch + self._expected * words[_PERIOD], self._spec.every * words[_PERIOD]
+            is_due = now < point <= bound
+            deadline = min(bound, point if now < point else point + ((now - point) // step + 1) * step)
+        self._semaphore.bind(deadline)
+        if not self._semaphore.wait() or is_due or self._block[_RELEASED] > self._last:
             return True
-        if self._clock_alarms is not None and self._last >= 0:
-            self._check_clock(self._clock_alarms)
-        return is_alive(*self._launcher)
+        return self._look_around()
 
-    def _patience_s(self) -> float:
-        """Return how long to wait for the next release, s, before the clock is checked."""
-        if self._last < 0:
-            return CHECK_S
-        every = self._spec.every
-        late = self._clock.time_of(self._last + every - self._last % every + CLOCK_TICKS) - monotonic_ns()
-        again = CLOCK_TICKS * self._clock.period_ns
-        return min((late if late > 0 else again) * 1e-9, CHECK_S)
-
-    def _check_clock(self, alarms: AlarmWriter) -> None:
-        """Raise one alarm for a clock that makes no ticks: its process is stopped, dead, or silent for too long."""
-        now, newest = self._clock.now(), self._words[_TICK]
-        if now - newest < CLOCK_TICKS:
-            self._clock_is_silent = False
-            return
-        silent_s = (now - newest) * self._clock.period_ns * 1e-9
-        clock = self._words[System.CLOCK_PID]
-        state = state_of(clock)
-        # A clock that could run is only late. Twice: after a pause of the whole machine it may be about to wake.
-        waits = silent_s > CLOCK_SILENT_S and state in WAITING
-        has_stopped = state in STOPPED + GONE or (waits and self._waited_at == newest)
-        self._waited_at = newest if waits else -1
-        # A new tick, or the end of the run, disproves it.
-        if has_stopped and not self._clock_is_silent and self._words[_TICK] == newest and not self._clock.is_stopped:
-            self._clock_is_silent = True
-            alarms.ring(now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest)
+    def _block_on_semaphore(self) -> bool:
+        bound = int(CHECK_S * 1e9)
+        if self._silent_clock is not None and self._last >= 0:
+            bound = min(bound, self._silent_clock.patience_ns(self._expected))
+        self._semaphore.bind(monotonic_ns() + bound)
+        return not self._semaphore.wait() or self._look_around()
 
     def _spin(self) -> bool:
         block, last = self._block, self._last
@@ -127,11 +132,11 @@ class NextCycle:
         os.sched_yield()
         return is_alive(*self._launcher)
 
-    def _take_posts(self, count: int) -> None:
-        """Take the posts that a polling task does not wait for: else the semaphore would overflow within weeks."""
-        # The newest post may follow its release a moment later: the next cycle takes it.
-        while count and self._semaphore.acquire(0):
-            count -= 1
+    def _look_around(self) -> bool:
+        """Check the clock, after a wait without a release; return False if the launcher is gone."""
+        if self._silent_clock is not None and self._last >= 0:
+            self._silent_clock.check()
+        return is_alive(*self._launcher)
 
     def hold_until(self, tick: int) -> None:
         """Take no release before `tick`: a planner keeps the time slice of its plan."""

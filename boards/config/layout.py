@@ -12,12 +12,12 @@ from pydantic import ValidationError
 
 from rack.backplane.address_map import CLOCK, AddressMap
 from rack.backplane.errors import MailboxError
-from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, depth_for
+from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports
-from rack.boards.config.schema import RackConfig
+from rack.boards.config.schema import RackConfig, TaskPlace
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
 from rack.levels.operator import OPERATOR_COMMAND
@@ -187,7 +187,13 @@ class Wiring:
             every=every,
             within_cycles=self.config.board[place.board].within_cycles if place.role == "planner" else 1,
             depth=depth_for(self._kept_ticks, every),
+            wake=self._wake(place),
         )
+
+    def _wake(self, place: TaskPlace) -> Wake:
+        """Return how a task waits for its next cycle. The planner of a polling executor must not poll too."""
+        wake = self.config.board[place.board].wake or self.config.clock.wake
+        return "timer" if wake == "poll" and place.role == "planner" else wake
 
     @property
     def _kept_ticks(self) -> int:

@@ -108,11 +108,21 @@ class Resolved:
             linger=self._ticks(LINGER_S),
             silent=max(self._ticks(SILENT_S), 8 * self._ending_every),
             history=self._ticks(AHEAD_S),
-            core=obtained_core(clock.core),
+            core=self._clock_core,
             priority=clock.priority,
             restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
             on_loss={task.name: self._on_loss(task.board) for task in self.layout.tasks if task.role == "executor"},
         )
+
+    @property
+    def _clock_core(self) -> int:
+        """Core of the clock: in lockstep that of the fastest board, since a switch is faster than waking up a core."""
+        if self.config.clock.mode == "lockstep":
+            # A polling board does not give its core away.
+            boards = [t for t in self.layout.tasks if t.role == "executor" and t.wake != "poll"]
+            if boards:
+                return min(boards, key=lambda task: (task.every, task.slot)).core
+        return obtained_core(self.config.clock.core)
 
     def _ticks(self, seconds: float) -> int:
         return round(seconds * 1e9 / self.config.clock_ns)
@@ -199,7 +209,6 @@ class _Examined:
             inputs=dict(ports.reads),
             outputs=dict(ports.writes),
             context=self._context(spec.board),
-            poll=(board.wake or self._config.clock.wake) == "poll" and is_executor,
             critical_priority=board.priority if critical else 0,
             guards_clock=is_executor and spec.every == min(task.every for task in layout.tasks),
             fails_self_test=fails_self_test,

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, StringConstraints
 
 from rack.backplane.clock.system_clock import ticks_of
-from rack.backplane.layout import Protocol, Role
+from rack.backplane.layout import Protocol, Role, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
@@ -27,7 +27,6 @@ LAST_SLOT = 21
 
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
-Wake = Literal["signal", "poll"]
 OnNoRealtime = Literal["refuse", "warn"]
 OnLoss = Literal["hold", "stop", "brake"]
 
@@ -64,7 +63,9 @@ class ClockConfig(Table):
         description="simulated time divided by real time; 2 runs twice as fast",
     )
     wake: Wake = Field(
-        "signal", description="how boards wait for their next cycle: signal: on a semaphore; poll: busy-wait"
+        "timer",
+        description="how boards wait for their next cycle: timer: each sleeps to its own grid point; signal: until the "
+        "clock wakes them; poll: busy-wait",
     )
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")

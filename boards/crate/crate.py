@@ -123,7 +123,7 @@ class Crate:
             UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
             words[System.LOSSES] += 1
             # In lockstep the clock waits for this.
-            semaphores.clock_semaphore(self._segment.rack).release()
+            semaphores.done_semaphore(self._segment.rack, name).release()
         return tick
 
     def _kill(self, board: str | None = None) -> None:

@@ -86,7 +86,7 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         entry.acted(tick, time.monotonic_ns())
         os.kill(os.getpid(), signal.SIGKILL)
     elif rack.send(entry, tick, task, signal.SIGKILL):
-        rack.driver.await_state(lambda: task.lost_tick >= 0)
+        rack.driver.await_state(task, lambda: task.lost_tick >= 0)
 
 
 def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
@@ -185,6 +185,8 @@ class FaultStage:
 
     def within(self, tick: int) -> None:
         """Let the faults with a phase in `tick` strike at their times; call it after the releases."""
+        if not self._phased:
+            return
         clock = self._rack.clock
         for entry in sorted(self._phased, key=lambda e: e[Entry.PHASE]):
             at = clock.time_of(tick) + entry[Entry.PHASE] * clock.period_ns // PHASES
@@ -198,14 +200,17 @@ class FaultStage:
         return entry[Entry.UNTIL] <= tick or has_acted or _step(entry).is_void(self._rack, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
-        """Say whether a fault begins. Its condition is read in every tick, so that no message is missed."""
+        """Say whether a fault begins. Its condition is read in every tick, so that no message is missed.
+
+        It is read as of the tick before: the clock works ahead of the grid, where messages of `tick` may be missing.
+        """
         if entry[Entry.WHEN_BOX] < 0:
             return entry[Entry.FROM] <= tick
         box = entry[Entry.WHEN_BOX]
         spec = self._segment.layout.mailboxes[box]
         if box not in self._observers:
             self._observers[box] = open_observer(self._segment, spec.name)
-        reading = self._observers[box].read(tick)
+        reading = self._observers[box].read(tick - 1)
         field = spec.fields[entry[Entry.WHEN_FIELD]].name
         return reading.is_there and int(getattr(reading.value, field)) == entry[Entry.WHEN_VALUE]
 

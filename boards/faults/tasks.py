@@ -81,10 +81,15 @@ class TaskFaults:
         self._arm: list[FaultEntry] = []
         self.loads: list[ExtraComputing] = []
 
-    def refresh(self) -> int:
-        """Apply the faults that are active now; return the generation of the fault table."""
+    def refresh(self, tick: int) -> int:
+        """Apply the faults that are active at `tick`; return the generation of the fault table.
+
+        The clock works ahead of the grid: a fault that it has begun for a later tick waits for the next call. The
+        generation is then -1.
+        """
         generation = self._table.generation
-        active = [(KINDS[entry[Entry.KIND]], entry) for entry in self._table.active(self._spec.name)]
+        found = [(KINDS[entry[Entry.KIND]], entry) for entry in self._table.active(self._spec.name)]
+        active = [(kind, entry) for kind, entry in found if entry[Entry.FROM] <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)
             for kind, entry in active
@@ -96,7 +101,7 @@ class TaskFaults:
         if isinstance(self._level, Executor):
             faults = [Fault(k.name, k.values(e), e[Entry.SEED], e[Entry.FROM], k.step) for k, e in arm]
             self._level.inject(faults)
-        return generation
+        return generation if len(active) == len(found) else -1
 
     def burn(self, tick: int) -> None:
         """Spend the extra computing time of all active faults."""

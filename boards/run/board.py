@@ -6,12 +6,14 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
-from rack.backplane.process import die_with_parent, name_process, set_priority, take_processor
+from rack.backplane.memory import lock_memory, touch_memory
+from rack.backplane.process import cores_kept_awake, die_with_parent, name_process, pin, set_priority, take_processor
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, TaskState
+from rack.backplane.words import Block, System, TaskState
 from rack.boards.classes import find_class
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
@@ -71,6 +73,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         block[Block.PRIORITY] = take_processor(spec)
         block[Block.CORE] = spec.core
         task = _task(segment, wiring, level, attention)
+        if block[Block.PRIORITY] and not segment.words[System.LOCKSTEP]:
+            touch_memory()
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)
         task.stopwatch.notify_clock()
@@ -83,9 +87,13 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> int:
     """Take the processor and run the system clock."""
-    os.sched_setaffinity(0, {wiring.core})
-    set_priority(wiring.priority)
-    run_clock(segment, wiring, attention)
+    pin(wiring.core)
+    is_realtime = set_priority(wiring.priority) and wiring.priority > 0
+    lock_memory()
+    if is_realtime and not wiring.lockstep:
+        touch_memory()
+    with cores_kept_awake() if is_realtime else nullcontext():
+        run_clock(segment, wiring, attention)
     return 0
 
 

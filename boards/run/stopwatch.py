@@ -10,7 +10,7 @@ from time import monotonic_ns, thread_time_ns
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.semaphores import done_semaphore
 from rack.backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
 from rack.backplane.words import Block, System
 from rack.boards.run.ports import InputPorts, OutputPorts
@@ -38,7 +38,7 @@ class Stopwatch:
         self._inputs, self._outputs, self._reading = inputs, outputs, inputs.task
         self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
-        self._lockstep_clock = clock_semaphore(segment.rack) if self._clock.is_lockstep else None
+        self._lockstep_done = done_semaphore(segment.rack, task) if self._clock.is_lockstep else None
         self._troubles = self._bus_errors = self._corrupt = 0
         self._cycles, self._state = self._block[_CYCLES], self._block[_LEVEL_STATE]
         self._processor_ns = 0  # processor time used before the current record
@@ -62,14 +62,14 @@ class Stopwatch:
         """Begin the cycle released at `tick`, after `skipped` missed releases."""
         self._tick, self._skipped = tick, skipped
         self.start_ns = self.plan_ns = release_ns = start_ns = monotonic_ns()
-        if self._lockstep_clock is None:
+        if self._lockstep_done is None:
             release_ns = self._words[_EPOCH] + tick * self._period_ns
         self._release_ns = release_ns
         self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
     def now(self, deadline: int) -> int | None:
         """Return the clock's tick once the level has processed; None while tick `deadline` has not come."""
-        if self._lockstep_clock is None and self.process_ns < self._time_of(deadline):
+        if self._lockstep_done is None and self.process_ns < self._time_of(deadline):
             return None
         now = self._clock.now()
         return now if now >= deadline else None
@@ -79,8 +79,8 @@ class Stopwatch:
 
         `in_time`: no message was too late. `deadline` is a tick.
         """
-        block, tick, skipped, lockstep_clock = self._block, self._tick, self._skipped, self._lockstep_clock
-        is_missed = not in_time or (lockstep_clock is None and self.end_ns > self._time_of(deadline))
+        block, tick, skipped, lockstep_done = self._block, self._tick, self._skipped, self._lockstep_done
+        is_missed = not in_time or (lockstep_done is None and self.end_ns > self._time_of(deadline))
         if self._reading.troubles != self._troubles or not in_time:
             flags |= self._count_troubles()
         if is_missed:
@@ -110,8 +110,8 @@ class Stopwatch:
         )
         self._cycles = block[_CYCLES] = self._cycles + 1
         block[_DONE] = done
-        if lockstep_clock is not None:
-            lockstep_clock.release()
+        if lockstep_done is not None:
+            lockstep_done.release()
         if not self._cycles % BUS_COUNT_CYCLES:
             self.count_bus()
         self._closed_ns = monotonic_ns()
@@ -129,8 +129,8 @@ class Stopwatch:
 
     def notify_clock(self) -> None:
         """In lockstep, let the clock check this task again."""
-        if self._lockstep_clock is not None:
-            self._lockstep_clock.release()
+        if self._lockstep_done is not None:
+            self._lockstep_done.release()
 
     def _count_troubles(self) -> int:
         """Count failed accesses since the last cycle; return trace flags."""

@@ -70,7 +70,7 @@ class SystemController:
         lockstep = self._wiring.lockstep
         if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
             return
-        self._driver.await_state(lambda: task.is_ready or task.is_given_up)
+        self._driver.await_state(task, lambda: task.is_ready or task.is_given_up)
         if task.is_ready:
             away = tick - task.lost_tick
             self._driver.settle()
@@ -149,16 +149,23 @@ class EndOfRun:
         self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
         self._silent = wiring.silent
         self._heard: int | None = None
+        # Under time-slice a message becomes visible at a boundary of its writer's period.
+        is_by_ticks = self._reader is not None and self._reader.spec.protocol == "time-slice"
+        self._every = self._reader.spec.every if self._reader is not None and is_by_ticks else 1
+        self._next = 0
 
     def __call__(self, tick: int) -> int | None:
-        """Return the tick at which the run stops; None until it is known."""
-        if self._stop_tick is None and self._reader is not None and self._writer is not None:
-            reading = self._reader.read(tick)
+        """Return the tick at which the run stops, by the messages as of the tick before; None until it is known."""
+        final = tick - 1
+        if final >= self._next and self._stop_tick is None and self._reader is not None and self._writer is not None:
+            boundary = final - final % self._every
+            self._next = boundary + self._every
+            reading = self._reader.read(boundary)
             if reading.is_new or self._heard is None or self._writer[Block.LOST]:
-                self._heard = tick
+                self._heard = boundary
             is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
-            if is_over or tick - self._heard >= self._silent:
-                self._stop_tick = tick + self._linger
+            if is_over or boundary - self._heard >= self._silent:
+                self._stop_tick = max(boundary + self._linger, tick)
         return self._stop_tick
 
 

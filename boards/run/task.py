@@ -40,7 +40,7 @@ class Task(ABC):
         self.words = segment.words
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
-        self.next_cycle = NextCycle(segment, wiring.task, wiring.poll, self.alarms if wiring.guards_clock else None)
+        self.next_cycle = NextCycle(segment, wiring.task, self.alarms if wiring.guards_clock else None)
         self.inputs = InputPorts(segment, wiring.inputs, self.alarms, f"{spec.board}.plan")
         self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs)
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
@@ -61,7 +61,7 @@ class Task(ABC):
         if tick is None:
             return None
         if self.words[_FAULTS] != self._generation:
-            self._generation = self.faults.refresh()
+            self._generation = self.faults.refresh(tick)
         return tick
 
     @abstractmethod

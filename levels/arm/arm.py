@@ -21,6 +21,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
 
 PATIENCE_CYCLES = 2
@@ -76,6 +77,8 @@ class Arm(ABC):
         self.violations = 0  # steps in which the drives broke a limit of position, velocity or torque
         self.pushed = 0  # steps in which a blow pushed a joint beyond a limit of position or velocity
         self.first_violation = ""  # the first violation, readable: which limit, by how much, and when
+        self.dynamics = Dynamics(cell)  # for the level that drives the arm; one that senses exactly shares it with it
+        self._saved: tuple[Message, tuple[int, ...]] | None = None  # last message filled, with what seldom changes
         self._data = cell.start()
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
@@ -147,9 +150,11 @@ class Arm(ABC):
 
         A simulation adds its state: `state.state` has room for MuJoCo's integration state of the cell.
         """
-        state.tick, state.waited, state.braked = self.tick, self.waited, self.braked
-        state.clipped, state.touches = self.clipped, self.touches
-        state.violations, state.pushed = self.violations, self.pushed
+        state.tick = self.tick
+        seldom = self.waited, self.braked, self.clipped, self.touches, self.violations, self.pushed
+        if (state, seldom) != self._saved:
+            state.waited, state.braked, state.clipped, state.touches, state.violations, state.pushed = seldom
+            self._saved = state, seldom
 
     def restore(self, state: Message) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted board."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import daqp
 import numpy as np
+from numpy.typing import NDArray
 
-from rack.levels.algebra import Array, mat_vec, solve
-from rack.levels.robot.dynamics import Dynamics
+from rack.levels.algebra import Array, cholesky_solve, mat_vec, solve
+from rack.levels.compiled import compiled
+from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
 from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
 
 STANDSTILL = 0.01
@@ -15,6 +20,8 @@ SPEED_PART = 0.99
 """Part of a velocity limit that the gate lets a joint reach; the rest covers model errors within a cycle."""
 RANGE_KEPT_RAD = 0.002
 """Distance that the gate keeps from the ends of a joint's range, for the same reason."""
+CLEAR_PART = 0.01
+"""Part of a velocity limit that must be left where one rough prediction is enough."""
 HARD, SOFT = 0, 8
 """Kinds of the solver's constraints."""
 
@@ -45,7 +52,8 @@ class LimitGate:
 
     A joint may be only so fast that it can brake, with `braking` (joints,), rad/s2, before the end of its range. The
     arm's equation of motion predicts the velocities. Torques that lead too far are replaced by the nearest ones, in
-    acceleration, that do not: a small quadratic program, in which torque limits take precedence.
+    acceleration, that do not: a small quadratic program, in which torque limits take precedence. Far from all limits,
+    nearly always, one rough prediction shows that nothing is to be cut.
     """
 
     def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
@@ -56,6 +64,9 @@ class LimitGate:
         self._braking = braking
         self._period_s = period_s
         self._dynamics = dynamics
+        limits = np.stack((self._torque, self._fastest, self._low, self._high, braking, dynamics.dry))
+        self.clearance = limits, period_s  # for `is_clear`
+        self._is_clear = is_clear.load()
         joints = len(braking)
         self._inertia, self._resisting = np.eye(joints), np.zeros(joints)
         self._unity = np.eye(joints)
@@ -66,6 +77,9 @@ class LimitGate:
 
         `torque` must be finite.
         """
+        self._dynamics.terms(q, qd)
+        if self._is_clear(torque, *self._dynamics.newest, *self.clearance):
+            return torque, False
         passed: Array = np.clip(torque, -self._torque, self._torque)
         least = -self._speed_towards(q - self._low, -qd) - qd
         most = self._speed_towards(self._high - q, qd) - qd
@@ -95,15 +109,95 @@ class LimitGate:
         return np.asarray(np.clip((mat_vec(per_torque, nearest) + offset) * self._torque, -self._torque, self._torque))
 
     def _speed_towards(self, distance: Array, speed: Array) -> Array:
-        """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.
+        return speed_towards(distance, speed, self._fastest, self._braking, self._period_s)
 
-        With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop within the rest:
-        v'^2 / 2 a <= distance - (v + v') T / 2.
-        """
-        half = 0.5 * self._braking * self._period_s
-        left = np.maximum(distance - 0.5 * speed * self._period_s, 0.0)
-        stoppable = np.sqrt(half * half + 2.0 * self._braking * left) - half
-        return np.minimum(stoppable, self._fastest)
+
+@compiled
+def is_clear(
+    torque: Array,
+    state: Array,  # (2, joints), rad and rad/s
+    inertia: Array,
+    bias: Array,
+    limits: Array,  # (6, joints): see `LimitGate`
+    period_s: float,
+) -> bool:
+    """Return whether `torque` leads nowhere near a limit, by the equation of motion at `state`.
+
+    It does not if the velocity stays within its bounds at no gain as at twice the gain predicted, with some room: more
+    than inertia and bias change in a cycle.
+    """
+    (q, qd), (most_torque, fastest, low, high, braking, dry) = state, limits
+    left = torque - bias
+    for joint in range(len(q)):
+        if not abs(torque[joint]) <= most_torque[joint]:
+            return False
+        left[joint] -= dry[joint] * math.tanh(qd[joint] / FRICTION_SPEED)
+    twice = cholesky_solve(inertia, left) * (2.0 * period_s)
+    for joint in range(len(q)):
+        speed, hard, room = fastest[joint], braking[joint], CLEAR_PART * fastest[joint]
+        least = -speed_towards(q[joint] - low[joint], -qd[joint], speed, hard, period_s) - qd[joint] + room
+        most = speed_towards(high[joint] - q[joint], qd[joint], speed, hard, period_s) - qd[joint] - room
+        if not (least <= 0.0 <= most and least <= twice[joint] <= most):
+            return False
+    return True
+
+
+class Motors(NamedTuple):
+    """More arguments of `give`."""
+
+    joints: NDArray[np.int64]  # (2, joints): their addresses in qpos and in qvel
+    actuators: NDArray[np.int64]  # (joints,), in ctrl
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    brakes: Array  # (nv,), N m
+    command: Array  # (joints,), N m: the torque as commanded, and as given
+    given: Array
+
+
+@compiled
+def give(
+    torque: Array,
+    state: Array,  # this and the next as for `is_clear`, evaluated at any state
+    inertia: Array,
+    bias: Array,
+    limits: Array,
+    period_s: float,
+    joints: NDArray[np.int64],  # this and the next: see `Motors`
+    actuators: NDArray[np.int64],
+    qpos: Array,
+    qvel: Array,
+    ctrl: Array,
+    brakes: Array,
+    command: Array,
+    given: Array,
+) -> bool:
+    """Give `torque` to the motors, and none to the brakes, if it is clear; return whether it is.
+
+    The usual case in one call: the equation of motion has been evaluated, for the controller, at the arm's state.
+    """
+    for joint in range(len(torque)):
+        if not (state[0, joint] == qpos[joints[0, joint]] and state[1, joint] == qvel[joints[1, joint]]):
+            return False
+    if not is_clear(torque, state, inertia, bias, limits, period_s):
+        return False
+    for joint in range(len(torque)):
+        command[joint] = given[joint] = ctrl[actuators[joint]] = torque[joint]
+        brakes[joints[1, joint]] = 0.0
+    return True
+
+
+@compiled
+def speed_towards(distance: Array, speed: Array, fastest: Array, braking: Array, period_s: float) -> Array:
+    """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.
+
+    With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop within the rest:
+    v'^2 / 2 a <= distance - (v + v') T / 2.
+    """
+    half = 0.5 * braking * period_s
+    left = np.maximum(distance - 0.5 * speed * period_s, 0.0)
+    stoppable = np.sqrt(half * half + 2.0 * braking * left) - half
+    return np.minimum(stoppable, fastest)
 
 
 class CoarseSensors:
@@ -114,18 +208,53 @@ class CoarseSensors:
     """
 
     def __init__(self, encoders: Encoders, seed: int) -> None:
-        self._seed = seed
         per_second = np.array([[1.0], [1.0 / EDGE_TIMING_S]])
-        self._noise, self._step = encoders.noise * per_second, encoders.resolution * per_second
-        self._noisy, self._stepped = bool(encoders.noise.any()), self._step > 0.0
-        self._per_step = 1.0 / np.where(self._stepped, self._step, 1.0)
+        self._sensors = seed, encoders.noise * per_second, encoders.resolution * per_second
+        self._sense = sense_coarsely.load()
 
     def sample(self, position: Array, velocity: Array, tick: int) -> Array:
         """Return (2, joints): positions, rad, and velocities, rad/s, of a tick as sensed."""
         sample = np.array((position, velocity))
-        if self._noisy:
-            sample += self._noise * np.random.default_rng((self._seed, tick)).standard_normal(sample.shape)
-        steps = np.rint(sample * self._per_step)
-        steps *= self._step
-        np.copyto(sample, steps, where=self._stepped)
+        self._sense(sample, tick, *self._sensors)
         return sample
+
+
+@compiled
+def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Array) -> None:
+    """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to multiples of `step`."""
+    joints = sample.shape[1]
+    chance = uniform(seed, tick, 2 * joints)
+    for joint in range(joints):
+        # Box and Muller: two independent normal numbers from two uniform ones.
+        length, angle = math.sqrt(-2.0 * math.log(chance[joint])), 2.0 * math.pi * chance[joints + joint]
+        sample[0, joint] += noise[0, joint] * length * math.cos(angle)
+        sample[1, joint] += noise[1, joint] * length * math.sin(angle)
+        for row in range(2):
+            if step[row, joint] > 0.0:
+                sample[row, joint] = np.rint(sample[row, joint] / step[row, joint]) * step[row, joint]
+
+
+@compiled
+def uniform(seed: int, tick: int, count: int) -> Array:
+    """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick alone."""
+    bits = mixed(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
+    bits = mixed(mixed(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
+    return ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+
+
+@compiled
+def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return `bits` mixed as SplitMix64 does (Steele, Lea and Flood, OOPSLA 2014)."""
+    bits = bits + np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    none, square, state, joints = np.zeros(0), np.zeros((0, 0)), np.zeros((2, 0)), np.zeros((2, 0), dtype=int)
+    clearance = state, square, none, np.zeros((6, 0)), 1.0
+    is_clear.load()(none, *clearance)
+    give.load()(none, *clearance, joints, joints[0], *[none] * 6)
+    sense_coarsely.load()(state, 0, 0, state, state)

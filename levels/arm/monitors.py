@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.arm.substeps import Substeps
 from rack.levels.robot.cell import Cell, unintended_contacts
 from rack.levels.robot.lookup import geom_name
 
@@ -13,53 +14,34 @@ QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
 
 
 class LimitMonitor:
-    """Records position, velocity and torque, of motor and brake together, in every step; judges once per tick.
+    """Judges position, velocity and torque, of motor and brake together, in every step of a tick.
 
     It shares no code with the limit gate, which enforces the limits.
     """
 
-    def __init__(self, cell: Cell, data: mujoco.MjData, substeps: int) -> None:
-        """Watch `data`; a tick takes `substeps` steps."""
-        model, bounds = cell.model, cell.bounds
-        self._names = [model.joint(int(joint)).name for joint in model.dof_jntid[cell.dof]]
-        # Whole rows are recorded, at no more cost than the arm's part of them; other entries have no limits.
-        self._live = data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied
-        ends = np.cumsum([model.nq, model.nv, model.nv])
-        self._seen = np.zeros((substeps, ends[-1]))
-        self._parts = [tuple(np.split(row, ends[:-1])) for row in self._seen]
-        self._columns = np.stack((cell.qpos, ends[0] + cell.dof, ends[1] + cell.dof))
-        self._low, self._high = np.full(ends[-1], -np.inf), np.full(ends[-1], np.inf)
-        self._low[self._columns] = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
-        self._high[self._columns] = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
+    def __init__(self, cell: Cell, steps: Substeps) -> None:
+        """Judge what `advance` records in `steps`."""
+        self._names = [cell.model.joint(int(joint)).name for joint in cell.model.dof_jntid[cell.dof]]
+        self._seen, (self._low, self._high) = steps.seen, steps.bounds
         self.count = 0  # steps in which the drives broke a limit
         self.pushed = 0  # steps in which a blow broke a limit of position or velocity: no drive can prevent it
         self.first = ""  # the first broken limit, readable
-
-    def look(self, substep: int) -> None:
-        """Record the step that has just been made, number `substep` of its tick."""
-        q, qd, motors, brakes = self._live
-        position, velocity, torque = self._parts[substep]
-        position[:] = q
-        velocity[:] = qd
-        np.add(motors, brakes, out=torque)
 
     def judge(self, time_s: float, struck: bool) -> bool:
         """Judge the steps of the tick that began at simulated `time_s`; return whether one broke a limit.
 
         `struck`: a blow still moves the arm.
         """
-        # NaN is not within limits either. (Counting is five times as fast as `all`.)
-        within = np.count_nonzero(self._seen >= self._low) + np.count_nonzero(self._seen <= self._high)
-        if within == 2 * self._seen.size:
+        wrong = ~((self._seen >= self._low) & (self._seen <= self._high))  # NaN is not within limits either
+        if not wrong.any():
             return False
-        self._count(time_s, struck)
+        self._count(wrong, time_s, struck)
         return True
 
-    def _count(self, time_s: float, struck: bool) -> None:
-        wrong = ~((self._seen >= self._low) & (self._seen <= self._high))
-        steps = wrong.any(axis=1)
+    def _count(self, wrong: NDArray[np.bool_], time_s: float, struck: bool) -> None:
+        steps = wrong.any(axis=(1, 2))
         if struck:
-            pushed = steps & ~wrong[:, self._columns[2]].any(axis=1) & np.isfinite(self._seen).all(axis=1)
+            pushed = steps & ~wrong[:, 2].any(axis=1) & np.isfinite(self._seen).all(axis=(1, 2))
             self.pushed += int(pushed.sum())
             steps &= ~pushed
             if not steps.any():
@@ -68,16 +50,15 @@ class LimitMonitor:
         if self.first:
             return
         substep = int(steps.argmax())
-        part, joint = (int(at[0]) for at in np.nonzero(wrong[substep, self._columns]))
-        column = self._columns[part, joint]
+        part, joint = (int(at[0]) for at in np.nonzero(wrong[substep]))
         what, unit = QUANTITIES[part]
         where = f"joint '{self._names[joint]}' at {time_s:.4f} s, step {substep}"
-        permitted = f"{self._low[column]:g} to {self._high[column]:g} is permitted"
-        self.first = f"{what} {self._seen[substep, column]:.6g} {unit} of {where}; {permitted}"
+        permitted = f"{self._low[part, joint]:g} to {self._high[part, joint]:g} is permitted"
+        self.first = f"{what} {self._seen[substep, part, joint]:.6g} {unit} of {where}; {permitted}"
 
 
 class ContactMonitor:
-    """Counts the unintended contacts of a cell after every step of the simulation."""
+    """Counts the unintended contacts of a cell, in every step that has any."""
 
     def __init__(self, cell: Cell) -> None:
         self._model = cell.model
@@ -89,15 +70,13 @@ class ContactMonitor:
         self.first = ""  # the first one, readable: which geoms, and when
         self.struck: tuple[int, int] | None = None  # geoms of the newest one of arm or load since last cleared
 
-    def look(self, data: mujoco.MjData, time_s: float) -> None:
-        """Count the unintended contacts of one step at simulated `time_s`."""
-        if data.ncon == 0:
-            return
+    def look(self, data: mujoco.MjData) -> None:
+        """Count the unintended contacts of the last step."""
         pairs = unintended_contacts(data, self._touch)
         if not len(pairs):
             return
         if not self.first:
-            self.first = f"unintended contact: {self.named(pairs[0])} at {time_s:.3f} s"
+            self.first = f"unintended contact: {self.named(pairs[0])} at {data.time:.3f} s"
         self.count += len(pairs)
         ours = pairs[(self._arm | self._held(data))[pairs].any(axis=1)]
         if len(ours):

@@ -11,8 +11,9 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
 from rack.levels.arm.arm import Arm, Sensed
-from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate
+from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, Motors, give
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
+from rack.levels.arm.substeps import advance, substeps
 from rack.levels.level import Finding
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -32,26 +33,29 @@ class SimulatedArm(Arm):
 
     def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
+        d, joints = self._data, len(cell.qpos)
         self._model, self._clock_ns = cell.model, clock_ns
-        self._substeps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
+        self._qpos, self._qvel, self._ctrl, self._applied = d.qpos, d.qvel, d.ctrl, d.qfrc_applied
+        self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
+        self._contacts, self._limits = ContactMonitor(cell), LimitMonitor(cell, self._steps)
         dynamics = Dynamics(cell)
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
         self._brake = Brake(cell.limits.acceleration, dynamics, cell.home)
-        self._contacts = ContactMonitor(cell)
-        self._limits = LimitMonitor(cell, self._data, self._substeps)
         self._most: Array | None = None  # (joints,), N m: torques of weakened motors
         obstacles = zip(cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True)
         self._motions = [
             (mocap, ObstacleMotion(cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name)))
             for mocap, body, name in obstacles
         ]
-        joints = len(cell.qpos)
-        self._true = (np.zeros(joints), np.zeros(joints))  # position and velocity
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._struck = 0  # ticks for which the motion is still blamed on a blow
-        self._sound = np.zeros(mujoco.mj_stateSize(cell.model, STATE))  # MuJoCo's state before the tick
-        self._command: Array = np.zeros(joints)  # N m
+        self._asked, self._command = np.zeros((2, joints))  # N m: the newest command, and the one in force
         self._given = False  # the command for the coming tick has passed the gate
+        motors = Motors(
+            self._steps.joints, cell.actuators, d.qpos, d.qvel, d.ctrl, d.qfrc_applied, self._command, self.torque
+        )
+        self._clear = *self.dynamics.newest, *self._gate.clearance, *motors
+        self._give_clear, self._advance = give.load(), advance.load()
         # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda _: None)
 
@@ -71,33 +75,34 @@ class SimulatedArm(Arm):
 
     def sense(self) -> Sensed:
         """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
-        d, cell = self._data, self.cell
+        cell = self.cell
         position, velocity = self._state()
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
         if cell.gripper_qpos is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
-        opening, speed = float(d.qpos[cell.gripper_qpos]), float(d.qvel[cell.gripper_dof])
-        return Sensed(position, velocity, opening, speed, self.tick)
+        opening, speed = self._qpos[cell.gripper_qpos], self._qvel[cell.gripper_dof]
+        return Sensed(position, velocity, float(opening), float(speed), self.tick)
 
     def _state(self) -> tuple[Array, Array]:
-        """Return true joint positions and velocities, rad, rad/s. Valid until the next call."""
-        position, velocity = self._true
-        np.take(self._data.qpos, self.cell.qpos, out=position)
-        np.take(self._data.qvel, self.cell.dof, out=velocity)
-        return position, velocity
+        """Return true joint positions and velocities, rad, rad/s."""
+        return self._qpos[self.cell.qpos], self._qvel[self.cell.dof]
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and give torques and gripper force for the coming torque cycle; see `Link.drive`."""
+        self._asked[:] = torque
         if math.isfinite(grip_force) and self.cell.gripper_actuator is not None:
-            self.grip_force = grip_force
+            self._ctrl[self.cell.gripper_actuator] = self.grip_force = grip_force
+        if self._most is None and self._give_clear(self._asked, *self._clear):
+            self.waited, self.braked, self._given = 0, False, True
+            return None
         finding = self.refused(torque)
         if finding is not None:
             self.clipped += 1
             self.brake()
             return finding
         self.waited, self.braked = 0, False
-        np.copyto(self._command, torque)
+        self._command[:] = torque
         self._give()
         return None
 
@@ -117,7 +122,7 @@ class SimulatedArm(Arm):
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time continues."""
-        self._contacts.struck = None
+        self._contacts.struck = self.contact = None
         for _ in range(ticks):
             if self.waited >= self.patience:
                 self._engage()
@@ -129,13 +134,6 @@ class SimulatedArm(Arm):
                 self._simulate()
             self.tick += 1
             self._data.time = self._now_s
-        self._count()
-
-    def _count(self) -> None:
-        """Take over the monitors' counts."""
-        contacts, limits = self._contacts, self._limits
-        self.contact, self.touches, self.first_touch = contacts.struck, contacts.count, contacts.first
-        self.violations, self.pushed, self.first_violation = limits.count, limits.pushed, limits.first
 
     def look(self, scene: Message) -> None:
         """Fill a `SCENE` with the poses as simulated."""
@@ -166,29 +164,36 @@ class SimulatedArm(Arm):
 
     def _give(self) -> None:
         """Apply the command to the motors, or the brakes' torque to the joints, through the limit gate."""
-        d, cell = self._data, self.cell
+        cell, braked = self.cell, self.braked
         q, qd = self._state()
-        braked = self.braked
         passed, cut = self._gate.admit(self._brake.torque(q, qd) if braked else self._command, q, qd)
         self.clipped += cut
-        d.qfrc_applied[cell.dof] = passed if braked else 0.0
+        self._applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)
-        d.ctrl[cell.actuators] = self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
-        if cell.gripper_actuator is not None:
-            d.ctrl[cell.gripper_actuator] = self.grip_force
+        self._ctrl[cell.actuators] = (
+            self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
+        )
         self._given = True
 
     def _simulate(self) -> None:
-        """Simulate one tick; on a fault, restore the state before it."""
-        m, d = self._model, self._data
-        mujoco.mj_getState(m, d, self._sound, STATE)
+        """Simulate one tick."""
         for mocap, motion in self._motions:
-            d.mocap_pos[mocap] = motion.position(self._now_s)
+            self._data.mocap_pos[mocap] = motion.position(self._now_s)
+        made = self._advance(0, *self._steps)
+        if made < 0:
+            self._look_closer(-made)
+        elif self._struck:
+            self._struck -= 1
+
+    def _look_closer(self, made: int) -> None:
+        """Finish a tick of which step `made` is not as it should be; on a fault, restore the state before the tick."""
         touches = self._contacts.count
-        for substep in range(self._substeps):
-            mujoco.mj_step(m, d)
-            self._contacts.look(d, d.time)
-            self._limits.look(substep)
+        self._contacts.look(self._data)
+        while made < len(self._steps.seen):
+            made = self._advance(made, *self._steps)
+            if made < 0:
+                made = -made
+                self._contacts.look(self._data)
         if self._contacts.count > touches and self._contacts.struck is not None:
             self._struck = STRUCK_TICKS
         broken = self._limits.judge(self._now_s, self._struck > 0)
@@ -196,7 +201,10 @@ class SimulatedArm(Arm):
             self._struck = STRUCK_TICKS if broken else self._struck - 1
         self.fault = self._broken()
         if self.fault:
-            mujoco.mj_setState(m, d, self._sound, STATE)
+            mujoco.mj_setState(self._model, self._data, self._steps.before, STATE)
+        contacts, limits = self._contacts, self._limits
+        self.contact, self.touches, self.first_touch = contacts.struck, contacts.count, contacts.first
+        self.violations, self.pushed, self.first_violation = limits.count, limits.pushed, limits.first
 
     def _broken(self) -> str:
         """Return the fault of the simulation; empty: none."""

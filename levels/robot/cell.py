@@ -18,7 +18,7 @@ from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.tables import RobotConfig, SceneConfig
 
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything the next step depends on: a simulation restored from it continues bit for bit."""
 
 
@@ -154,10 +154,7 @@ def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArra
     """Return the pairs of geoms, (n, 2), in unintended contact; `touch` is that of `Cell`."""
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
-    suspects = touch[pairs[:, 0], pairs[:, 1]]
-    if not np.count_nonzero(suspects):  # the usual case, at every substep
-        return pairs[:0]
-    return np.asarray(pairs[suspects & (contact.dist < 0.0)])
+    return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0.0)])
 
 
 def start_qpos(cell: Cell) -> NDArray[np.float64]:

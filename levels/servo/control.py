@@ -57,8 +57,9 @@ class ComputedTorque:
     Every joint's error is that of a damped oscillator in every state of the arm. Torques stay within their limits.
     """
 
-    def __init__(self, cell: Cell, params: ServoParams) -> None:
-        self._dynamics = Dynamics(cell)
+    def __init__(self, cell: Cell, params: ServoParams, dynamics: Dynamics) -> None:
+        """Use `dynamics` of the cell: the arm's, which saves its limit gate another evaluation."""
+        self._dynamics = dynamics
         gains = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
         dry, limits = np.array((cell.model.dof_frictionloss[cell.dof], cell.bounds.torque))
         self._set = partial(set_torque.load(), *gains, dry, limits)

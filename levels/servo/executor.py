@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm
+from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
 from rack.levels.arm.faulty import STEPS
 from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
@@ -72,7 +72,7 @@ class ServoExecutor(Executor):
         self._faulty = FaultyLink(self.arm, cell, every, self.acted)
         self._link: Link = self.arm  # the path to the arm; through `_faulty` while faults are injected
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)  # set points, interpolated
-        self._loop = ComputedTorque(cell, params)
+        self._loop = ComputedTorque(cell, params, self.arm.dynamics)
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
@@ -88,7 +88,8 @@ class ServoExecutor(Executor):
 
     @classmethod
     def preload(cls) -> None:
-        """Load the compiled functions of the level."""
+        """Load the compiled functions of the level and of its arm."""
+        preload()
         for module in (control, reference, sensor_monitor, actuator_monitor):
             module.preload()
 

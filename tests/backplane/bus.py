@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
-from rack.backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec
+from rack.backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec, Wake
 from rack.backplane.message import Field, MessageType
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
@@ -49,10 +49,16 @@ def mailbox(
 
 
 def task(
-    name: str, every: int = 1, slot: int = 2, role: Role = "executor", within_cycles: int = 1, depth: int = 16
+    name: str,
+    every: int = 1,
+    slot: int = 2,
+    role: Role = "executor",
+    within_cycles: int = 1,
+    depth: int = 16,
+    wake: Wake = "signal",
 ) -> TaskSpec:
     """Return the spec of a task on a board of its own."""
-    return TaskSpec(name, name, role, slot, 0, 0, every, within_cycles, depth)
+    return TaskSpec(name, name, role, slot, 0, 0, every, within_cycles, depth, wake)
 
 
 def layout(rack: str, mailboxes: Iterable[MailboxSpec] = (), tasks: Iterable[TaskSpec] = ()) -> Layout:

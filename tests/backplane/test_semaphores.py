@@ -31,14 +31,14 @@ def named(rack: str) -> int:
     return len(list(SHM_FOLDER.glob(f"sem.*.{rack}.*")))
 
 
-def test_there_is_one_a_task_one_a_locked_mailbox_and_the_clocks(bus: Segment) -> None:
-    assert len(semaphores.names(bus.layout)) == len(set(semaphores.names(bus.layout))) == named(bus.rack) == 4
+def test_there_are_two_a_task_and_one_a_locked_mailbox(bus: Segment) -> None:
+    assert len(semaphores.names(bus.layout)) == len(set(semaphores.names(bus.layout))) == named(bus.rack) == 5
 
 
 def test_locks_begin_free_and_wake_ups_unsent(bus: Segment) -> None:
     assert semaphores.lock_semaphore(bus.rack, NAME).value == 1
     assert semaphores.wake_semaphore(bus.rack, "writer").value == 0
-    assert semaphores.clock_semaphore(bus.rack).value == 0
+    assert semaphores.done_semaphore(bus.rack, "writer").value == 0
 
 
 def test_semaphores_of_a_killed_rack_are_replaced(bus: Segment) -> None:

@@ -8,7 +8,7 @@ import time
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
-from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.semaphores import done_semaphore
 from rack.backplane.words import Block, System
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.faults.kind import KINDS
@@ -33,7 +33,7 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:  # n
             time.sleep(CYCLE_S)
             seen.append((tick, entry.stage))
             segment.block("writer")[Block.DONE] = tick
-            clock_semaphore(segment.rack).release()
+            done_semaphore(segment.rack, "writer").release()
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()

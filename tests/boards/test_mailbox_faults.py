@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 
 from rack.backplane.layout import PROTOCOLS
-from rack.backplane.words import Block
+from rack.backplane.words import Block, TaskState
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import LOOSE, MakeConfig
+from tests.processes import wait_until
 
 KINDS_OF_WRITERS = ("mute", "drop", "delay", "reorder", "corrupt", "babble", "masquerade")
 
@@ -75,6 +76,7 @@ def test_the_bus_counters_continue_after_a_restart(config: MakeConfig) -> None:
     with Rack(given) as rack:
         rack.run(3.0)
         block = rack.segment.block("watch")
+        wait_until(lambda: block[Block.STATE] == TaskState.ENDED)
         # Of its 101 cycles the dead process had accounted for 64: it does so in every 64th.
         accounted = block[Block.CYCLES] - 101 + 64
         assert block[Block.READS] == block[Block.WRITES] == accounted > 64

@@ -74,7 +74,7 @@ def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
         events = rack.events
     assert outcome.worked
     begins = next(event for event in events if event.kind == "fault")
-    assert (begins.tick, begins.text.partition(",")[0]) == (41, "lose-every (n 4 messages) begins")
+    assert (begins.tick, begins.text.partition(",")[0]) == (42, "lose-every (n 4 messages) begins")
     detected = next(event for event in events if event.kind == "detection")
     assert (detected.code, detected.subject) == ("gap", "wave.status")
     assert sum(event.kind == "fault" and "acted 20 time" in event.text for event in events) == 1

@@ -45,9 +45,9 @@ class Post:
         # All that are not visible yet, and the newest that is.
         self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
 
-    def write(self, tick: int) -> None:
-        """Write the message in the cycle released at `tick`, if the mailbox is written in that cycle."""
-        if not tick % self.spec.every:
+    def write(self, tick: int, cycle: int) -> None:
+        """Write the message in the cycle of `cycle` ticks released at `tick`, if this is one that writes it."""
+        if not (tick + cycle) % self.spec.every:
             self.serial += 1
             self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
@@ -113,7 +113,7 @@ class BareTask:
 
     def _write(self, tick: int) -> None:
         for post in self._posts:
-            post.write(tick)
+            post.write(tick, self.spec.every)
 
 
 def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, Mode, Wake
+from rack.backplane.layout import Wake
+from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, Mode
 from rack.boards.config.toml import to_toml
 
 LONGEST = LAST_SLOT - CLOCK_SLOT

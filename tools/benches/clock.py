@@ -9,8 +9,8 @@ from typing import get_args
 
 import numpy as np
 
+from rack.backplane.layout import Wake
 from rack.boards.config import loads
-from rack.boards.config.schema import Wake
 from rack.levels.timing.trace_times import lateness_ns
 from rack.tools.benches.chain import PRIORITY, Chain
 from rack.tools.benches.comparison import Absent, Comparison, Sample, interleaved

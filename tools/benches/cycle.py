@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from rack.backplane.trace import FIELDS
 from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Occupation, unit_times
 from rack.tools.benches.apart import apart
@@ -282,8 +283,12 @@ def _medians(traces: Iterable[Trace]) -> dict[str, float]:
 
 
 def parts_of(trace: Trace) -> dict[str, np.ndarray]:
-    """Return the processor time of each part of each cycle, us, shape (n,)."""
-    exchange, read, process, write = trace.units.T
-    beyond = trace.rows["processor_ns"] - trace.units.sum(axis=1)
-    times = beyond, exchange + read, process, write, np.zeros_like(beyond)
+    """Return the processor time of each part of each cycle but the first, us, shape (n - 1,)."""
+    rows, units = trace.rows, trace.units[1:]
+    exchange, read, process, write = units.T
+    beyond = rows["processor_ns"][1:] - units.sum(axis=1)
+    # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it is written.
+    closed = rows["closed_ns"][1:] if "closed_ns" in FIELDS else np.zeros_like(beyond)
+    closing = np.clip(np.where(closed, closed - rows["end_ns"][:-1], 0), 0, beyond)
+    times = beyond - closing, exchange + read, process, write, closing
     return {part: time * 1e-3 for part, time in zip(PARTS, times, strict=True)}

@@ -16,7 +16,7 @@ from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block, Head, Run, System
 from tests.backplane.bus import layout, task
 from tests.backplane.conftest import MakeBus
-from tests.processes import in_thread
+from tests.processes import BOUND_S, in_thread
 
 PERIOD_NS = 1_000_000
 HISTORY = 8
@@ -59,6 +59,35 @@ def test_a_run_stops_at_its_tick_and_wakes_everybody(make_bus: MakeBus) -> None:
     assert (segment.words[System.STATE], segment.words[System.STOP_TICK]) == (Run.STOPPED, 10)
     released = len(ticks) - 1
     assert [post.value for post in posts] == [released + 1] * 2
+
+
+def test_the_clock_works_ahead_for_tasks_that_sleep(make_bus: MakeBus) -> None:
+    segment = make_bus(task("sleeper", wake="timer"), task("waiter", slot=3))
+    start(segment, 20 * PERIOD_NS)
+    epoch, made = segment.words[System.EPOCH_NS], []
+    sleeper, waiter = segment.block("sleeper"), segment.block("waiter")
+
+    def take() -> None:
+        post = wake_semaphore(segment.rack, "waiter")
+        while segment.words[System.STATE] != Run.STOPPED:
+            if post.acquire(BOUND_S):
+                made.append((sleeper[Block.RELEASED], waiter[Block.RELEASED], time.monotonic_ns()))
+
+    with in_thread(take):
+        ticks = given_out(segment, 40)
+    assert any(at < epoch + tick * PERIOD_NS for tick, at in ticks)
+    # A task that waits for a signal is released at the grid point, where the others have found their release.
+    assert all(at >= epoch + second * PERIOD_NS and first >= second for first, second, at in made)
+    # One post as the grid begins, one at the end; one more only for a tick of which the clock was late.
+    assert wake_semaphore(segment.rack, "sleeper").value < 2 + len(ticks)
+
+
+def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> None:
+    segment = make_bus(task("sleeper", wake="timer"))
+    start(segment)
+    # Every tick is decided on after its grid point.
+    numbers = [tick for tick, _ in given_out(segment, 30, lambda tick: time.sleep(2 * PERIOD_NS * 1e-9))]
+    assert wake_semaphore(segment.rack, "sleeper").value == 2 + len(numbers) - 1
 
 
 def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> None:

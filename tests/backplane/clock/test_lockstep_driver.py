@@ -6,13 +6,15 @@ import os
 import signal
 import threading
 import time
+from typing import get_args
 
 import pytest
 
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
+from rack.backplane.layout import Wake
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import clock_semaphore
+from rack.backplane.semaphores import done_semaphore
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -30,12 +32,10 @@ def serve(segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, st
         time.sleep(work_s)
         log.append(("end", name, tick))
         block[Block.DONE] = tick
-        clock_semaphore(segment.rack).release()
+        done_semaphore(segment.rack, name).release()
 
 
-def lockstep(
-    segment: Segment, stop: int, one_at_a_time: bool, poll: bool = False
-) -> tuple[list[tuple[str, str, int]], list[int]]:
+def lockstep(segment: Segment, stop: int, one_at_a_time: bool) -> tuple[list[tuple[str, str, int]], list[int]]:
     """Run lockstep over slow tasks; return the log of their cycles, and the ticks in the order given out."""
     log: list[tuple[str, str, int]] = []
     ticks: list[int] = []
@@ -47,7 +47,7 @@ def lockstep(
 
     segment.words[System.LOCKSTEP] = 1
     # Ready before the first release: a task that is late waits for the next one.
-    cycles = {t.name: NextCycle(segment, t.name, poll) for t in segment.layout.tasks}
+    cycles = {t.name: NextCycle(segment, t.name) for t in segment.layout.tasks}
     threads = [
         threading.Thread(target=serve, args=(segment, t.name, cycles[t.name], log, 0.002 * t.slot), daemon=True)
         for t in segment.layout.tasks
@@ -68,10 +68,10 @@ def test_lockstep_makes_every_tick_once(make_bus: MakeBus) -> None:
     assert [segment.words[w] for w in (System.TICK, System.STOP_TICK, System.STATE)] == [12, 13, Run.STOPPED]
 
 
-@pytest.mark.parametrize("poll", [False, True])
-def test_a_lockstep_tick_begins_when_every_task_due_has_finished(make_bus: MakeBus, poll: bool) -> None:
-    segment = make_bus(task("fast", slot=2), task("slow", every=4, slot=5))
-    log, _ = lockstep(segment, 12, False, poll)
+@pytest.mark.parametrize("wake", get_args(Wake))
+def test_a_lockstep_tick_begins_when_every_task_due_has_finished(make_bus: MakeBus, wake: Wake) -> None:
+    segment = make_bus(task("fast", slot=2, wake=wake), task("slow", every=4, slot=5, wake=wake))
+    log, _ = lockstep(segment, 12, False)
     every = {"fast": 1, "slow": 4}
     for name, period in every.items():
         assert [tick for what, who, tick in log if (what, who) == ("begin", name)] == list(range(0, 12, period))
@@ -79,11 +79,11 @@ def test_a_lockstep_tick_begins_when_every_task_due_has_finished(make_bus: MakeB
             assert log.index(("end", name, tick)) < log.index(("tick", "clock", tick + period))
 
 
-@pytest.mark.parametrize("poll", [False, True])
-def test_one_at_a_time_means_one_after_the_other(make_bus: MakeBus, poll: bool) -> None:
-    planner = task("planner", slot=4, role="planner")
-    segment = make_bus(planner, task("slow", every=2, slot=3), task("fast", slot=2))
-    log, _ = lockstep(segment, 6, True, poll)
+@pytest.mark.parametrize("wake", get_args(Wake))
+def test_one_at_a_time_means_one_after_the_other(make_bus: MakeBus, wake: Wake) -> None:
+    planner = task("planner", slot=4, role="planner", wake=wake)
+    segment = make_bus(planner, task("slow", every=2, slot=3, wake=wake), task("fast", slot=2, wake=wake))
+    log, _ = lockstep(segment, 6, True)
     expected: list[tuple[str, str, int]] = []
     for tick in range(6):
         expected.append(("tick", "clock", tick))

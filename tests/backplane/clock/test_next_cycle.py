@@ -7,10 +7,12 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from typing import get_args
 
 import pytest
 
 from rack.backplane.clock.wake import NextCycle
+from rack.backplane.layout import Wake
 from rack.backplane.process import state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
@@ -20,13 +22,26 @@ from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
 
-POLL = pytest.mark.parametrize("poll", [False, True], ids=["signal", "poll"])
+WAKES = pytest.mark.parametrize("wake", get_args(Wake), indirect=True)
 EVERY = 4
+PERIOD_NS = 2_500_000
 
 
 @pytest.fixture
-def bus(make_bus: MakeBus) -> Segment:
-    return make_bus(task("level", every=EVERY))
+def wake(request: pytest.FixtureRequest) -> Wake:
+    """How the task waits; by signal, unless a test has other wishes."""
+    return getattr(request, "param", "signal")
+
+
+@pytest.fixture
+def bus(make_bus: MakeBus, wake: Wake) -> Segment:
+    return make_bus(task("level", every=EVERY, wake=wake))
+
+
+def start_grid(segment: Segment, passed_ns: int = 0, period_ns: int = PERIOD_NS) -> None:
+    """Start a grid with tick 0 that long ago."""
+    segment.words[System.PERIOD_NS] = period_ns
+    segment.words[System.EPOCH_NS] = time.monotonic_ns() - passed_ns
 
 
 def release(segment: Segment, tick: int) -> None:
@@ -34,18 +49,18 @@ def release(segment: Segment, tick: int) -> None:
     wake_semaphore(segment.rack, "level").release()
 
 
-@POLL
-def test_a_release_is_given_once(bus: Segment, poll: bool) -> None:
-    cycle, seen = NextCycle(bus, "level", poll), []
+@WAKES
+def test_a_release_is_given_once(bus: Segment) -> None:
+    cycle, seen = NextCycle(bus, "level"), []
     for tick in (0, 4, 8):
         release(bus, tick)
         seen.append((cycle.wait(), cycle.skipped))
     assert seen == [(0, 0), (4, 0), (8, 0)]
 
 
-@POLL
-def test_a_late_task_skips_passed_releases_and_counts_them(bus: Segment, poll: bool) -> None:
-    cycle = NextCycle(bus, "level", poll)
+@WAKES
+def test_a_late_task_skips_passed_releases_and_counts_them(bus: Segment) -> None:
+    cycle = NextCycle(bus, "level")
     release(bus, 0)
     cycle.wait()
     for tick in (4, 8, 12):
@@ -101,10 +116,10 @@ def test_a_restarted_task_waits_for_the_next_release(bus: Segment) -> None:
     assert (cycle.wait(), cycle.skipped) == (12, 0)
 
 
-@POLL
-def test_the_end_of_the_run_ends_a_wait(bus: Segment, poll: bool) -> None:
+@WAKES
+def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     found: list[int | None] = [-1]
-    thread = threading.Thread(target=lambda: found.append(NextCycle(bus, "level", poll).wait()), daemon=True)
+    thread = threading.Thread(target=lambda: found.append(NextCycle(bus, "level").wait()), daemon=True)
     thread.start()
     bus.words[System.STATE] = Run.STOPPED
     wake_semaphore(bus.rack, "level").release()
@@ -112,9 +127,9 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment, poll: bool) -> None:
     assert found == [-1, None]
 
 
-@POLL
-def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment, poll: bool) -> None:
-    cycle = NextCycle(bus, "level", poll)
+@WAKES
+def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment) -> None:
+    cycle = NextCycle(bus, "level")
     for tick in (0, 4, 8):
         release(bus, tick)
     bus.words[System.STATE] = Run.STOPPED
@@ -122,10 +137,10 @@ def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment, poll: boo
     assert cycle.wait() is None
 
 
-@POLL
-def test_the_launchers_end_ends_a_wait(bus: Segment, poll: bool) -> None:
+@WAKES
+def test_the_launchers_end_ends_a_wait(bus: Segment) -> None:
     bus.words[Head.LAUNCHER_START] += 1
-    assert NextCycle(bus, "level", poll).wait() is None
+    assert NextCycle(bus, "level").wait() is None
 
 
 def busy() -> None:
@@ -134,14 +149,15 @@ def busy() -> None:
 
 
 @pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 @pytest.mark.parametrize(("clock", "rung"), [(busy, []), (signal.pause, [Alarm.CLOCK_STOPPED])])
 def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
     bus: Segment, monkeypatch: pytest.MonkeyPatch, clock: Callable[[], None], rung: list[Alarm]
 ) -> None:
-    monkeypatch.setattr("rack.backplane.clock.wake.CLOCK_SILENT_S", 0.05)
+    monkeypatch.setattr("rack.backplane.clock.silence.CLOCK_SILENT_S", 0.05)
     looks: list[int] = []
-    monkeypatch.setattr("rack.backplane.clock.wake.state_of", lambda pid: looks.append(pid) or state_of(pid))
-    bus.words[System.PERIOD_NS], bus.words[System.EPOCH_NS] = 2_500_000, time.monotonic_ns()
+    monkeypatch.setattr("rack.backplane.clock.silence.state_of", lambda pid: looks.append(pid) or state_of(pid))
+    start_grid(bus)
     cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))
     release(bus, 0)
     cycle.wait()
@@ -156,8 +172,9 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
 
 
 @pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
-    bus.words[System.PERIOD_NS], bus.words[System.EPOCH_NS] = 2_500_000, time.monotonic_ns()
+    start_grid(bus)
     cycle, ring = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")), alarm_ring(bus, "level")
     release(bus, 0)
     cycle.wait()
@@ -171,10 +188,86 @@ def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
                 release(bus, tick)
 
 
-def test_posts_that_a_polling_task_does_not_need_do_not_add_up(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level", poll=True)
+def test_posts_that_a_task_does_not_wait_for_do_not_add_up(bus: Segment) -> None:
+    cycle = NextCycle(bus, "level")
     for tick in range(0, 100 * EVERY, EVERY):
         release(bus, tick)
         if tick % 3:
             assert cycle.wait() == tick
-    assert wake_semaphore(bus.rack, "level").value <= 1
+    assert wake_semaphore(bus.rack, "level").value < 100 // 3 + 2
+
+
+def publish(segment: Segment, tick: int) -> None:
+    """Release the task as a clock does that is in time: without a post."""
+    segment.block("level")[Block.RELEASED] = tick
+
+
+TIMER = pytest.mark.parametrize("wake", ["timer"], indirect=True)
+
+
+@TIMER
+def test_a_sleeping_task_takes_a_release_at_its_grid_point_and_not_before(bus: Segment) -> None:
+    cycle = NextCycle(bus, "level")
+    start_grid(bus, -4 * PERIOD_NS)
+    publish(bus, 0)
+    for tick in range(0, 10 * EVERY, EVERY):
+        assert (cycle.wait(), cycle.skipped) == (tick, 0)
+        assert time.monotonic_ns() >= bus.words[System.EPOCH_NS] + tick * PERIOD_NS
+        publish(bus, tick + EVERY)
+
+
+@TIMER
+def test_a_sleeping_task_sleeps_on_to_its_next_grid_point_if_the_clock_skips_one(bus: Segment) -> None:
+    cycle = NextCycle(bus, "level")
+    start_grid(bus, -PERIOD_NS)
+    publish(bus, 0)
+    assert cycle.wait() == 0
+
+    def skip() -> None:
+        wait_until(lambda: time.monotonic_ns() > bus.words[System.EPOCH_NS] + EVERY * PERIOD_NS)
+        publish(bus, 2 * EVERY)
+
+    with in_thread(skip):
+        assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 1)
+
+
+@TIMER
+def test_a_late_clock_wakes_a_sleeping_task_with_a_post(bus: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
+    hour_ns = 3_600_000_000_000
+    start_grid(bus, EVERY * hour_ns + hour_ns // 2, hour_ns)
+    cycle, found = NextCycle(bus, "level"), []
+    publish(bus, 0)
+    # Hours late, but the first one on the grid that is there.
+    assert cycle.wait() == 0
+    thread = threading.Thread(target=lambda: found.append(cycle.wait()), daemon=True)
+    thread.start()
+    release(bus, EVERY)
+    thread.join(BOUND_S / 2)
+    assert found == [EVERY]
+
+
+@TIMER
+def test_a_task_that_sleeps_before_the_clock_starts_is_woken_to_sleep_by_its_grid(
+    bus: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
+    cycle, found = NextCycle(bus, "level"), []
+    thread = threading.Thread(target=lambda: found.append(cycle.wait()), daemon=True)
+    thread.start()
+    start_grid(bus, -4 * PERIOD_NS)
+    wake_semaphore(bus.rack, "level").release()
+    publish(bus, 0)
+    thread.join(BOUND_S / 2)
+    assert found == [0]
+
+
+@TIMER
+def test_in_lockstep_a_sleeping_task_waits_for_its_signal(bus: Segment) -> None:
+    bus.words[System.LOCKSTEP] = 1
+    # A grid in the far future: it does not count.
+    start_grid(bus, -1_000 * EVERY * PERIOD_NS)
+    cycle = NextCycle(bus, "level")
+    for tick in (0, 4, 8):
+        release(bus, tick)
+        assert (cycle.wait(), cycle.skipped) == (tick, 0)

@@ -119,7 +119,7 @@ def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> Non
         rung = [watched.release(False) for _ in range(RELEASES_MISSED)]
     assert rung == [[Alarm.LATE], [], [], [Alarm.HANG]]
     assert watched.losses == 1
-    assert not watched.task.is_due(watched.tick + 1, watched.tick)
+    assert not watched.task.is_free(watched.tick + 1)
 
 
 def test_a_lost_task_is_due_again_when_it_has_rejoined(make_bus: MakeBus) -> None:
@@ -129,12 +129,12 @@ def test_a_lost_task_is_due_again_when_it_has_rejoined(make_bus: MakeBus) -> Non
         watched.release(answered)
     task.lose(2)
     assert (task.lost_tick, task.is_ready, task.is_settled()) == (2, False, True)
-    assert not task.is_due(3, 2)
+    assert not task.is_free(3)
     task.block[Block.STATE] = TaskState.READY
     assert task.is_ready
     task.rejoin()
     assert (task.lost_tick, task.missed, task.is_idle()) == (-1, 0, True)
-    assert task.is_due(3, 2)
+    assert task.is_free(3)
 
 
 def test_a_task_that_finishes_every_cycle_too_late_is_late_and_not_lost(make_bus: MakeBus) -> None:

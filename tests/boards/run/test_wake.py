@@ -1,12 +1,13 @@
-"""How a board waits for its cycle: a semaphore, or busy-waiting on its own core."""
+"""How a board waits for its cycle: on the grid by itself, on a semaphore, or busy-waiting on its own core."""
 
 from __future__ import annotations
 
 import os
+from typing import get_args
 
 import pytest
 
-from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.layout import PROTOCOLS, Protocol, Wake
 from rack.backplane.words import Block
 from rack.boards import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
@@ -14,21 +15,21 @@ from tests.boards.messages import Written
 
 SECONDS = 0.25
 TICKS = 100
-POLL = "board.wave.wake=poll"
 pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="a polling board needs its own core")
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_polling_board_writes_the_same_as_a_woken_one(config: MakeConfig, protocol: Protocol) -> None:
+def test_boards_write_the_same_however_they_wait(config: MakeConfig, protocol: Protocol) -> None:
     digests = set()
-    for wake in ("board.wave.wake=signal", POLL):
-        with Rack(config(wake, f"protocol.default={protocol}", text=PLAIN)) as rack:
+    for wake in get_args(Wake):
+        with Rack(config(f"board.wave.wake={wake}", f"protocol.default={protocol}", text=PLAIN)) as rack:
             digests.add(rack.run(SECONDS).digest)
     assert len(digests) == 1
 
 
-def test_a_board_that_polls_keeps_the_grid_in_real_time(config: MakeConfig) -> None:
-    with Rack(config(POLL, "clock.mode=realtime", "clock.speed=0.5", text=PLAIN)) as rack:
+@pytest.mark.parametrize("wake", get_args(Wake))
+def test_a_board_keeps_the_grid_in_real_time(config: MakeConfig, wake: Wake) -> None:
+    with Rack(config(f"board.wave.wake={wake}", "clock.mode=realtime", "clock.speed=0.5", text=PLAIN)) as rack:
         assert rack.run(SECONDS).ticks == TICKS
         block = rack.segment.block("wave")
         # A board whose core was taken away during the very last cycles does not see those any more.

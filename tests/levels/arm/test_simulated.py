@@ -12,7 +12,7 @@ import pytest
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.arm import SimulatedArm
+from rack.levels.arm import SimulatedArm, substeps
 from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.arm.simulated import ObstacleMotion
 from rack.levels.messages import ARM_STATE, SCENE
@@ -52,7 +52,7 @@ class Extremes:
     beyond: float = -np.inf
     steps: int = field(default=0)
 
-    def look(self, _: mujoco.MjModel, data: mujoco.MjData) -> None:
+    def look(self, data: mujoco.MjData) -> None:
         q, qd, bounds = data.qpos[self.made.qpos], data.qvel[self.made.dof], self.made.bounds
         self.speed = max(self.speed, float(np.max(np.abs(qd) / bounds.velocity)))
         self.torque = max(self.torque, float(np.max(np.abs(data.qfrc_actuator[self.made.dof]) / bounds.torque)))
@@ -60,18 +60,22 @@ class Extremes:
         self.steps += 1
 
 
+Watch = Callable[[SimulatedArm], Extremes]
+
+
 @pytest.fixture
-def watched(monkeypatch: pytest.MonkeyPatch) -> Callable[[Cell], Extremes]:
-    """Let every MuJoCo step of this test be looked at."""
+def watched(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    """Let every MuJoCo step of this test be looked at: the arm makes them in Python."""
 
-    def watch(made: Cell) -> Extremes:
-        extremes, step = Extremes(made), mujoco.mj_step
+    def watch(arm: SimulatedArm) -> Extremes:
+        extremes, step = Extremes(arm.cell), substeps.mj_step
 
-        def stepping(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        def stepping(model: int, data: int) -> None:
             step(model, data)
-            extremes.look(model, data)
+            extremes.look(arm._data)
 
-        monkeypatch.setattr(mujoco, "mj_step", stepping)
+        monkeypatch.setattr(substeps, "mj_step", stepping)
+        monkeypatch.setattr(arm, "_advance", substeps.advance)
         return extremes
 
     return watch
@@ -125,10 +129,10 @@ def test_an_arm_without_commands_stands_still(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
-def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Callable[[Cell], Extremes]) -> None:
+def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Watch) -> None:
     arm, made = arm_of(name)
     made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # a contact would stop the arm
-    extremes, rng = watched(made), np.random.default_rng(7)
+    extremes, rng = watched(arm), np.random.default_rng(7)
     for block in range(60):
         side = rng.choice([-1.0, 1.0], len(made.home)) if block < 40 else np.ones(len(made.home))
         for _ in range(20):
@@ -142,10 +146,12 @@ def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Cal
     assert arm.violations == 0
 
 
-def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(watched: Callable[[Cell], Extremes]) -> None:
+def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(
+    watched: Watch,
+) -> None:
     arm, made = arm_of("puma560")
     made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    extremes, torque = watched(made), made.bounds.torque * [1, -1, 1, 1, -1, 1]
+    extremes, torque = watched(arm), made.bounds.torque * [1, -1, 1, 1, -1, 1]
     for missed in (1, 3, 10, 1, 80):
         for _ in range(60):
             arm.drive(torque, 0.0)

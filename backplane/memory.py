@@ -1,0 +1,70 @@
+"""A real-time process's memory: all there before the first cycle, so that no cycle waits for a page.
+
+A board is forked from the crate and shares its memory. Left alone, the first write to each page copies it, the first
+access to each page of the segment or of a library maps it, and the C library returns freed memory to the kernel only to
+ask for it again: a page fault in every second cycle for the first seconds, and in rare code paths at any later time.
+
+`mlockall` without MCL_ONFAULT would do it in one call, but it also fills memory that was reserved and never used, twice
+of what a board needs, and later mappings at once. So pages are locked as they are touched, and touched here by kind:
+memory of the process itself where it is in use, the segment and the libraries whole.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import mmap
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_POPULATE_READ, _POPULATE_WRITE = 22, 23  # MADV_*, since Linux 5.14; without them pages are touched by the first cycles
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+RESERVE = 4 << 20
+"""Bytes of heap kept beyond those in use."""
+GAP = 16
+"""Unused pages between used ones that are touched with them: one call takes as long as some pages."""
+_PRESENT = 63
+"""Bit of /proc/self/pagemap: the page is in memory."""
+
+
+def lock_memory() -> None:
+    """Lock all memory, present and future, as it is touched; stop the garbage collector."""
+    _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    gc.freeze()
+    gc.disable()
+
+
+def touch_memory() -> None:
+    """Touch every page that a cycle may need, and let the C library keep what it has obtained."""
+    _libc.mallopt(_M_TRIM_THRESHOLD, -1)
+    _libc.mallopt(_M_MMAP_MAX, 0)
+    reserve = ctypes.create_string_buffer(RESERVE)
+    del reserve
+    with Path("/proc/self/pagemap").open("rb", buffering=0) as pagemap:
+        for line in Path("/proc/self/maps").read_text().splitlines():
+            span, rights, _, device, *_ = line.split(maxsplit=4)
+            start, end = (int(address, 16) for address in span.split("-"))
+            if rights == "rw-p" and device == "00:00":
+                for first, last in _used(pagemap.fileno(), start, end):
+                    _libc.madvise(first, last - first, _POPULATE_WRITE)
+            elif rights[0] == "r":
+                _libc.madvise(start, end - start, _POPULATE_WRITE if rights[1] == "w" else _POPULATE_READ)
+
+
+def _used(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
+    """Yield the stretches of a mapping that are in memory, as addresses."""
+    page = mmap.PAGESIZE
+    entries = np.frombuffer(os.pread(pagemap, (end - start) // page * 8, start // page * 8), "u8")
+    used = np.flatnonzero(entries >> _PRESENT)
+    if not len(used):
+        return
+    breaks = np.flatnonzero(np.diff(used) > GAP)
+    firsts, lasts = used[np.append(0, breaks + 1)], used[np.append(breaks, len(used) - 1)] + 1
+    for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
+        yield start + first * page, start + last * page

@@ -1,0 +1,94 @@
+"""MuJoCo's own functions and memory, for compiled code.
+
+Called from Python, a step of MuJoCo costs 2 us more than it takes, and a look at its contacts half a microsecond: both
+happen at every step. Compiled code calls the C library directly, on the addresses of model and data. Called as Python,
+the same code reaches the same functions through ctypes.
+
+Of an error that MuJoCo calls fatal (its memory is exhausted) the bindings would make an exception; here it ends the
+process, as the exception would have ended the board.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.compiled import compiled
+from rack.levels.robot.cell import STATE
+
+LIBRARY = Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionString()}")
+
+
+class native(compiled[..., None]):  # noqa: N801  # stands for a function
+    """A function of MuJoCo that returns nothing. Arguments are integers: addresses, sizes and flags."""
+
+    def __init__(self, name: str, arguments: int) -> None:
+        function = getattr(ctypes.CDLL(str(LIBRARY)), name)
+        function.restype, function.argtypes = None, [ctypes.c_ssize_t] * arguments
+        super().__init__(function)
+        self._name, self._arguments = name, arguments
+
+    def load(self) -> Any:
+        """Return the function for compiled callers."""
+        if self._machine is None:
+            from llvmlite import binding
+            from numba import types
+
+            binding.load_library_permanently(str(LIBRARY))
+            self._machine = types.ExternalFunction(self._name, types.void(*[types.intp] * self._arguments))
+        return self._machine
+
+
+mj_step = native("mj_step", 2)
+mj_fwd_position = native("mj_fwdPosition", 2)
+mj_fwd_velocity = native("mj_fwdVelocity", 2)
+mj_full_m = native("mj_fullM", 3)
+mj_jac = native("mj_jac", 6)
+mj_jac_dot = native("mj_jacDot", 6)
+mj_get_state = native("mj_getState", 4)
+
+
+class ContactViews(NamedTuple):
+    """Views of the contacts of an `MjData`, valid as long as it is."""
+
+    number: NDArray[np.int32]  # (1,)
+    geoms: NDArray[np.int32]  # (room, 2), of which the first `number` are contacts
+    distance: NDArray[np.float64]  # (room,), m; likewise
+
+
+def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
+    """Return views of the contacts. Raises `RuntimeError` for a MuJoCo that keeps them in another place.
+
+    The bindings give a copy of their number, and views of the contacts of one moment. But contacts always begin the
+    arena, and their number follows warnings and timers (mjdata.h).
+    """
+    state = np.zeros(mujoco.mj_stateSize(model, STATE))
+    mujoco.mj_getState(model, data, state, STATE)
+    warnings, timers = data.warning.number, data.timer.number
+    end = warnings.ctypes.data - warnings.itemsize + len(warnings) * warnings.strides[0]
+    number = _view(end + len(timers) * timers.strides[0], np.int32, (1,), (4,))
+    before = int(number[0])
+    mujoco.mj_addContact(model, data, mujoco.MjContact())  # where there are no contacts, they have no address
+    if not before + 1 == number[0] == data.ncon:
+        raise RuntimeError(f"MuJoCo {mujoco.mj_versionString()} does not keep the number of contacts where 4.0 does")
+    geoms, distance = data.contact.geom, data.contact.dist
+    room, strides = data.narena // geoms.strides[0], geoms.strides
+    views = ContactViews(
+        number,
+        _view(geoms.ctypes.data, np.int32, (room, 2), strides),
+        _view(distance.ctypes.data, np.float64, (room,), strides[:1]),
+    )
+    mujoco.mj_forward(model, data)  # without the contact added
+    mujoco.mj_setState(model, data, state, STATE)
+    return views
+
+
+def _view(address: int, kind: type, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
+    """Return the array at `address`."""
+    memory = (ctypes.c_char * (shape[0] * strides[0])).from_address(address)
+    return np.ndarray(shape, kind, memoryview(memory), 0, strides)

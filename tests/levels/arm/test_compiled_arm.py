@@ -1,0 +1,131 @@
+"""The compiled functions of the arm: the same bits as their Python, and one version for all robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message
+from rack.levels import arm as arm_package
+from rack.levels.algebra import Array, cholesky_solve
+from rack.levels.arm import SimulatedArm, drives, substeps
+from rack.levels.compiled import compiled
+from rack.levels.messages import ARM_STATE
+from rack.levels.robot import dynamics
+from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.dynamics import Dynamics, Payload
+from rack.levels.robot.limits import Encoders
+from tests.levels.arms import CLOCK_NS, cell, config, four_bar
+
+RNG = np.random.default_rng(8)
+OFFSET = np.array([0.02, -0.03, 0.05])
+
+
+def driven(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
+    """Drive an arm as a controller does; return its state."""
+    for tick in range(ticks):
+        sensed = arm.sense()
+        bias = arm.dynamics.terms(sensed.position, sensed.velocity).bias
+        arm.drive(bias + 0.3 * made.bounds.torque * np.sin(0.1 * tick + np.arange(len(bias))), 10.0)
+        arm.step(1)
+    state = Message(ARM_STATE.dtype(sizes(made)))
+    arm.save(state)
+    return state
+
+
+def in_python(arm: SimulatedArm) -> None:
+    """Replace an arm's compiled functions by their Python."""
+    arm._advance, arm._give_clear = substeps.advance, drives.give
+    arm._gate._is_clear = drives.is_clear
+    for used in (arm.dynamics, arm._gate._dynamics):
+        used._evaluate, used._carry = dynamics.evaluate, dynamics.carry
+
+
+@pytest.mark.parametrize("name", ["puma560", "k1607", "puma560_crossing"])
+def test_an_arm_moves_bit_for_bit_as_in_python(name: str) -> None:
+    made = cell(name)
+    one, other = (SimulatedArm(made, config(name)[1], CLOCK_NS) for _ in range(2))
+    in_python(other)
+    assert driven(one, made, 300).raw == driven(other, made, 300).raw
+    assert one.touches == other.touches
+
+
+@pytest.mark.parametrize("name", ["puma560", "k1607"])
+def test_the_equation_of_motion_is_the_same_as_in_python(name: str) -> None:
+    made = cell(name)
+    one, other = Dynamics(made), Dynamics(made)
+    other._evaluate, other._carry = dynamics.evaluate, dynamics.carry
+    for q, qd in RNG.uniform(-1.0, 1.0, (20, 2, len(made.qpos))):
+        for payload in (None, Payload(1.5, OFFSET)):
+            for mine, theirs in zip(one.terms(q, qd, payload), other.terms(q, qd, payload), strict=True):
+                assert np.array_equal(mine, theirs)
+
+
+def test_solutions_and_coarse_samples_are_the_same_as_in_python() -> None:
+    square = RNG.normal(size=(6, 6))
+    inertia, load = square.T @ square + np.eye(6), RNG.normal(size=6)
+    solution = cholesky_solve.load()(inertia, load)
+    assert np.array_equal(solution, cholesky_solve(inertia, load))
+    assert solution == pytest.approx(np.linalg.solve(inertia, load))
+    sensors = np.full((2, 6), 1e-3), np.array([[1e-4] * 6, [0.0] * 6])
+    for tick in range(50):
+        one, other = np.ones((2, 6)), np.ones((2, 6))
+        drives.sense_coarsely.load()(one, tick, 7, *sensors)
+        drives.sense_coarsely(other, tick, 7, *sensors)
+        assert np.array_equal(one, other)
+
+
+def test_noise_is_normal_and_independent_of_joint_quantity_and_tick() -> None:
+    noise = np.array([samples(tick) for tick in range(4000)]).reshape(4000, 12)
+    assert np.abs(noise.mean(axis=0)).max() < 0.1
+    assert noise.std(axis=0) == pytest.approx(np.ones(12), abs=0.06)
+    assert np.mean(np.abs(noise) > 2.0) == pytest.approx(0.0455, abs=0.005)
+    together = np.hstack((noise[1:], noise[:-1]))
+    for seen in (together, together**2):
+        assert np.abs(np.corrcoef(seen.T) - np.eye(24)).max() < 0.1
+
+
+def samples(tick: int) -> Array:
+    """Return the noise of a tick in standard deviations, (2, joints)."""
+    encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
+    return drives.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick) / [[1e-3], [1e-2]]
+
+
+def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> None:
+    arm_package.preload()
+    four = four_bar(tmp_path)
+    for made, scene in ((cell("puma560"), config("puma560")[1]), (build_cell(*four, CLOCK_NS), four[1])):
+        arm = SimulatedArm(made, scene, CLOCK_NS)
+        arm.dynamics.terms(made.home, np.zeros(6), Payload(1.0, OFFSET))
+        driven(arm, made, 3)
+        arm.drive(made.bounds.torque, 0.0)
+        arm.brake()
+        arm.step(2)
+    samples(1)
+    functions: list[compiled[..., Any]] = [
+        *(dynamics.evaluate, dynamics.carry, substeps.advance, drives.give, drives.is_clear, drives.sense_coarsely)
+    ]
+    machines: list[Callable[..., Any]] = [function.load() for function in functions]
+    assert [len(machine.signatures) for machine in machines] == [1] * len(machines)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["puma560", "k1607"])
+def test_what_is_clear_of_all_limits_would_also_pass_a_careful_look(name: str) -> None:
+    made = cell(name)
+    bounds, period_s = made.bounds, CLOCK_NS * 1e-9
+    quick, careful = (drives.LimitGate(bounds, made.limits.acceleration, period_s, Dynamics(made)) for _ in range(2))
+    careful._is_clear = lambda *_: False
+    low, high = np.maximum(bounds.position[:, 0], -3.0), np.minimum(bounds.position[:, 1], 3.0)
+    clear = 0
+    for _ in range(2000):
+        q = made.home + RNG.choice([0.05, 1.0]) * (RNG.uniform(low, high) - made.home)
+        qd, torque = RNG.choice([0.2, 1.0]) * RNG.uniform(-1.0, 1.0, (2, len(q))) * (bounds.velocity, bounds.torque)
+        mine, theirs = quick.admit(torque, q, qd), careful.admit(torque, q, qd)
+        clear += mine[0] is torque
+        assert mine[1] == theirs[1]
+        assert np.array_equal(mine[0], theirs[0])
+    assert 100 < clear < 1900
