@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.memory import lock_memory
-from rack.backplane.process import die_with_parent, pin, set_priority
+from rack.backplane.process import cores_kept_awake, die_with_parent, pin, set_priority
 from rack.tools.benches.cyclictest import WakeGrid
 from rack.tools.console.answer import Failure
 
