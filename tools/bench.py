@@ -51,11 +51,7 @@ def interruptible(context: typer.Context) -> None:
 
 
 @bench.command()
-def mailbox(
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 60,
-    plot: Plot = None,
-    as_json: Json = False,
-) -> None:
+def mailbox(rounds: Rounds = 60, plot: Plot = None, as_json: Json = False) -> None:
     """Measure a message, written and read, next to other ways of inter-process communication.
 
     Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes and queues of
@@ -209,11 +205,11 @@ def clock(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how late a board starts: from its grid point to the start of its cycle.
+    """Measure how late a board starts its cycle.
 
-    An empty board waits in each of the ways that a config permits. On the same core, at the same rate and priority,
-    `cyclictest`, a bare loop of clock_nanosleep in Python and a thread of LinuxCNC are measured by turns; ratios are to
-    `cyclictest`.
+    Lateness is the time from grid point to start. An empty board waits in each of the ways that a config permits. By
+    turns with it, on the same core at the same rate and priority: `cyclictest`, a bare loop of clock_nanosleep in
+    Python, and a thread of LinuxCNC. Ratios are to `cyclictest`.
     """
     from rack.tools.benches.clock import RATES_HZ, measure
     from rack.tools.console.progress import progress_for
