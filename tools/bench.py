@@ -52,7 +52,7 @@ def interruptible(context: typer.Context) -> None:
 
 @bench.command()
 def mailbox(
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 60,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 200,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
