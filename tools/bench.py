@@ -31,7 +31,7 @@ Share = Annotated[
 Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
 
 
-class Shown(Protocol):
+class BenchResult(Protocol):
     """What a bench has found, as far as it is shown."""
 
     def document(self) -> dict[str, Any]:
@@ -275,7 +275,7 @@ def boards(
     raise typer.Exit(0 if found.exact else 1)
 
 
-def _show(found: Shown, plot: Path | None, as_json: bool) -> None:
+def _show(found: BenchResult, plot: Path | None, as_json: bool) -> None:
     """Print what a bench has found and, if asked for, plot it."""
     from rack.tools.console.tables import terminal_width
 
