@@ -51,7 +51,11 @@ def interruptible(context: typer.Context) -> None:
 
 
 @bench.command()
-def mailbox(rounds: Rounds = 60, plot: Plot = None, as_json: Json = False) -> None:
+def mailbox(
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 200,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
     """Measure a message, written and read, next to other ways of inter-process communication.
 
     Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes and queues of

@@ -24,7 +24,7 @@ from rack.tools.benches.apart import apart
 from rack.tools.benches.checkout import THIS, RackCommand, checkout, this_rack
 from rack.tools.benches.comparison import Comparison, Sample, shown, turns
 from rack.tools.benches.empty import write_empty_rack
-from rack.tools.benches.physics import SERVO, Pace, replay
+from rack.tools.benches.physics import SERVO, ReplayPace, replay
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import decimal, table
@@ -199,7 +199,7 @@ class CycleRuns:
         self._runs = 0
         config = load("nasrem")
         servo = wire(config).task(SERVO)
-        self._pace = Pace(config.clock_ns * servo.every, servo.core, servo.priority)
+        self._pace = ReplayPace(config.clock_ns * servo.every, servo.core, servo.priority)
 
     def run(self, kind: RackKind, command: RackCommand) -> None:
         """Run one rack and take its traces; of this tree's arm in lockstep, replay the physics at once."""
@@ -218,7 +218,7 @@ class CycleRuns:
             first = next(iter(traces.values()))
             self.found.shares_us[command.name].append(np.diff(first.rows["start_ns"]) * 1e-3 / len(traces))
         if kind.lockstep and kind.config != EMPTY and command.name == THIS:
-            for who, pace in ((ROW, Pace()), (PACED, self._pace)):
+            for who, pace in ((ROW, ReplayPace()), (PACED, self._pace)):
                 times_us = apart(replay, folder / "run", pace, REPLAYED_TICKS)
                 self.found.physics_us[who].append(np.array(times_us))
 

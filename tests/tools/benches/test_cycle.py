@@ -15,7 +15,7 @@ from rack.boards.config import load
 from rack.tools.benches.apart import apart
 from rack.tools.benches.cycle import PACED, PARTS, ROW, Found, Trace, costs, measure, parts_of
 from rack.tools.benches.empty import BOARDS, write_empty_rack
-from rack.tools.benches.physics import Pace, Replay, replay
+from rack.tools.benches.physics import Replay, ReplayPace, replay
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.runs.recording import Recording
@@ -109,7 +109,7 @@ def test_replayed_physics_end_in_the_recorded_state(tmp_path_factory: pytest.Tem
     run = nasrem_run(tmp_path_factory)
     whole = len(Replay.of(Recording(run)).controls)
     assert whole > 1000
-    times_us = apart(replay, run, Pace(), whole)
+    times_us = apart(replay, run, ReplayPace(), whole)
     assert len(times_us) == whole
     assert min(times_us) > 0.0
 
@@ -118,4 +118,4 @@ def test_physics_of_another_run_are_refused(tmp_path_factory: pytest.TempPathFac
     own = Replay.of(Recording(nasrem_run(tmp_path_factory)))
     short = replace(own, controls=own.controls[:20])
     with pytest.raises(Failure, match="do not end in the recorded state"):
-        short.run(Pace(), 20)
+        short.run(ReplayPace(), 20)
