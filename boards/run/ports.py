@@ -106,8 +106,8 @@ class OutputPorts:
                 w,
                 getattr(self._faulty.get(port), "write", w.write),
                 self._rests_on[port],
+                w.spec.delay,
                 w.spec.every,
-                -w.spec.delay % w.spec.every,  # a message becomes visible at a multiple of the time between messages
             )
             for port, w in self.writers.items()
         ]
@@ -123,8 +123,9 @@ class OutputPorts:
         `now`: the clock's tick, if the cycle's end may have passed.
         """
         in_time = True
-        for port, writer, write, source, every, phase in self._lines:
-            if tick % every != phase:
+        for port, writer, write, source, delay, every in self._lines:
+            # A message that is not written in every cycle becomes visible at multiples of its period.
+            if (tick + delay) % every:
                 if port in self._faulty:
                     self._faulty[port].flush(tick, now)
                 continue

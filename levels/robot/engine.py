@@ -55,6 +55,7 @@ mj_jac_dot = native("mj_jacDot", 6)
 mj_get_state = native("mj_getState", 4)
 mju_mat_to_quat = native("mju_mat2Quat", 2)
 mju_mul_quat = native("mju_mulQuat", 3)
+mj_set_state = native("mj_setState", 4)
 
 
 class ContactViews(NamedTuple):
