@@ -28,7 +28,7 @@ SCENES = Output(SCENE, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
 
 
-class Circumstances(NamedTuple):
+class SteadyStatus(NamedTuple):
     """What of a status seldom changes."""
 
     command: int
@@ -83,7 +83,7 @@ class ServoExecutor(Executor):
         self._rest = np.zeros(len(cell.home))  # (joints,), always zero: velocity and acceleration at rest
         self._wanted = Motion(cell.home, self._rest, self._rest)  # motion wanted in the last cycle: rad, rad/s, rad/s2
         self._command = self._rests_on = 0  # serials of the newest command, and of the operator's that it rests on
-        self._shown: Circumstances | None = None  # in the last status
+        self._shown: SteadyStatus | None = None  # in the last status
         self._started = False  # the first cycle has begun
         self._abandoned = False  # set points were abandoned in the last cycle: the arm was braked
 
@@ -234,10 +234,10 @@ class ServoExecutor(Executor):
             arm.fault,
         )
         if shown != self._shown:
-            self._shown = Circumstances(*shown)
+            self._shown = SteadyStatus(*shown)
             self._show(status, self._shown)
 
-    def _show(self, status: Message, shown: Circumstances) -> None:
+    def _show(self, status: Message, shown: SteadyStatus) -> None:
         """Fill in what seldom changes."""
         status.echo, status.holding, status.stopped, status.braked = shown[:4]
         status.demand, status.clipped, status.touches, status.violations, status.pushed = shown[4:9]
