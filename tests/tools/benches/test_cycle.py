@@ -15,7 +15,7 @@ from rack.boards.config import load
 from rack.tools.benches.apart import apart
 from rack.tools.benches.cycle import PACED, PARTS, ROW, Found, Trace, costs, measure, parts_of
 from rack.tools.benches.empty import BOARDS, write_empty_rack
-from rack.tools.benches.physics import ReplayPace, Replay, replay
+from rack.tools.benches.physics import Replay, ReplayPace, replay
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.runs.recording import Recording
