@@ -206,20 +206,22 @@ def clock(
     rate: Annotated[list[int] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 2.0,
     rounds: Rounds = 3,
+    share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how late a board starts: from its grid point to the start of its cycle.
+    """Measure how late a board starts its cycle.
 
-    An empty board waits in each of the ways that a config permits. On the same core, at the same rate and priority,
-    `cyclictest`, a bare loop of clock_nanosleep in Python and a thread of LinuxCNC are measured by turns; ratios are to
-    `cyclictest`.
+    Lateness is the time from grid point to start. An empty board waits in each of the ways that a config permits. By
+    turns with it, on the same core at the same rate and priority: `cyclictest`, a bare loop of clock_nanosleep in
+    Python, and a thread of LinuxCNC. Ratios are to `cyclictest`.
     """
     from rack.tools.benches.clock import RATES_HZ, measure
+    from rack.tools.benches.observed import Runs
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
-        found = measure(tuple(rate or RATES_HZ), seconds, rounds, progress)
+        found = measure(tuple(rate or RATES_HZ), Runs(seconds, rounds, share), progress)
     _show(found, plot, as_json)
 
 
@@ -229,6 +231,7 @@ def rate(
     rate: Annotated[list[float] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one run")] = 15.0,
     rounds: Rounds = 2,
+    share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
@@ -238,11 +241,12 @@ def rate(
     at most 0.1 % of its cycles are missed beyond those that `cyclictest` is late by a cycle, at that rate on that core
     in the same minutes.
     """
+    from rack.tools.benches.observed import Runs
     from rack.tools.benches.rate import RATES_HZ, measure
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
-        found = measure(config, rate or RATES_HZ, seconds, rounds, progress)
+        found = measure(config, rate or RATES_HZ, Runs(seconds, rounds, share), progress)
     _show(found, plot, as_json)
 
 
@@ -253,6 +257,7 @@ def boards(
     ] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="simulated time of one run")] = 3.0,
     rounds: Rounds = 3,
+    share: Share = False,
     against: Against = None,
     plot: Plot = None,
     as_json: Json = False,
@@ -265,12 +270,13 @@ def boards(
     """
     from rack.tools.benches.boards import COUNTS, measure
     from rack.tools.benches.chain import LONGEST
+    from rack.tools.benches.observed import Runs
     from rack.tools.console.progress import progress_for
 
     if max(count or COUNTS) > LONGEST:
         raise Failure(f"--count {max(count or COUNTS)}: a crate takes up to {LONGEST} boards and the clock", 2)
     with progress_for(as_json) as progress:
-        found = measure(sorted(set(count or COUNTS)), seconds, rounds, against, progress)
+        found = measure(sorted(set(count or COUNTS)), Runs(seconds, rounds, share), against, progress)
     _show(found, plot, as_json)
     raise typer.Exit(0 if found.exact else 1)
 
