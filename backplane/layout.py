@@ -39,8 +39,8 @@ class FieldSpec:
 class MailboxSpec:
     """One mailbox: its writer and readers, its message, its protocol.
 
-    `every` is the time from message to message and `delay` the time from release to visibility, both in ticks;
-    `depth` is the number of slots, a power of two.
+    `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
+    become visible at multiples of `every`. `depth` is the number of slots, a power of two.
     """
 
     name: str

@@ -20,18 +20,17 @@ from rack.backplane.layout import Layout
 from rack.backplane.segment import PREFIX, SHM_FOLDER
 
 _libc = ctypes.CDLL(None)
-_sem_open, _sem_clockwait, _sem_trywait = _libc.sem_open, _libc.sem_clockwait, _libc.sem_trywait
+_sem_open, _sem_clockwait = _libc.sem_open, _libc.sem_clockwait
 _sem_open.argtypes, _sem_open.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
 _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
-_sem_trywait.argtypes = (ctypes.c_void_p,)
 
 
 class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no types
     """An open semaphore whose waits do not depend on the wall clock.
 
     `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. A signal may end it
-    early. `take()` does not wait, and returns 0 when it has obtained the semaphore. Both are the C library's own, for
-    the fastest wake-up.
+    early. It is the C library's own; calling it through ctypes takes some microseconds of processor time, so waits that
+    need no exact bound have `await_post`.
     """
 
     def __init__(self, name: str) -> None:
@@ -42,15 +41,29 @@ class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no 
         # A struct timespec, read by the C library in place.
         self._deadline = (ctypes.c_int64 * 2)()
         self.wait = partial(_sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline))
-        self.take = partial(_sem_trywait, address)
 
     def bind(self, deadline_ns: int) -> None:
         """Let waits end at that time, CLOCK_MONOTONIC."""
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
 
+    def take(self) -> bool:
+        """Obtain the semaphore if that needs no wait; else return False."""
+        return self.await_post(0)
+
+    def await_post(self, timeout_s: float) -> bool:
+        """Wait at most `timeout_s` by the wall clock; False after that.
+
+        Only for waits whose bound hardly matters: if the wall clock is set back, they take longer.
+        """
+        try:
+            super().acquire(timeout_s)
+        except posix_ipc.BusyError:
+            return False
+        return True
+
     def acquire(self, timeout_s: float) -> bool:
         """Wait at most `timeout_s`; False after that."""
-        if not self.take():
+        if self.take():
             return True
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         self.bind(deadline_ns)

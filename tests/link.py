@@ -140,7 +140,7 @@ MakeLink = Callable[..., Link]
 
 @contextmanager
 def links(rack: str) -> Iterator[MakeLink]:
-    """Make the links of a test: protocol, periods of writer and reader, who comes first, slots; then remove them."""
+    """Make the links of a test, then remove them; a link's writer writes in every n-th of its cycles."""
     made: list[Link] = []
 
     def make(
@@ -148,8 +148,9 @@ def links(rack: str) -> Iterator[MakeLink]:
         rates: tuple[int, int] = (1, 1),
         reader_first: bool = False,
         depth: int = 1024,
+        cycles: int = 1,
     ) -> Link:
-        box = mailbox(protocol, every=rates[0], delay=rates[0], depth=depth)
+        box = mailbox(protocol, every=cycles * rates[0], delay=rates[0], depth=depth)
         tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
         segment = Segment.create(layout(f"{rack}-{len(made)}", [box], tasks), "")
         semaphores.create(segment.layout)

@@ -32,7 +32,7 @@ Share = Annotated[
 Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
 
 
-class Shown(Protocol):
+class BenchResult(Protocol):
     """What a bench has found, as far as it is shown."""
 
     def document(self) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def interruptible(context: typer.Context) -> None:
 
 @bench.command()
 def mailbox(
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 60,
+    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 200,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
@@ -207,20 +207,22 @@ def clock(
     rate: Annotated[list[int] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 2.0,
     rounds: Rounds = 3,
+    share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how late a board starts: from its grid point to the start of its cycle.
+    """Measure how late a board starts its cycle.
 
-    An empty board waits in each of the ways that a config permits. On the same core, at the same rate and priority,
-    `cyclictest`, a bare loop of clock_nanosleep in Python and a thread of LinuxCNC are measured by turns; ratios are to
-    `cyclictest`.
+    Lateness is the time from grid point to start. An empty board waits in each of the ways that a config permits. By
+    turns with it, on the same core at the same rate and priority: `cyclictest`, a bare loop of clock_nanosleep in
+    Python, and a thread of LinuxCNC. Ratios are to `cyclictest`.
     """
     from rack.tools.benches.clock import RATES_HZ, measure
+    from rack.tools.benches.observed import Runs
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
-        found = measure(tuple(rate or RATES_HZ), seconds, rounds, progress)
+        found = measure(tuple(rate or RATES_HZ), Runs(seconds, rounds, share), progress)
     _show(found, plot, as_json)
 
 
@@ -230,6 +232,7 @@ def rate(
     rate: Annotated[list[float] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one run")] = 15.0,
     rounds: Rounds = 2,
+    share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
@@ -239,11 +242,12 @@ def rate(
     at most 0.1 % of its cycles are missed beyond those that `cyclictest` is late by a cycle, at that rate on that core
     in the same minutes.
     """
+    from rack.tools.benches.observed import Runs
     from rack.tools.benches.rate import RATES_HZ, measure
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
-        found = measure(config, rate or RATES_HZ, seconds, rounds, progress)
+        found = measure(config, rate or RATES_HZ, Runs(seconds, rounds, share), progress)
     _show(found, plot, as_json)
 
 
@@ -254,6 +258,7 @@ def boards(
     ] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="simulated time of one run")] = 3.0,
     rounds: Rounds = 3,
+    share: Share = False,
     against: Against = None,
     plot: Plot = None,
     as_json: Json = False,
@@ -266,12 +271,13 @@ def boards(
     """
     from rack.tools.benches.boards import COUNTS, measure
     from rack.tools.benches.chain import LONGEST
+    from rack.tools.benches.observed import Runs
     from rack.tools.console.progress import progress_for
 
     if max(count or COUNTS) > LONGEST:
         raise Failure(f"--count {max(count or COUNTS)}: a crate takes up to {LONGEST} boards and the clock", 2)
     with progress_for(as_json) as progress:
-        found = measure(sorted(set(count or COUNTS)), seconds, rounds, against, progress)
+        found = measure(sorted(set(count or COUNTS)), Runs(seconds, rounds, share), against, progress)
     _show(found, plot, as_json)
     raise typer.Exit(0 if found.exact else 1)
 
@@ -282,6 +288,7 @@ def launch(
     rounds: Rounds = 10,
     kills: Annotated[int, typer.Option(metavar="N", min=1, help="kills of each board")] = 10,
     against: Against = None,
+    share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
@@ -292,15 +299,15 @@ def launch(
     that the run has made. Then boards of a running rack are killed: the output shows the time to detection, and the
     time until the brakes of the arm are engaged.
     """
-    from rack.tools.benches.launch import measure
+    from rack.tools.benches.launch import LaunchCounts, measure
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
-        found = measure(config, rounds, kills, against, progress)
+        found = measure(config, LaunchCounts(rounds, kills), against, share, progress)
     _show(found, plot, as_json)
 
 
-def _show(found: Shown, plot: Path | None, as_json: bool) -> None:
+def _show(found: BenchResult, plot: Path | None, as_json: bool) -> None:
     """Print what a bench has found and, if asked for, plot it."""
     from rack.tools.console.tables import terminal_width
 

@@ -196,7 +196,8 @@ class RealtimeDriver(ClockDriver):
             for task in due:
                 if not task.sleeps:
                     task.release(tick)
-                    task.wake()
+                    if task.is_posted:
+                        task.wake()
         self.check(due, tick)
 
     def _time_of(self, tick: int) -> int:

@@ -60,7 +60,8 @@ class LockstepDriver(ClockDriver):
         due = self.due(tick, last)
         for task in due:
             task.release(tick)
-            task.wake()
+            if task.is_posted:
+                task.wake()
             if self._one_at_a_time and not self._wait(task, task.is_settled):
                 return False
         self.check(due, tick)
@@ -72,9 +73,10 @@ class LockstepDriver(ClockDriver):
         for task in order:
             if task.deadline > tick:
                 continue
-            # Its report is taken even if its words already show it: else the semaphore would overflow.
-            task.done.take()
-            if not task.is_finished(tick):
+            if task.is_finished(tick):
+                # Its report is taken even so: else the semaphore would overflow.
+                task.done.take()
+            else:
                 slowest = task
                 if not self._wait(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
                     return False
@@ -94,13 +96,20 @@ class LockstepDriver(ClockDriver):
 
     def _wait(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
         """Wait until `condition` holds, which the task's reports make true; False when the launcher is gone."""
+        wait = task.done.wait
         while not condition():
-            if task.done.acquire(CHECK_S):
-                continue
-            if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
+            # Its bound is set now and then: a wait that ends too early looks around once too often.
+            if wait() and not self._look_around(task):
                 return False
-            # A signal may have stopped the task: time must not wait for it.
-            task.check_stopped()
+        return True
+
+    def _look_around(self, task: ReleasedTask) -> bool:
+        """Check, after a wait without a report, what time must not wait for; False when the launcher is gone."""
+        if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
+            return False
+        # By a signal.
+        task.check_stopped()
+        task.done.bind(time.monotonic_ns() + int(CHECK_S * 1e9))
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:

@@ -7,6 +7,8 @@ processor time that it will not end. A task that gets no processor time is starv
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.process import STOPPED, WAITING, processor_ns, state_of
 from rack.backplane.segment import Segment
@@ -27,11 +29,11 @@ LEAST_NS = 1_000_000_000
 class ReleasedTask:
     """The clock's end of a task's control block.
 
-    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `missed` counts
+    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `is_posted`: it
+    waits for its semaphore, which `wake()` posts. `done`: the semaphore that it posts in lockstep. `missed` counts
     releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
-    finishes none. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
-    `done`: posted by the task, in lockstep. `deadline`: tick before which its release, or plan, must be finished, as
-    last seen; it only moves later.
+    finishes none. `deadline`: tick before which its release, or plan, must be finished, as last seen; it only moves
+    later. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -39,17 +41,19 @@ class ReleasedTask:
         self.index = segment.layout.tasks.index(spec)
         self.block = segment.block(spec.name)
         self.sleeps = spec.wake == "timer"
+        self.is_posted = spec.wake != "poll"
         self.missed = 0
         self.is_stopped = False
         self.deadline = self.block[_DEADLINE]
         self._every = spec.every
         self._done = self.block[_DONE]
-        self._semaphore = wake_semaphore(segment.rack, spec.name)
+        self.wake: Callable[[], None] = wake_semaphore(segment.rack, spec.name).release
         self.done = done_semaphore(segment.rack, spec.name)
 
     def is_free(self, release: int) -> bool:
         """Say whether the task can take a release; it can not while it works on a plan, or is lost."""
-        return self.block[_DEADLINE] <= release and not self.block[_LOST]
+        block = self.block
+        return block[_DEADLINE] <= release and not block[_LOST]
 
     def release(self, tick: int) -> None:
         """Give the task its newest release."""
@@ -74,7 +78,8 @@ class ReleasedTask:
 
     def is_settled(self) -> bool:
         """Say whether it has finished, or will not: there is nothing to wait for."""
-        return self.is_idle() or bool(self.block[_LOST]) or self.is_stopped
+        block = self.block
+        return block[_DONE] == block[_RELEASED] or bool(block[_LOST]) or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
         """Say whether `tick` may begin without waiting for the task."""
@@ -84,10 +89,6 @@ class ReleasedTask:
     def check_stopped(self) -> None:
         """Check whether a signal has stopped its process."""
         self.is_stopped = state_of(self.block[Block.PID]) in STOPPED
-
-    def wake(self) -> None:
-        """Post the task's semaphore."""
-        self._semaphore.release()
 
     @property
     def lost_tick(self) -> int:

@@ -104,7 +104,8 @@ class SilenceWatch:
         finished, slots = self._cycles.finished, self._slots
         head = slots.box[0]
         # A serial without a message was lost on the way, not suppressed.
-        due = finished - finished % self._reader.spec.every
+        spec = self._reader.spec
+        due = finished - (finished + spec.delay) % spec.every
         return slots.copy(head) and slots.serial == head and slots.tick < due
 
     def _report(self, code: Alarm, tick: int, age: int) -> None:

@@ -150,28 +150,24 @@ def _step(entry: FaultEntry) -> ClockStep:
 class FaultStage:
     """Begins and ends faults at ticks, before any task of the tick is released.
 
-    In real time a fault with a phase strikes within its tick, after the releases.
+    In real time a fault with a phase strikes within its tick, after the releases. There is nothing to do in a tick if
+    no fault is `open` (waiting or active) and none but the first `injected` ones have come.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
         self._segment, self._words = segment, segment.words
         self._rack, self._table, self._alarms = StruckRack(segment, driver), FaultTable(segment), driver.alarms
         self._observers: dict[int, Reader] = {}
-        self._injected = 0
-        self._open: list[FaultEntry] = []
+        self.injected = 0
+        self.open: list[FaultEntry] = []
         self._phased: list[FaultEntry] = []
-
-    @property
-    def is_quiet(self) -> bool:
-        """Whether no fault waits or is active: nothing to do in this tick."""
-        return not self._open and self._words[System.INJECTED] == self._injected
 
     def advance(self, tick: int) -> None:
         """Begin the faults due at `tick`, and end those that are over."""
-        self._injected = self._words[System.INJECTED]
-        self._open = self._table.staged(OPEN)
-        over = [entry for entry in self._open if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)]
-        due = [entry for entry in self._open if entry.stage == Stage.WAITING and self._is_due(entry, tick)]
+        self.injected = self._words[System.INJECTED]
+        self.open = self._table.staged(OPEN)
+        over = [entry for entry in self.open if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)]
+        due = [entry for entry in self.open if entry.stage == Stage.WAITING and self._is_due(entry, tick)]
         if over or due:
             # A running cycle finishes with the faults with which it began.
             self._rack.driver.settle()
@@ -179,7 +175,7 @@ class FaultStage:
             self._finish(entry, tick)
         for entry in due:
             self._begin(entry, tick)
-        for entry in self._open:
+        for entry in self.open:
             if entry.stage == Stage.ACTIVE:
                 _step(entry).during(self._rack, entry, tick)
 

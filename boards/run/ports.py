@@ -101,7 +101,14 @@ class OutputPorts:
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [
-            (port, w, getattr(self._faulty.get(port), "write", w.write), self._rests_on[port], w.spec.every)
+            (
+                port,
+                w,
+                getattr(self._faulty.get(port), "write", w.write),
+                self._rests_on[port],
+                w.spec.delay,
+                w.spec.every,
+            )
             for port, w in self.writers.items()
         ]
 
@@ -116,8 +123,9 @@ class OutputPorts:
         `now`: the clock's tick, if the cycle's end may have passed.
         """
         in_time = True
-        for port, writer, write, source, every in self._lines:
-            if tick % every:
+        for port, writer, write, source, delay, every in self._lines:
+            # A message that is not written in every cycle becomes visible at multiples of its period.
+            if (tick + delay) % every:
                 if port in self._faulty:
                     self._faulty[port].flush(tick, now)
                 continue

@@ -26,8 +26,8 @@ from rack.boards.wiring import ClockWiring
 HEAD_START_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that its start-up does not delay a tick."""
 # Plain integers for the hot path.
-_LOSSES, _EMERGENCY, _REQUESTED, _COMMANDED = (
-    int(word) for word in (System.LOSSES, System.EMERGENCY_STOP, System.REQUESTED, System.COMMANDED)
+_LOSSES, _EMERGENCY, _REQUESTED, _INJECTED = (
+    int(word) for word in (System.LOSSES, System.EMERGENCY_STOP, System.REQUESTED, System.INJECTED)
 )
 
 
@@ -43,11 +43,11 @@ class SystemController:
 
     def begin(self, tick: int) -> None:
         """Do the work due before the tasks of `tick` are released."""
-        if not self._faults.is_quiet:
-            self._faults.advance(tick)
-        if not self._desk.is_quiet:
-            self._desk.advance(tick)
-        words = self._words
+        words, faults, desk = self._words, self._faults, self._desk
+        if faults.open or words[_INJECTED] != faults.injected:
+            faults.advance(tick)
+        if desk.waiting or words[_REQUESTED] != desk.requested:
+            desk.advance(tick)
         if self._settled != (words[_LOSSES], self._driver.watchdog.losses, words[_EMERGENCY]):
             self._handle_losses(tick)
 
@@ -96,28 +96,26 @@ class SystemController:
 
 
 class OperatorDesk:
-    """Issues operator commands at the start of a tick, each into its level's mailbox, before any task is released."""
+    """Issues operator commands at the start of a tick, each into its level's mailbox, before any task is released.
+
+    There is nothing to do in a tick if no command is `waiting` and none but the first `requested` ones have come.
+    """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
         self._words, self._alarms = segment.words, alarms
         self._table, self._clock = OperatorTable(segment), SystemClock(segment)
         boxes = segment.layout.mailboxes
         self._writers = {at: open_writer(segment, box.name) for at, box in enumerate(boxes) if box.writer == CLOCK}
-        self._requested = -1
-        self._waiting: list[RequestEntry] = []
-
-    @property
-    def is_quiet(self) -> bool:
-        """Whether no command waits: nothing to do in this tick."""
-        return not self._waiting and self._words[_REQUESTED] == self._requested
+        self.requested = -1
+        self.waiting: list[RequestEntry] = []
 
     def advance(self, tick: int) -> None:
         """Issue all commands due at `tick`."""
-        if self._words[_REQUESTED] != self._requested:
-            self._requested = self._words[_REQUESTED]
-            self._waiting = self._table.waiting()
-        for entry in [entry for entry in self._waiting if entry[RequestWord.TICK] <= tick]:
-            self._waiting.remove(entry)
+        if self._words[_REQUESTED] != self.requested:
+            self.requested = self._words[_REQUESTED]
+            self.waiting = self._table.waiting()
+        for entry in [entry for entry in self.waiting if entry[RequestWord.TICK] <= tick]:
+            self.waiting.remove(entry)
             # Mark first, then check that it still waits; a client that withdraws it uses the opposite order.
             entry.words[RequestWord.GIVEN_TICK] = tick
             if self._table.is_waiting(entry):
@@ -129,8 +127,8 @@ class OperatorDesk:
         words, writer = entry.words, self._writers[entry[RequestWord.MAILBOX]]
         if not words[RequestWord.SERIAL]:
             # If the clock dies after this line, its successor issues the command again, under the same serial.
-            self._words[_COMMANDED] += 1
-            words[RequestWord.SERIAL] = self._words[_COMMANDED]
+            self._words[System.COMMANDED] += 1
+            words[RequestWord.SERIAL] = self._words[System.COMMANDED]
         message = writer.message
         message.raw[:] = entry.message[: len(message.raw)]
         message.id = words[RequestWord.SERIAL]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,7 +14,7 @@ from rack.levels.algebra import Array, norm
 from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, Motors, give
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
-from rack.levels.arm.substeps import advance, substeps
+from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -21,6 +22,14 @@ from rack.levels.tables import MotionConfig, SceneConfig
 
 STRUCK_TICKS = 40
 """Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the blow."""
+
+
+class Cells(NamedTuple):
+    """Views of MuJoCo's state that give single numbers in a third of the time of an array's."""
+
+    qpos: memoryview[float]
+    qvel: memoryview[float]
+    ctrl: memoryview[float]
 
 
 class SimulatedArm(Arm):
@@ -35,8 +44,13 @@ class SimulatedArm(Arm):
         super().__init__(cell, scene, clock_ns, every, seed)
         d, joints = self._data, len(cell.qpos)
         self._model, self._clock_ns = cell.model, clock_ns
-        self._qpos, self._qvel, self._ctrl, self._applied = d.qpos, d.qvel, d.ctrl, d.qfrc_applied
         self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
+        self._state = self._steps.seen[-1, 0], self._steps.seen[-1, 1]  # (joints,): true positions and velocities
+        self._refresh()
+        self._cells = Cells(memoryview(d.qpos), memoryview(d.qvel), memoryview(d.ctrl))
+        self._grip = cell.gripper_actuator
+        gripped = cell.gripper_qpos, cell.gripper_dof
+        self._gripper = None if gripped[0] is None or gripped[1] is None else (gripped[0], gripped[1])
         self._contacts, self._limits = ContactMonitor(cell), LimitMonitor(cell, self._steps)
         dynamics = Dynamics(cell)
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
@@ -55,7 +69,7 @@ class SimulatedArm(Arm):
             self._steps.joints, cell.actuators, d.qpos, d.qvel, d.ctrl, d.qfrc_applied, self._command, self.torque
         )
         self._clear = *self.dynamics.newest, *self._gate.clearance, *motors
-        self._give_clear, self._advance = give.load(), advance.load()
+        self._give_clear, self._advance, self._copy_state = give.load(), advance.load(), copy_state.load()
         # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda _: None)
 
@@ -75,24 +89,24 @@ class SimulatedArm(Arm):
 
     def sense(self) -> Sensed:
         """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
-        cell = self.cell
-        position, velocity = self._state()
+        position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
-        if cell.gripper_qpos is None:
+        if self._gripper is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
-        opening, speed = self._qpos[cell.gripper_qpos], self._qvel[cell.gripper_dof]
-        return Sensed(position, velocity, float(opening), float(speed), self.tick)
+        at, dof = self._gripper
+        return Sensed(position, velocity, self._cells.qpos[at], self._cells.qvel[dof], self.tick)
 
-    def _state(self) -> tuple[Array, Array]:
-        """Return true joint positions and velocities, rad, rad/s."""
-        return self._qpos[self.cell.qpos], self._qvel[self.cell.dof]
+    def _refresh(self) -> None:
+        """Take positions and velocities of the joints from MuJoCo's state: it was set by other than a step."""
+        position, velocity = self._state
+        position[:], velocity[:] = self._data.qpos[self.cell.qpos], self._data.qvel[self.cell.dof]
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and give torques and gripper force for the coming torque cycle; see `Link.drive`."""
         self._asked[:] = torque
-        if math.isfinite(grip_force) and self.cell.gripper_actuator is not None:
-            self._ctrl[self.cell.gripper_actuator] = self.grip_force = grip_force
+        if self._grip is not None and math.isfinite(grip_force):
+            self._cells.ctrl[self._grip] = self.grip_force = grip_force
         if self._most is None and self._give_clear(self._asked, *self._clear):
             self.waited, self.braked, self._given = 0, False, True
             return None
@@ -114,7 +128,7 @@ class SimulatedArm(Arm):
     def _engage(self) -> None:
         if not self.braked:
             self.braked = True
-            self._brake.hold_at(self._state()[0])
+            self._brake.hold_at(self._state[0])
 
     def weaken(self, most: Array | None) -> None:
         """Limit the motors to `most` (joints,), N m, from the next command on; None: they are sound."""
@@ -122,7 +136,7 @@ class SimulatedArm(Arm):
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time continues."""
-        self._contacts.struck = self.contact = None
+        self.contact = None
         for _ in range(ticks):
             if self.waited >= self.patience:
                 self._engage()
@@ -133,6 +147,7 @@ class SimulatedArm(Arm):
             if not self.fault:
                 self._simulate()
             self.tick += 1
+        if self.fault:
             self._data.time = self._now_s
 
     def look(self, scene: Message) -> None:
@@ -141,9 +156,12 @@ class SimulatedArm(Arm):
 
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE`."""
+        before = self._saved
         super().save(state)
-        mujoco.mj_getState(self._model, self._data, state.state, STATE)
-        state.struck, state.rest = self._struck, self._brake.rest
+        self._copy_state(self._steps.model, self._steps.data, state.state)
+        state.struck = self._struck
+        if self.braked or self._saved is not before:
+            state.rest = self._brake.rest
 
     def restore(self, state: Message) -> None:
         """Continue, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
@@ -155,31 +173,35 @@ class SimulatedArm(Arm):
         np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
-        self.grip_force = float(d.ctrl[cell.gripper_actuator]) if cell.gripper_actuator is not None else 0.0
+        self.grip_force = 0.0 if self._grip is None else self._cells.ctrl[self._grip]
         self._given = True
+        self._refresh()
 
     @property
     def _now_s(self) -> float:
         return self.tick * self._clock_ns * 1e-9
 
+    @property
+    def _after_s(self) -> float:
+        return (self.tick + 1) * self._clock_ns * 1e-9
+
     def _give(self) -> None:
         """Apply the command to the motors, or the brakes' torque to the joints, through the limit gate."""
         cell, braked = self.cell, self.braked
-        q, qd = self._state()
+        q, qd = self._state
         passed, cut = self._gate.admit(self._brake.torque(q, qd) if braked else self._command, q, qd)
         self.clipped += cut
-        self._applied[cell.dof] = passed if braked else 0.0
+        self._data.qfrc_applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)
-        self._ctrl[cell.actuators] = (
-            self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
-        )
+        given = self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
+        self._data.ctrl[cell.actuators] = given
         self._given = True
 
     def _simulate(self) -> None:
         """Simulate one tick."""
         for mocap, motion in self._motions:
             self._data.mocap_pos[mocap] = motion.position(self._now_s)
-        made = self._advance(0, *self._steps)
+        made = self._advance(0, self._after_s, *self._steps)
         if made < 0:
             self._look_closer(-made)
         elif self._struck:
@@ -187,10 +209,10 @@ class SimulatedArm(Arm):
 
     def _look_closer(self, made: int) -> None:
         """Finish a tick of which step `made` is not as it should be; on a fault, restore the state before the tick."""
-        touches = self._contacts.count
+        touches, self._contacts.struck = self._contacts.count, self.contact
         self._contacts.look(self._data)
         while made < len(self._steps.seen):
-            made = self._advance(made, *self._steps)
+            made = self._advance(made, self._after_s, *self._steps)
             if made < 0:
                 made = -made
                 self._contacts.look(self._data)
@@ -202,6 +224,8 @@ class SimulatedArm(Arm):
         self.fault = self._broken()
         if self.fault:
             mujoco.mj_setState(self._model, self._data, self._steps.before, STATE)
+            self._refresh()
+        self._data.time = self._after_s
         contacts, limits = self._contacts, self._limits
         self.contact, self.touches, self.first_touch = contacts.struck, contacts.count, contacts.first
         self.violations, self.pushed, self.first_violation = limits.count, limits.pushed, limits.first

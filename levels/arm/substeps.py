@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 from rack.levels.robot.cell import STATE, Cell
-from rack.levels.robot.engine import contact_views, mj_get_state, mj_step
+from rack.levels.robot.engine import contact_views, mj_get_state, mj_set_state, mj_step
+
+TIME = int(mujoco.mjtState.mjSTATE_TIME)
 
 
 class Substeps(NamedTuple):
-    """Arguments of `advance`, prepared once: a cycle has no time for it."""
+    """Further arguments of `advance`, prepared once."""
 
     model: int  # address
     data: int  # address
@@ -59,6 +61,7 @@ def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
 @compiled
 def advance(  # flat arguments: a field of a named record takes 0.1 us
     begin: int,
+    end_s: float,
     model: int,
     data: int,
     before: Array,
@@ -75,7 +78,7 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     distance: Array,
     touch: NDArray[np.bool_],
 ) -> int:
-    """Make the steps of a tick from number `begin` on, up to one that needs a closer look; see `Substeps`.
+    """Make the steps of a tick from number `begin` on, up to one that needs a closer look; the tick ends at `end_s`.
 
     Returns the number of the step to continue with; negative if the last one made broke a limit, or has an unintended
     contact, a warning, or a state that is not finite.
@@ -99,14 +102,23 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
         sound &= bool(np.isfinite(qpos).all()) and bool(np.isfinite(qvel).all())
         if not sound:
             return -(step + 1)
+    time_s = np.full(1, end_s)  # exactly: what steps add up to differs in the last bit
+    mj_set_state(model, data, time_s.ctypes.data, TIME)
     return len(seen)
+
+
+@compiled
+def copy_state(model: int, data: int, state: Array) -> None:
+    """Fill `state` with MuJoCo's integration state."""
+    mj_get_state(model, data, state.ctypes.data, STATE)
 
 
 def preload() -> None:
     """Load this module's compiled functions."""
-    nothing, mask = np.zeros(0), np.zeros((0, 0), dtype=bool)
-    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
-    room = contact_views(data.model, data)
-    joints, table, warnings = np.zeros((2, 0), dtype=int), np.zeros((0, 3, 0)), data.warning.number
-    arrays = nothing, nothing, nothing, nothing, joints, table, table
-    advance.load()(1, 0, 0, nothing, warnings, *arrays, *room, mask)
+    model, none, table = mujoco.MjModel.from_xml_string("<mujoco/>"), np.zeros(0), np.zeros((0, 3, 0))
+    data = mujoco.MjData(model)
+    joints, touch = np.zeros((2, 0), dtype=int), np.zeros((0, 0), dtype=bool)
+    state: list[Any] = [none, data.warning.number, none, none, none, none, joints, table, table]
+    state += [*contact_views(model, data), touch]
+    advance.load()(1, 0.0, model._address, data._address, *state)
+    copy_state.load()(model._address, data._address, np.zeros(mujoco.mj_stateSize(model, STATE)))

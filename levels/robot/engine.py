@@ -51,6 +51,7 @@ mj_full_m = native("mj_fullM", 3)
 mj_jac = native("mj_jac", 6)
 mj_jac_dot = native("mj_jacDot", 6)
 mj_get_state = native("mj_getState", 4)
+mj_set_state = native("mj_setState", 4)
 
 
 class ContactViews(NamedTuple):

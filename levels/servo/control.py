@@ -61,8 +61,7 @@ class ComputedTorque:
         """Use `dynamics` of the cell: the arm's, which saves its limit gate another evaluation."""
         self._dynamics = dynamics
         gains = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
-        dry, limits = np.array((cell.model.dof_frictionloss[cell.dof], cell.bounds.torque))
-        self._set = partial(set_torque.load(), *gains, dry, limits)
+        self._set = partial(set_torque.load(), *gains, dynamics.dry, cell.bounds.torque.copy())
         self.holds = False  # the gripper holds a part, says the plan
         self.cut = 0  # cycles in which a torque limit cut a torque
         self._payload: Payload | None = None

@@ -59,7 +59,7 @@ class ServoExecutor(Executor):
         "before": Input(ARM_STATE, "own.state"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
+    outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENES}
     faults = STEPS
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
     params = ServoParams

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.process import is_alive, name_process, pin, start_time
-from tests.processes import FORKS, exit_status, fork, forked, kill, wait_until
+from rack.backplane.process import cores_kept_awake, is_alive, name_process, pin, start_time
+from tests.processes import FORKS, descriptors, exit_status, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 
@@ -66,3 +66,22 @@ def test_a_core_that_the_machine_lacks_is_an_error() -> None:
         assert exit_status(child) == 0
     finally:
         kill(child)
+
+
+def test_cores_are_kept_awake_by_a_request_that_is_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = tmp_path / "cpu_dma_latency"
+    device.touch()
+    monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
+    before = descriptors()
+    with cores_kept_awake():
+        assert device.read_bytes() == bytes(4)
+        assert descriptors() == before + 1
+    assert descriptors() == before
+
+
+def test_cores_sleep_as_usual_where_the_request_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
+    entered = False
+    with cores_kept_awake():
+        entered = True
+    assert entered

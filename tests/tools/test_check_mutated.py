@@ -57,7 +57,7 @@ def texts() -> dict[str, dict[str, Any]]:
         str(path.relative_to(CONFIGS)): tomllib.loads(path.read_text()) for path in sorted(CONFIGS.rglob("*.toml"))
     }
     for place, tables in found.items():
-        if "robot" in tables:
+        if "model" in tables.get("robot", {}):
             tables["robot"]["model"] = f"robots/{tables['robot']['model']}"
         if "/" in place:
             tables["extends"] = ["nasrem"]

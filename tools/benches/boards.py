@@ -25,7 +25,7 @@ from rack.tools.benches.chain_figures import RATE_HZ, Boards, ChainFigures
 from rack.tools.benches.checkout import RackCommand, checkout, this_rack
 from rack.tools.benches.comparison import turns
 from rack.tools.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
-from rack.tools.benches.observed import Observed, missed_share, observe
+from rack.tools.benches.observed import Observed, Runs, missed_share, observe
 from rack.tools.console.progress import Progress
 
 COUNTS = (1, 2, 5, 10, 15, LONGEST)
@@ -38,8 +38,8 @@ LEVELS = "relay_levels"
 """Module of the levels in another checkout."""
 
 
-def measure(counts: Sequence[int], seconds: float, rounds: int, against: Path | None, progress: Progress) -> Boards:
-    """Run chains of so many boards, each `rounds` times for `seconds`, by turns with `cyclictest` and in lockstep.
+def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: Progress) -> Boards:
+    """Run chains of so many boards, by turns with `cyclictest` and in lockstep.
 
     `against` is another checkout, which runs the same in lockstep. Raises `Failure` if it cannot.
     """
@@ -49,13 +49,13 @@ def measure(counts: Sequence[int], seconds: float, rounds: int, against: Path | 
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="rack-bench-")))
         racks = [this_rack(), *([] if against is None else [stack.enter_context(checkout(against))])]
         chains = [
-            _ChainRuns(Chain(count, RATE_HZ), seconds, peers, list(_configs(count, racks, folder))) for count in counts
+            _ChainRuns(Chain(count, RATE_HZ), runs, peers, list(_configs(count, racks, folder))) for count in counts
         ]
-        progress.total(sum(chain.round_s for chain in chains) * rounds)
+        progress.total(sum(chain.lasts_s for chain in chains))
         for chain in chains:
             progress.begin(f"boards: {chain.chain.boards}")
-            chain.measure(rounds)
-            progress.end(chain.round_s * rounds, "done", ())
+            chain.measure()
+            progress.end(chain.lasts_s, "done", ())
         return Boards(
             tuple(chain.figures() for chain in chains), tuple(rack.name for rack in racks), len(cores), absent
         )
@@ -77,10 +77,10 @@ class _ChainRuns:
     """All runs of one chain; `peers` are the cores of `cyclictest`, `configs` those for lockstep, by tree."""
 
     def __init__(
-        self, chain: Chain, seconds: float, peers: tuple[int, ...], configs: list[tuple[RackCommand, Path]]
+        self, chain: Chain, runs: Runs, peers: tuple[int, ...], configs: list[tuple[RackCommand, Path]]
     ) -> None:
-        self.chain, self._seconds = chain, seconds
-        self._grid = WakeGrid(peers, round(1e9 / RATE_HZ), max(1, round(seconds * RATE_HZ)), PRIORITY)
+        self.chain, self._settings = chain, runs
+        self._grid = WakeGrid(peers, round(1e9 / RATE_HZ), max(1, round(runs.seconds * RATE_HZ)), PRIORITY)
         self._runs: list[Observed] = []
         self._late: list[np.ndarray] = []
         self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack, _ in configs}
@@ -88,26 +88,30 @@ class _ChainRuns:
         self._contestants += [partial(self._lockstep, rack, path) for rack, path in configs]
 
     @property
-    def round_s(self) -> float:
-        """About how long one round takes."""
-        return len(self._contestants) * (self._seconds + LAUNCH_S)
+    def lasts_s(self) -> float:
+        """About how long measuring takes."""
+        return self._settings.rounds * len(self._contestants) * (self._settings.seconds + LAUNCH_S)
 
-    def measure(self, rounds: int) -> None:
+    def measure(self) -> None:
         """Run every contestant once a round."""
-        for _, contestant in turns(self._contestants, rounds):
+        for _, contestant in turns(self._contestants, self._settings.rounds):
             contestant()
 
     def _run(self) -> None:
-        self._runs.append(observe(loads(self.chain.text()), self._seconds, [self._last]))
+        self._runs.append(self._observe(self.chain))
+
+    def _observe(self, chain: Chain) -> Observed:
+        return observe(loads(chain.text()), self._settings.seconds, self._settings.share, [self._last])
 
     def _peer(self) -> None:
         self._late.append(cyclictest(self._grid))
 
     def _lockstep(self, rack: RackCommand, path: Path) -> None:
-        seconds = self._seconds * min(STRETCH, LONGEST / self.chain.boards)
-        found = json.loads(
-            rack.run("run", path, "--lockstep", "--no-record", "--json", "--seconds", seconds, bound_s=BOUND_S)
-        )
+        seconds = self._settings.seconds * min(STRETCH, LONGEST / self.chain.boards)
+        options = ["--lockstep", "--no-record", "--json", "--seconds", seconds]
+        # Older trees have no such option: they run in any case.
+        options += ["--share"] if self._settings.share and rack.package else []
+        found = json.loads(rack.run("run", path, *options, bound_s=BOUND_S))
         self._lockstep_us[rack.name].append(found["wall_s"] * 1e6 / found["outcome"]["ticks"])
 
     @property
@@ -116,7 +120,7 @@ class _ChainRuns:
 
     def figures(self) -> ChainFigures:
         """Return the figures of all runs; the response in lockstep is that of one more."""
-        lockstep = observe(loads(self.chain._replace(mode="lockstep").text()), self._seconds, [self._last])
+        lockstep = self._observe(self.chain._replace(mode="lockstep"))
         names, late = self.chain.names, np.concatenate(self._late) if self._late else None
         counts = [run.cycles(name) for run in self._runs for name in names]
         rows = [np.concatenate([run.traces[name] for run in self._runs]) for name in names]

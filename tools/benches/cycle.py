@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rack.backplane.trace import FIELDS
 from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Occupation, unit_times
 from rack.tools.benches.apart import apart
 from rack.tools.benches.checkout import THIS, RackCommand, checkout, this_rack
 from rack.tools.benches.comparison import Comparison, Sample, shown, turns
 from rack.tools.benches.empty import write_empty_rack
-from rack.tools.benches.physics import SERVO, Pace, replay
+from rack.tools.benches.physics import SERVO, ReplayPace, replay
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import decimal, table
@@ -200,7 +199,7 @@ class CycleRuns:
         self._runs = 0
         config = load("nasrem")
         servo = wire(config).task(SERVO)
-        self._pace = Pace(config.clock_ns * servo.every, servo.core, servo.priority)
+        self._pace = ReplayPace(config.clock_ns * servo.every, servo.core, servo.priority)
 
     def run(self, kind: RackKind, command: RackCommand) -> None:
         """Run one rack and take its traces; of this tree's arm in lockstep, replay the physics at once."""
@@ -219,7 +218,7 @@ class CycleRuns:
             first = next(iter(traces.values()))
             self.found.shares_us[command.name].append(np.diff(first.rows["start_ns"]) * 1e-3 / len(traces))
         if kind.lockstep and kind.config != EMPTY and command.name == THIS:
-            for who, pace in ((ROW, Pace()), (PACED, self._pace)):
+            for who, pace in ((ROW, ReplayPace()), (PACED, self._pace)):
                 times_us = apart(replay, folder / "run", pace, REPLAYED_TICKS)
                 self.found.physics_us[who].append(np.array(times_us))
 
@@ -288,7 +287,9 @@ def parts_of(trace: Trace) -> dict[str, np.ndarray]:
     exchange, read, process, write = units.T
     beyond = rows["processor_ns"][1:] - units.sum(axis=1)
     # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it is written.
-    closed = rows["closed_ns"][1:] if "closed_ns" in FIELDS else np.zeros_like(beyond)
-    closing = np.clip(np.where(closed, closed - rows["end_ns"][:-1], 0), 0, beyond)
+    closing, gap = rows["closed_ns"][1:] - rows["end_ns"][:-1], rows["start_ns"][1:] - rows["closed_ns"][1:]
+    # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the next start is known.
+    closing = np.where(closing > beyond, beyond - np.minimum(gap, beyond), closing)
+    closing[rows["closed_ns"][1:] == 0] = 0
     times = beyond - closing, exchange + read, process, write, closing
     return {part: time * 1e-3 for part, time in zip(PARTS, times, strict=True)}

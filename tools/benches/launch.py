@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -34,11 +35,20 @@ Key = tuple[str, str]
 """Case and contestant."""
 
 
-def measure(name: str, rounds: int, kills: int, against: Path | None, progress: Progress) -> Comparison:
+class LaunchCounts(NamedTuple):
+    """Rounds of launches and commands, and kills of each board."""
+
+    rounds: int
+    kills: int
+
+
+def measure(name: str, counts: LaunchCounts, against: Path | None, share: bool, progress: Progress) -> Comparison:
     """Return how long launches, commands and reactions to kills take; `against` is another checkout, launched by turns.
 
-    Raises `Failure` if a command fails, or a kill has no reaction.
+    With `share`, racks run even on cores that another one holds. Raises `Failure` if a command fails, or a kill has no
+    reaction.
     """
+    rounds, kills = counts
     progress.total(rounds * ROUND_S + 2 * kills * KILL_S)
     own = this_rack()
     with ExitStack() as stack:
@@ -46,7 +56,7 @@ def measure(name: str, rounds: int, kills: int, against: Path | None, progress: 
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         trees = [own, *([] if other is None else [other])]
         progress.begin("launches and commands")
-        samples = list(_samples(name, trees, rounds, folder))
+        samples = list(_samples(name, trees, ShortRuns(folder, share), rounds))
         progress.end(rounds * ROUND_S, "done", ())
     killing = Killing(name, kills, progress)
     samples += [sample for board in killing.boards for sample in killing.samples(board, KILL_S)]
@@ -55,12 +65,33 @@ def measure(name: str, rounds: int, kills: int, against: Path | None, progress: 
     return Comparison("launch", "launches, short commands, and reactions to a kill", tuple(samples), baselines)
 
 
-def _samples(name: str, trees: list[RackCommand], rounds: int, folder: Path) -> Iterator[Sample]:
+class ShortRuns(NamedTuple):
+    """Runs of a config of which only the beginning counts: in subfolders of `folder`; on the cores of others if so."""
+
+    folder: Path
+    share: bool = False
+
+    def launch_s(self, rack: RackCommand, config: str) -> float:
+        """Return the time from a `rack run` to the first cycle of its fastest level, s."""
+        with tempfile.TemporaryDirectory(dir=self.folder) as place:
+            began_ns = time.monotonic_ns()
+            run = self.run(rack, config, Path(place) / "run")
+            return (first_cycle_ns(run, fastest(load(config))) - began_ns) * 1e-9
+
+    def run(self, rack: RackCommand, config: str, out: Path) -> Path:
+        """Make a run; return its folder."""
+        # A checkout of before the namespace does not know the option, and never refuses.
+        options = ["--share"] if self.share and rack.package else []
+        name = ("--set", f"name=bench-run-{os.getpid()}")
+        rack.run("run", config, *name, *options, "--seconds", RUN_S, "--out", out, "--json", bound_s=BOUND_S)
+        return out
+
+
+def _samples(name: str, trees: list[RackCommand], runs: ShortRuns, rounds: int) -> Iterator[Sample]:
     """Yield the times of launches and commands, all measured by turns."""
     own = trees[0]
-    run = folder / "run"
+    run = runs.run(own, name, runs.folder / "run")
     idle = load(name, [f"name=bench-{os.getpid()}", "clock.mode=lockstep"])
-    own.run("run", name, *_named("run"), "--seconds", RUN_S, "--out", run, "--json", bound_s=BOUND_S)
     commands: Mapping[str, tuple[object, ...]] = {
         "rack --help": ("--help",),
         "rack list": ("list",),
@@ -68,7 +99,7 @@ def _samples(name: str, trees: list[RackCommand], rounds: int, folder: Path) -> 
         "rack report": ("report", run),
     }
     contestants: dict[Key, Callable[[], float]] = {
-        (LAUNCH, tree.name): partial(launch_s, tree, name, folder / f"{at}") for at, tree in enumerate(trees)
+        (LAUNCH, tree.name): partial(runs.launch_s, tree, name) for tree in trees
     }
     python = RackCommand(INTERPRETER, (sys.executable, "-c", "import numpy"), own.environment, "")
     for case, arguments in commands.items():
@@ -80,16 +111,6 @@ def _samples(name: str, trees: list[RackCommand], rounds: int, folder: Path) -> 
     for (case, who), found in times.items():
         # A launch takes seconds, all else milliseconds.
         yield Sample(case, who, tuple(1e3 * seconds for seconds in found), "ms")
-
-
-def launch_s(rack: RackCommand, config: str, folder: Path) -> float:
-    """Return the time from a `rack run` to the first cycle of its fastest level, s."""
-    task = fastest(load(config))
-    with tempfile.TemporaryDirectory(dir=folder.parent) as place:
-        out = Path(place) / "run"
-        began_ns = time.monotonic_ns()
-        rack.run("run", config, *_named("run"), "--seconds", RUN_S, "--out", out, "--json", bound_s=BOUND_S)
-        return (first_cycle_ns(out, task) - began_ns) * 1e-9
 
 
 def fastest(config: RackConfig) -> str:
@@ -113,7 +134,3 @@ def _command_s(rack: RackCommand, arguments: tuple[object, ...]) -> float:
     began = time.monotonic()
     rack.run(*arguments, bound_s=BOUND_S)
     return time.monotonic() - began
-
-
-def _named(kind: str) -> tuple[str, str]:
-    return "--set", f"name=bench-{kind}-{os.getpid()}"

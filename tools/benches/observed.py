@@ -23,6 +23,14 @@ SETTLE_NS = 250_000_000
 """Start of a run, in which caches are cold: no peer is measured in its own."""
 
 
+class Runs(NamedTuple):
+    """How a bench runs its contestants: how long, in how many turns, and whether on cores that another rack holds."""
+
+    seconds: float
+    rounds: int
+    share: bool = False
+
+
 class CycleCount(NamedTuple):
     """CycleCount of a task that ended too late or never took place, of all that were due."""
 
@@ -59,9 +67,12 @@ class Observed:
         return CycleCount(due - int(in_time), due)
 
 
-def observe(config: RackConfig, seconds: float, mailboxes: Sequence[str] = ()) -> Observed:
-    """Run a rack for `seconds` of simulated time, or until its task ends. Raises what `Rack` raises."""
-    with Rack(config) as rack:
+def observe(config: RackConfig, seconds: float, share: bool, mailboxes: Sequence[str] = ()) -> Observed:
+    """Run a rack for `seconds` of simulated time, or until its task ends.
+
+    `share` is as in `Rack`, which raises if another rack holds a core.
+    """
+    with Rack(config, share=share) as rack:
         segment = rack.segment
         tasks = [task.name for task in segment.layout.tasks]
         rings: dict[str, Ring] = {name: trace_ring(segment, name) for name in tasks}

@@ -25,7 +25,7 @@ from rack.tools.runs.recording import Recording
 SERVO = "servo"
 
 
-class Pace(NamedTuple):
+class ReplayPace(NamedTuple):
     """How a replay runs: a tick every `period_ns` on `core` at a real-time `priority`; all 0: tick after tick."""
 
     period_ns: int = 0
@@ -67,7 +67,7 @@ class Replay:
         substeps = round(config.clock_ns * 1e-9 / cell.model.opt.timestep)
         return cls(cell, substeps, config.clock_ns, first, states[first], states[last], controls)
 
-    def run(self, pace: Pace, ticks: int) -> list[float]:
+    def run(self, pace: ReplayPace, ticks: int) -> list[float]:
         """Replay at most so many ticks; return the processor time of each, us.
 
         Raises `Failure` if the whole stretch is replayed and does not end as recorded.
@@ -98,7 +98,7 @@ class Replay:
             raise Failure("the replayed physics do not end in the recorded state: they are not what the servo ran")
 
 
-def replay(folder: Path, pace: Pace, ticks: int) -> list[float]:
+def replay(folder: Path, pace: ReplayPace, ticks: int) -> list[float]:
     """Replay at most so many ticks of a recorded run; return the processor time of each, us.
 
     To be called by `apart`: only in the environment of boards are the physics theirs. Raises `Failure` as `Replay`.
@@ -128,7 +128,7 @@ def _stretch(recording: Recording) -> tuple[int, int]:
 
 
 @contextmanager
-def _scheduled(pace: Pace) -> Iterator[None]:
+def _scheduled(pace: ReplayPace) -> Iterator[None]:
     """Run as a board does: pinned, at its priority if that is permitted."""
     cores = os.sched_getaffinity(0)
     try:

@@ -21,7 +21,7 @@ from rack.boards.config.layout import obtained_core
 from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
 from rack.tools.benches.comparison import Absent, turns
 from rack.tools.benches.cyclictest import CYCLICTEST, WakeGrid, absent_cyclictest, cyclictest, overdue
-from rack.tools.benches.observed import Observed, missed_share, observe
+from rack.tools.benches.observed import Observed, Runs, missed_share, observe
 from rack.tools.console.answer import Failure
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.progress import Progress
@@ -172,27 +172,28 @@ class Rates:
         return paths
 
 
-def measure(name: str, rates_hz: Sequence[float], seconds: float, rounds: int, progress: Progress) -> Rates:
-    """Run a rack at every rate `rounds` times for `seconds`, by turns with `cyclictest` on the board's core."""
+def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Rates:
+    """Run a rack at every rate, by turns with `cyclictest` on the core of its fastest board."""
     config = load(name, [f"name=bench-{os.getpid()}"])
     racks = {rate_hz: at_rate(config, rate_hz) for rate_hz in sorted(rates_hz)}
     board = next(name for name in config.board if config.every(name) == 1)
     core, absent = obtained_core(config.board[board].core), absent_cyclictest()
-    progress.total(len(racks) * rounds * (2 * seconds + LAUNCH_S))
+    each_s = runs.rounds * (2 * runs.seconds + LAUNCH_S)
+    progress.total(len(racks) * each_s)
     figures = []
     for rate_hz, rack in racks.items():
         progress.begin(f"{rate_hz:g} Hz")
         priority = config.board[board].priority or 1
-        grid = WakeGrid((core,), round(1e9 / rate_hz), max(1, round(seconds * rate_hz)), priority)
-        runs: list[Observed] = []
+        grid = WakeGrid((core,), round(1e9 / rate_hz), max(1, round(runs.seconds * rate_hz)), priority)
+        ran: list[Observed] = []
         late: list[np.ndarray] = []
-        for _, who in turns(("rack",) if absent else ("rack", CYCLICTEST), rounds):
+        for _, who in turns(("rack",) if absent else ("rack", CYCLICTEST), runs.rounds):
             if who == CYCLICTEST:
                 late.append(cyclictest(grid))
             else:
-                runs.append(observe(rack, seconds))
-        figures.append(_figures(rate_hz, board, runs, np.concatenate(late) if late else None, grid.period_ns))
-        progress.end(rounds * (2 * seconds + LAUNCH_S), figures[-1].verdict, ())
+                ran.append(observe(rack, runs.seconds, runs.share))
+        figures.append(_figures(rate_hz, board, ran, np.concatenate(late) if late else None, grid.period_ns))
+        progress.end(each_s, figures[-1].verdict, ())
     return Rates(name, board, core, tuple(figures), absent)
 
 

@@ -69,7 +69,10 @@ class SignalsFile:
     def __init__(self, path: Path, layout: Layout) -> None:
         self._columns = {mailbox.name: columns_of(mailbox) for mailbox in layout.mailboxes}
         self._waiting: dict[str, list[np.ndarray]] = {name: [] for name in self._columns}
-        head = [pa.field("mailbox", pa.string()), *(pa.field(name, pa.int64()) for name in HEAD)]
+        head = [
+            pa.field("mailbox", pa.string()),
+            *(pa.field(name, pa.uint64() if name == "chain" else pa.int64()) for name in HEAD),
+        ]
         fields = head + [column.field for columns in self._columns.values() for column in columns]
         self._schema = pa.schema(fields, metadata={"layout": json.dumps(asdict(layout))})
         texts = [column.name for columns in self._columns.values() for column in columns if column.kind[1] == "S"]

@@ -57,7 +57,9 @@ class PdServo(Executor):
         load = Payload(read.plan.value.payload_mass, read.plan.value.payload_offset)
         inertia, gravity = self.dynamics.terms(sensed.position, self.rest, load)
         torque = inertia.diagonal() * (self.gains.stiffness * error + self.gains.damping * slip) + gravity
-        force = 0.0 if self.grip is None else self.grip.force(command, sensed.opening, sensed.opening_velocity)
+        if self.grip is not None and read.command.is_new:
+            self.grip.take(command)
+        force = 0.0 if self.grip is None else self.grip.force(sensed.opening, sensed.opening_velocity)
         self.arm.drive(torque, force)
         status = write.status
         status.echo, status.operator = command.id, command.operator

@@ -90,6 +90,14 @@ def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> N
     assert wake_semaphore(segment.rack, "sleeper").value == 2 + len(numbers) - 1
 
 
+def test_a_task_that_polls_is_released_without_posts(make_bus: MakeBus) -> None:
+    segment = make_bus(task("poller", wake="poll"))
+    start(segment)
+    assert len(given_out(segment, 30)) > 1
+    # The one post is the end's.
+    assert wake_semaphore(segment.rack, "poller").value == 1
+
+
 def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> None:
     segment, held_up = make_bus(), []
 

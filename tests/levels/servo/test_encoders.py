@@ -48,7 +48,7 @@ def test_noise_is_that_of_its_tick_and_seed_and_has_its_size() -> None:
     arm, other = (SimulatedArm(cell, scene, CLOCK_NS, seed=seed) for seed in (1, 2))
     noise = []
     for _ in range(200):
-        noise.append(arm.sense().position - arm._state()[0])
+        noise.append(arm.sense().position - arm._state[0])
         assert np.array_equal(arm.sense().position, arm.sense().position)
         assert not np.array_equal(arm.sense().position, other.sense().position)
         arm.step(1)
@@ -63,7 +63,7 @@ def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(resoluti
     rig = ServoRig(coarse(robot, resolution, noise), scene)
     rig.run(1000, move().at)
     assert rig.alarms(*BRAKES) == []
-    assert rig.servo.arm._state()[0] == pytest.approx(GOAL, abs=2e-3)  # type: ignore[attr-defined]
+    assert rig.servo.arm._state[0] == pytest.approx(GOAL, abs=2e-3)  # type: ignore[attr-defined]
 
 
 @pytest.mark.timeout(200)

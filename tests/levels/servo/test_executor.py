@@ -207,6 +207,19 @@ def test_equal_runs_give_equal_messages() -> None:
     assert raws[0] == raws[1]
 
 
+def test_a_scene_is_filled_in_the_cycle_before_those_of_its_readers() -> None:
+    rig, move = rig_of("puma560"), course("puma560")
+    rig.run(100, move.at)
+    seen, filled = rig.rack.tasks["servo"].write.scene.tool_position.copy(), []
+    for _ in range(4 * PERIOD):
+        rig.run(1, move.at)
+        if not np.array_equal(seen, scene := rig.rack.tasks["servo"].write.scene.tool_position):
+            seen = scene.copy()
+            filled.append(rig.rack.tick)  # the tick at which it is visible
+    assert len(filled) == 4
+    assert all(tick % PERIOD == 0 for tick in filled)
+
+
 def test_an_unknown_parameter_is_refused_with_the_valid_ones() -> None:
     with pytest.raises(LevelError, match=r"params.bandwith = 3: .*; keys: bandwidth, damping"):
         rig_of("puma560", bandwith=3)

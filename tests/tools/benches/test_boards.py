@@ -12,6 +12,7 @@ from rack.boards.config import loads, wire
 from rack.tools.benches.boards import measure
 from rack.tools.benches.chain import LONGEST, Chain
 from rack.tools.benches.chain_figures import Boards, ChainFigures, Fit
+from rack.tools.benches.observed import Runs
 from rack.tools.console.progress import Progress
 from tests.test_architecture import ROOT
 from tests.tools.command_line import rack
@@ -27,7 +28,7 @@ def test_a_chain_of_boards_fills_the_crate() -> None:
 
 def test_messages_take_as_many_cycles_as_there_are_boards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = measure((2, 5), 0.2, 1, ROOT, Progress())
+    found = measure((2, 5), Runs(0.2, 1, True), ROOT, Progress())
     assert found.exact
     assert found.trees == ("this tree", ROOT.name)
     for one in found.figures:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from rack.tools.benches.checkout import checkout, this_rack
 from rack.tools.console.answer import Failure
-from tests.tools.command_line import BOUND_S, ROOT
+from tests.tools.command_line import BOUND_S, ROOT, rack
 
 MAIN = """
 import subprocess, sys
@@ -95,3 +96,10 @@ def test_a_path_that_is_no_checkout_is_refused_in_one_line(tmp_path: Path) -> No
         assert reason in str(refused.value)
         assert len(str(refused.value).splitlines()) == 1
         assert refused.value.status == 2
+
+
+@pytest.mark.parametrize("bench", ["cycle", "lockstep"])
+def test_a_bench_against_no_checkout_is_a_usage_error(bench: str, tmp_path: Path) -> None:
+    done = rack("bench", bench, "--against", tmp_path / "nowhere", "--json")
+    reason = f"{tmp_path / 'nowhere'}: not a checkout of rack: no such folder"
+    assert (done.returncode, done.stderr.strip(), json.loads(done.stdout)["error"]) == (2, reason, [reason])

@@ -13,6 +13,7 @@ from rack.tools.benches import clock
 from rack.tools.benches.clock import BARE, board, measure
 from rack.tools.benches.cyclictest import CYCLICTEST, WakeGrid
 from rack.tools.benches.linuxcnc import LINUXCNC
+from rack.tools.benches.observed import Runs
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from tests.machine import needs_fifo
@@ -24,7 +25,7 @@ def test_boards_and_peers_are_measured_at_one_rate(tmp_path: Path, monkeypatch: 
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
     peers.program(tmp_path, "halrun", peers.HALRUN)
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = measure((400,), 0.25, 1, Progress())
+    found = measure((400,), Runs(0.25, 1, True), Progress())
     assert found.cases == ["400 Hz"]
     measured = {sample.who: sample for sample in found.samples}
     named = {one.who for one in found.absent}
@@ -39,7 +40,7 @@ def test_boards_and_peers_are_measured_at_one_rate(tmp_path: Path, monkeypatch: 
 
 def test_peers_that_the_machine_lacks_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = measure((1000,), 0.1, 1, Progress())
+    found = measure((1000,), Runs(0.1, 1, True), Progress())
     assert {CYCLICTEST, LINUXCNC} <= {one.who for one in found.absent}
     lines = list(found.lines())
     assert any("apt-get install rt-tests" in line for line in lines)
@@ -52,8 +53,8 @@ def test_a_peer_that_fails_is_named_with_its_reason(monkeypatch: pytest.MonkeyPa
     def fail(grid: WakeGrid) -> np.ndarray:
         raise Failure("cyclictest: Unable to change scheduling policy!")
 
-    monkeypatch.setattr(clock, "_contestants", lambda: ({CYCLICTEST: fail}, []))
-    found = measure((50,), 0.1, 2, Progress())
+    monkeypatch.setattr(clock, "_contestants", lambda share: ({CYCLICTEST: fail}, []))
+    found = measure((50,), Runs(0.1, 2), Progress())
     assert found.samples == ()
     (absent,) = found.absent
     assert (absent.who, absent.reason) == ("cyclictest at 50 Hz", "cyclictest: Unable to change scheduling policy!")
@@ -61,12 +62,12 @@ def test_a_peer_that_fails_is_named_with_its_reason(monkeypatch: pytest.MonkeyPa
 
 def test_a_machine_without_real_time_says_so_and_measures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clock, "permits_fifo", lambda: False)
-    monkeypatch.setattr(clock, "_contestants", lambda: ({BARE: clock.sleep_loop}, []))
-    found = measure((1000,), 0.05, 1, Progress())
+    monkeypatch.setattr(clock, "_contestants", lambda share: ({BARE: clock.sleep_loop}, []))
+    found = measure((1000,), Runs(0.05, 1), Progress())
     assert "SCHED_FIFO is refused" in found.title
     assert found.samples[0].count > 0
 
 
 def test_the_start_of_a_run_is_left_out() -> None:
     grid = WakeGrid((0,), 2_500_000, 40, 80)
-    assert 0 < len(board("signal", grid)) <= grid.wakes
+    assert 0 < len(board("signal", True, grid)) <= grid.wakes

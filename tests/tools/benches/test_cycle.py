@@ -15,7 +15,7 @@ from rack.boards.config import load
 from rack.tools.benches.apart import apart
 from rack.tools.benches.cycle import PACED, PARTS, ROW, Found, Trace, costs, measure, parts_of
 from rack.tools.benches.empty import BOARDS, write_empty_rack
-from rack.tools.benches.physics import Pace, Replay, replay
+from rack.tools.benches.physics import Replay, ReplayPace, replay
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.runs.recording import Recording
@@ -31,9 +31,24 @@ def trace(processor_us: int, cycles: int = 5) -> Trace:
 
 
 def test_the_parts_of_a_cycle_are_its_whole_processor_time() -> None:
-    found = parts_of(trace(50))
+    one = trace(50)
+    one.rows["end_ns"] = one.rows["tick"] * 2_500_000
+    one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 5000
+    found = parts_of(one)
     assert tuple(found) == PARTS
-    assert [times.tolist() for times in found.values()] == [[us] * 4 for us in (13.0, 3.0, 30.0, 4.0, 0.0)]
+    assert [times.tolist() for times in found.values()] == [[us] * 4 for us in (8.0, 3.0, 30.0, 4.0, 5.0)]
+
+
+def test_bookkeeping_that_a_trace_does_not_separate_is_part_of_waking_up() -> None:
+    assert [times[0] for times in parts_of(trace(50)).values()] == [13.0, 3.0, 30.0, 4.0, 0.0]
+
+
+def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
+    one = trace(50)
+    one.rows["end_ns"] = one.rows["tick"] * 2_500_000
+    one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 90_000
+    one.rows["start_ns"][1:] = one.rows["closed_ns"][1:] + 2000
+    assert [times[0] for times in parts_of(one).values()] == [2.0, 3.0, 30.0, 4.0, 11.0]
 
 
 def given(**others: Trace) -> Found:
@@ -94,7 +109,7 @@ def test_replayed_physics_end_in_the_recorded_state(tmp_path_factory: pytest.Tem
     run = nasrem_run(tmp_path_factory)
     whole = len(Replay.of(Recording(run)).controls)
     assert whole > 1000
-    times_us = apart(replay, run, Pace(), whole)
+    times_us = apart(replay, run, ReplayPace(), whole)
     assert len(times_us) == whole
     assert min(times_us) > 0.0
 
@@ -103,4 +118,4 @@ def test_physics_of_another_run_are_refused(tmp_path_factory: pytest.TempPathFac
     own = Replay.of(Recording(nasrem_run(tmp_path_factory)))
     short = replace(own, controls=own.controls[:20])
     with pytest.raises(Failure, match="do not end in the recorded state"):
-        short.run(Pace(), 20)
+        short.run(ReplayPace(), 20)

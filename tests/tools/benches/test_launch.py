@@ -11,7 +11,7 @@ import pytest
 from rack.boards.config import load
 from rack.tools.benches.checkout import this_rack
 from rack.tools.benches.kill import DETECTED, SAFE, Killing
-from rack.tools.benches.launch import BOUND_S, fastest, first_cycle_ns, launch_s
+from rack.tools.benches.launch import BOUND_S, ShortRuns, fastest, first_cycle_ns
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 
@@ -39,7 +39,7 @@ def test_the_fastest_executor_is_looked_for(small: Path) -> None:
 
 def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(small: Path, tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()
-    assert 0.0 < launch_s(this_rack(), str(small), tmp_path / "runs" / "run") < BOUND_S
+    assert 0.0 < ShortRuns(tmp_path / "runs").launch_s(this_rack(), str(small)) < BOUND_S
     assert not list((tmp_path / "runs").iterdir())
 
 

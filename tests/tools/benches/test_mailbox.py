@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -113,6 +114,16 @@ def test_a_bench_measures_every_protocol_and_names_who_is_absent(monkeypatch: py
     assert set(found.baselines) == set(found.cases)
     assert set(found.baselines.values()) <= {peer.name for peer in PEERS}
     assert not left_by(os.getpid())
+
+
+def test_the_command_prints_one_document_and_writes_its_pictures(tmp_path: Path) -> None:
+    command = [*RACK, "bench", "mailbox", "--rounds", "1", "--json", "--plot", tmp_path / "pictures"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, timeout=3 * BOUND_S)
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["bench"] == "mailbox"
+    assert {sample["case"] for sample in document["samples"]} == {case.name for case in CASES}
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == ["mailbox.png", "mailbox.svg"]
 
 
 def test_an_interrupted_bench_leaves_nothing(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def test_shares_are_of_all_tasks_together() -> None:
 
 def test_a_run_leaves_traces_messages_and_its_outcome() -> None:
     chain = Chain(2, 400, "lockstep")
-    found = observe(loads(chain.text()), 0.1, ["board2.status"])
+    found = observe(loads(chain.text()), 0.1, True, ["board2.status"])
     assert found.outcome.ticks == 40
     assert [found.cycles(name) for name in chain.names] == [(0, 39), (0, 39)]
     assert found.messages["board2.status"]["message"]["sent"].tolist() == [-1, *range(39)]

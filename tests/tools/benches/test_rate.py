@@ -10,6 +10,7 @@ import pytest
 
 from rack.boards.config import load, loads, wire
 from rack.tools.benches.comparison import Absent
+from rack.tools.benches.observed import Runs
 from rack.tools.benches.rate import RATES_HZ, STEP_MS, RateFigures, Rates, at_rate, measure
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
@@ -60,7 +61,7 @@ def test_a_rack_is_run_at_every_rate(tmp_path: Path, monkeypatch: pytest.MonkeyP
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = measure(str(path), (800, 400), 0.3, 1, Progress())
+    found = measure(str(path), (800, 400), Runs(0.3, 1, True), Progress())
     assert [one.rate_hz for one in found.figures] == [400, 800]
     assert found.board == "wave"
     for one in found.figures:
@@ -78,7 +79,7 @@ def test_late_wakes_of_cyclictest_are_a_share_of_its_own(tmp_path: Path, monkeyp
     path.write_text(PLAIN)
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)))
     monkeypatch.setattr("rack.tools.benches.cyclictest.permits_fifo", lambda: True)
-    (one,) = measure(str(path), (400,), 0.3, 2, Progress()).figures
+    (one,) = measure(str(path), (400,), Runs(0.3, 2, True), Progress()).figures
     # Of 120 wakes two rounds have two at 2.5 ms and four at 150 ms: 1 and 60 points of this grid.
     assert one.late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
 
@@ -87,7 +88,7 @@ def test_the_command_prints_one_document(tmp_path: Path, monkeypatch: pytest.Mon
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)
     monkeypatch.setenv("PATH", str(tmp_path))
-    options = ("--rate", 400, "--seconds", 0.2, "--rounds", 1, "--plot", tmp_path)
+    options = ("--rate", 400, "--seconds", 0.2, "--rounds", 1, "--share", "--plot", tmp_path)
     done = rack("bench", "rate", "--config", path, *options, "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)

@@ -1,0 +1,50 @@
+"""Outputs that are not written in every cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.watch.alarms import Alarm
+from rack.levels.level import Output
+from tests.backplane.bus import POINT
+from tests.link import MakeLink, links
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    with links(rack_name) as make:
+        yield make
+
+
+def test_a_message_at_its_own_rate_is_visible_at_multiples_of_its_period(link: MakeLink) -> None:
+    rack = link(rates=(2, 2), cycles=4)
+    rack.run(0, 40)
+    assert rack.written() == [(6, 1, 8), (14, 2, 16), (22, 3, 24), (30, 4, 32), (38, 5, 40)]
+    assert [seen.tick for seen in rack.reader.seen if seen.verdict == "NEW"] == [8, 16, 24, 32]
+    assert [tick for tick in range(0, 40, 2) if Output(POINT, 4).is_due(tick, 2)] == [6, 14, 22, 30, 38]
+
+
+def test_between_its_messages_a_slow_output_raises_no_alarm(link: MakeLink) -> None:
+    rack = link(rates=(1, 1), cycles=8)
+    rack.run(0, 200)
+    assert rack.alarms() == []
+    assert not any(seen.is_lost for seen in rack.reader.seen)
+
+
+def test_a_slow_output_that_stops_is_mute_after_three_of_its_periods(link: MakeLink) -> None:
+    rack = link(cycles=8)
+    rack.run(0, 64)
+    rack.fault("mute")
+    rack.run(64, 160)
+    ((tick, alarm),) = rack.alarms()
+    assert alarm is Alarm.MUTE
+    assert 63 + 3 * 8 <= tick <= 63 + 4 * 8
+
+
+def test_delayed_messages_of_a_slow_output_arrive_between_its_own(link: MakeLink) -> None:
+    rack = link(cycles=4)
+    rack.fault("delay", 1)
+    rack.run(0, 32)
+    assert [released for released, _, _ in rack.written()] == [3, 7, 11, 15, 19, 23, 27]
