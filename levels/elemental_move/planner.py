@@ -81,9 +81,16 @@ class ElementalMovePlanner(Planner):
     output = MOVE_PLAN
     params = ElementalMoveParams
 
+    @classmethod
+    def preload(cls) -> None:
+        """Import what plans motions: OMPL takes a while, which no board of this level need spend again."""
+        import numpy.random  # noqa: F401
+
+        import rack.levels.planning.motion_planner  # noqa: F401
+
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        # OMPL takes time and memory to import: only a planner's process pays for it.
+        # OMPL takes time and memory to import: only racks that plan motions pay for it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
         self._params = read_params(ElementalMoveParams, context.params)
