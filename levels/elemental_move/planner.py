@@ -25,7 +25,6 @@ from rack.levels.messages import (
     Verb,
 )
 from rack.levels.motion.path import Path
-from rack.levels.planning import collision
 from rack.levels.planning.moves import Move, Situation, read_window
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.robot.cell import build_cell
@@ -83,10 +82,10 @@ class ElementalMovePlanner(Planner):
 
     @classmethod
     def preload(cls) -> None:
-        """Import what plans motions: OMPL takes a while, which no board of this level need spend again."""
-        import numpy.random  # noqa: F401
+        """Load what plans motions: OMPL takes a while, which no board of this level need spend again."""
+        from rack.levels.planning import motion_planner
 
-        import rack.levels.planning.motion_planner  # noqa: F401
+        motion_planner.preload()
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -105,11 +104,6 @@ class ElementalMovePlanner(Planner):
         self._tries = 0  # of that job
         self._answered = 0  # newest request answered
         self._answer_due = 0  # tick by which the executor must have used the answer
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of collision checks."""
-        collision.preload()
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether a path is requested, blocked or missing."""

@@ -10,7 +10,6 @@ from rack.backplane.message import Message
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
-from rack.levels.planning import collision
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
@@ -39,10 +38,10 @@ class TaskPlanner(Planner):
 
     @classmethod
     def preload(cls) -> None:
-        """Import what plans motions: OMPL takes a while, which no board of this level need spend again."""
-        import numpy.random  # noqa: F401
+        """Load what plans motions: OMPL takes a while, which no board of this level need spend again."""
+        from rack.levels.planning import motion_planner
 
-        import rack.levels.planning.motion_planner  # noqa: F401
+        motion_planner.preload()
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -57,11 +56,6 @@ class TaskPlanner(Planner):
         self._plan: Message | None = None  # made by this process
         self._visible_at = 0  # tick from which it is visible
         self._since: int | None = None  # tick of the first cycle
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of collision checks."""
-        collision.preload()
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether the program is still to be planned and the world is known and at rest."""
