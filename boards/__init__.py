@@ -16,8 +16,9 @@ Names are imported on first use: the crate and its boards import parts of this p
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from rack.backplane.exports import on_first_use
 
 if TYPE_CHECKING:
     from rack.boards.config import load
@@ -36,11 +37,5 @@ _PLACES = {
     "rack.boards.events": ("Cause", "Event", "EventKind", "Outcome"),
 }
 
-
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
-
-    def __getattr__(name: str) -> Any:
-        for module, names in _PLACES.items():
-            if name in names:
-                return getattr(import_module(module), name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    __getattr__ = on_first_use(__name__, _PLACES)

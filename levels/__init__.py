@@ -13,29 +13,61 @@ every processor), `rack.levels.robot` (cell, limits, dynamics), `rack.levels.arm
 levels: `servo`, `primitive`, `elemental_move`, `task`, `world`, `figures`.
 """
 
-from rack.backplane.message import Field, Message, MessageType, State, command, status
-from rack.backplane.watch.alarms import Alarm
-from rack.levels.errors import LevelError, ProgramError, Refused, RobotError
-from rack.levels.level import (
-    Demand,
-    Executor,
-    Fault,
-    Finding,
-    Input,
-    LevelContext,
-    Pace,
-    Planner,
-    Ports,
-    Program,
-    Reading,
-    Verdict,
-)
-from rack.levels.messages import Error
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Commands, Goal, Operation, Orders
-from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, read_params
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rack.backplane.exports import on_first_use
+
+if TYPE_CHECKING:
+    from rack.backplane.message import Field, Message, MessageType, State, command, status
+    from rack.backplane.watch.alarms import Alarm
+    from rack.levels.errors import LevelError, ProgramError, Refused, RobotError
+    from rack.levels.level import (
+        Demand,
+        Executor,
+        Fault,
+        Finding,
+        Input,
+        LevelContext,
+        Pace,
+        Planner,
+        Ports,
+        Program,
+        Reading,
+        Verdict,
+    )
+    from rack.levels.messages import Error
+    from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Commands, Goal, Operation, Orders
+    from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, read_params
 
 __all__ = ["ANSWER", "OPERATOR_COMMAND", "RESTS_ON", "Alarm", "Commands", "Demand", "Error", "Executor", "Fault"]
 __all__ += ["Field", "Finding", "Finite", "Goal", "Input", "LevelContext", "LevelError", "Message", "MessageType"]
 __all__ += ["Operation", "Orders", "Pace", "Planner", "Ports", "Positive", "Program", "ProgramError", "Reading"]
 __all__ += ["Refused", "RobotConfig", "RobotError", "SceneConfig", "State", "Table", "Verdict", "command"]
 __all__ += ["read_params", "status"]
+_PLACES = {
+    "rack.backplane.message": ("Field", "Message", "MessageType", "State", "command", "status"),
+    "rack.backplane.watch.alarms": ("Alarm",),
+    "rack.levels.errors": ("LevelError", "ProgramError", "Refused", "RobotError"),
+    "rack.levels.level": (
+        "Demand",
+        "Executor",
+        "Fault",
+        "Finding",
+        "Input",
+        "LevelContext",
+        "Pace",
+        "Planner",
+        "Ports",
+        "Program",
+        "Reading",
+        "Verdict",
+    ),
+    "rack.levels.messages": ("Error",),
+    "rack.levels.operator": ("ANSWER", "OPERATOR_COMMAND", "RESTS_ON", "Commands", "Goal", "Operation", "Orders"),
+    "rack.levels.tables": ("Finite", "Positive", "RobotConfig", "SceneConfig", "Table", "read_params"),
+}
+
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
+    __getattr__ = on_first_use(__name__, _PLACES)

@@ -6,15 +6,13 @@ class can then strike it: a new kind needs no change in the level. The steps her
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from rack.levels.level import Fault
 
 Array = NDArray[np.float64]
 Key = tuple[str, int, int, int]
@@ -24,6 +22,16 @@ Sample = Any
 APART = np.array([[1e-2], [1e-2]])
 """Error of a stuck sensor, rad and rad/s, from which it counts as wrong: while a joint creeps, nobody need notice it
 earlier."""
+
+
+class Fault(NamedTuple):
+    """A fault injected into the arm, or another device that a level drives."""
+
+    kind: str  # as in "sensor-nan"
+    parameters: Mapping[str, float]  # of the kind, by name
+    seed: int  # of its random numbers
+    since: int  # tick at which it began
+    step: object  # acts the fault; of a class that the level lists in `faults`
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
+from rack.levels.faults import Fault
 from rack.levels.operator import Commands
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 
@@ -109,16 +110,6 @@ class Pace(NamedTuple):
 
     every: int  # ticks from cycle to cycle
     within_cycles: int  # cycles that one plan may take
-
-
-class Fault(NamedTuple):
-    """A fault injected into the arm, or another device that a level drives."""
-
-    kind: str  # as in "sensor-nan"
-    parameters: Mapping[str, float]  # of the kind, by name
-    seed: int  # of its random numbers
-    since: int  # tick at which it began
-    step: object  # acts the fault; of a class that the level lists in `faults`
 
 
 class Finding(NamedTuple):

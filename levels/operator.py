@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import REASON_BYTES, Field, Message, command
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 MAX_JOINTS = 16
 """Most joints of an arm: an operator's mailbox is the same in every rack."""

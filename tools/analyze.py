@@ -12,7 +12,8 @@ import typer
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.document import document
 from rack.tools.analysis.tables import text
-from rack.tools.console.answer import Json, RunFolder, print_json
+from rack.tools.console.answer import print_json
+from rack.tools.console.parameters import Json, RunFolder
 from rack.tools.console.progress import reading_progress
 from rack.tools.console.tables import print_wrapped, terminal_width
 from rack.tools.runs.recording import Recording

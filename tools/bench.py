@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal, Protocol
 
 import typer
 
-from rack.tools.console.answer import Failure, Json, config_names, print_json
+from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import Json, config_names
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 
@@ -279,6 +280,31 @@ def boards(
         found = measure(sorted(set(count or COUNTS)), Runs(seconds, rounds, share), against, progress)
     _show(found, plot, as_json)
     raise typer.Exit(0 if found.exact else 1)
+
+
+@bench.command()
+def launch(
+    config: Config = "nasrem",
+    rounds: Rounds = 10,
+    kills: Annotated[int, typer.Option(metavar="N", min=1, help="kills of each board")] = 10,
+    against: Against = None,
+    share: Share = False,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Measure what a user waits for: launches, short commands, and the reaction to a killed board.
+
+    A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to the checkout given by
+    --against. The ratio of a short command is to a Python that imports numpy and ends. `rack report` shows a report
+    that the run has made. Then boards of a running rack are killed: the output shows the time to detection, and the
+    time until the brakes of the arm are engaged.
+    """
+    from rack.tools.benches.launch import LaunchCounts, measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(config, LaunchCounts(rounds, kills), against, share, progress)
+    _show(found, plot, as_json)
 
 
 def _show(found: BenchResult, plot: Path | None, as_json: bool) -> None:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.console.answer import ConfigName, Failure, Json, Settings, print_json
+from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.parameters import ConfigName, Json, Settings
 
 if TYPE_CHECKING:
     from rack.tools.campaigns.campaign import Campaign

@@ -15,7 +15,8 @@ from rack.boards.config import load, shared_out
 from rack.boards.config.schema import CLOCK_SLOT, RackConfig
 from rack.boards.config.timing import with_budgets
 from rack.levels.timing.forecast import Forecast
-from rack.tools.console.answer import ConfigName, Failure, Faults, Json, Settings, print_json
+from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
 from rack.tools.console.tables import print_wrapped, table, terminal_width
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import Repair, repair

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from rack.boards.crate.clean import clean as remove_leftovers
-from rack.tools.console.answer import Json, print_answer
+from rack.tools.console.answer import print_answer
+from rack.tools.console.parameters import Json
 
 
 def clean(as_json: Json = False) -> None:

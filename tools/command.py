@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from rack.tools.console.answer import Failure, Json, RackName, Timeout, check_timeout, print_answer
+from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 

@@ -10,7 +10,8 @@ import typer
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, Run, System
-from rack.tools.console.answer import Failure, Json, RackName, print_answer
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json, RackName
 
 Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")]
 

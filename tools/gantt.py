@@ -11,7 +11,8 @@ import typer
 from rack.tools.charts import figure5
 from rack.tools.charts.gantt import Subject, gantt_of, subject_of
 from rack.tools.charts.window import times_of, window_options
-from rack.tools.console.answer import Failure, Json, Settings, print_answer
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json, Settings
 from rack.tools.console.progress import reading_progress
 
 LATEST_MS = 1e10

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from rack.tools.console.answer import Failure, Json, Timeout, check_timeout, named, print_answer
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json, Timeout, check_timeout, named
 from rack.tools.console.tables import table, terminal_width
 
 Rack = Annotated[

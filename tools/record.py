@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from rack.backplane.segment import Segment
-from rack.tools.console.answer import Json, RackName, View, print_answer
+from rack.tools.console.answer import print_answer
 from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import Json, RackName, View
 from rack.tools.recorder.recorder import Recorder, SafeSink
 from rack.tools.runs.folder import folder_of
 from rack.tools.runs.window import ViewerWindow, free_port, url

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from rack.tools.console.answer import Failure, RunFolder
+from rack.tools.console.answer import Failure
+from rack.tools.console.parameters import RunFolder
 from rack.tools.runs.window import ViewerWindow
 
 

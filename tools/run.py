@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rack.boards.config import load
-from rack.boards.config.schema import RackConfig
-from rack.tools.analysis.report import unrecorded, write_report
-from rack.tools.console.answer import ConfigName, Failure, Faults, Json, Settings, View
+from rack.boards.config.files import assembled, named_classes
+from rack.boards.crate.requests import Preload
+from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.report import print_report
-from rack.tools.runs.display import display_for
-from rack.tools.runs.folder import folder_of
-from rack.tools.runs.launch import NO_TIME, RunResult, run_rack
+from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, View
+
+if TYPE_CHECKING:
+    from rack.boards.config.schema import RackConfig
+    from rack.boards.config.toml import Tables
+    from rack.boards.crate.line import CrateLine
+    from rack.tools.runs.launch import RunResult
 
 Lockstep = Annotated[
     bool, typer.Option("--lockstep", help="start a tick only when every due task has finished: exact and repeatable")
@@ -34,6 +36,7 @@ NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no
 
 
 def run(
+    context: typer.Context,
     config: ConfigName,
     lockstep: Lockstep = False,
     seconds: Seconds = None,
@@ -66,24 +69,42 @@ def run(
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
-    found = load(config, overrides, faults)
+    tables = assembled(config, overrides, faults)
+    crate = _informed(context.obj, tables)
+    from rack.boards.config.resolved import validated
+    from rack.tools.runs.display import display_for
+    from rack.tools.runs.folder import folder_of
+    from rack.tools.runs.launch import NO_TIME, run_rack
+
+    found = validated(tables)
     folder = None if no_record else folder_of(out, found.name)
     # From the start of the run to the end of its report; during the launch a signal ends the command at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:
-            result = run_rack(found, seconds, folder, display, view=view, share=share)
-        print_report(*_report(found, folder, result), as_json)
+            result = run_rack(found, seconds, folder, display, view=view, share=share, crate=crate)
+        _report(found, folder, result, as_json)
     if not result.worked:
         # On stderr and last, where it is seen in any case.
         print(result.failure(), file=sys.stderr)
     sys.exit(0 if result.worked else 1)
 
 
-def _report(config: RackConfig, folder: Path | None, result: RunResult) -> tuple[dict[str, Any], str]:
-    """Make the report; a recording that cannot be read does not fail the run."""
+def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
+    """Let the crate load the levels that a config names, while this process imports what checks the config."""
+    if crate is not None:
+        own = tables.get("python_path")
+        crate.send(Preload(named_classes(tables), (*sys.path, *map(str, own if isinstance(own, list) else []))))
+    return crate
+
+
+def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> None:
+    """Make the report and print it; a recording that cannot be read does not fail the run."""
+    from rack.tools.analysis.report import unrecorded, write_report
+    from rack.tools.answers import print_report
+
+    report: tuple[dict[str, Any], str] | None = None
     try:
-        if folder is not None:
-            return write_report(folder)
+        report = write_report(folder) if folder is not None else None
     except (Failure, OSError) as error:
         print(f"no report: {error}", file=sys.stderr)
-    return unrecorded(config, result.document()), result.text()
+    print_report(*(report or (unrecorded(config, result.document()), result.text())), as_json)

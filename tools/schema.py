@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.console.answer import Failure, Json, config_names, print_answer
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json, config_names
 from rack.tools.console.tables import table, terminal_width
 
 if TYPE_CHECKING:

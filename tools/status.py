@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
-from rack.backplane.segment import Segment, racks
-from rack.tools.console.answer import Failure, Json, named, print_json, rack_names
-from rack.tools.console.tables import console
-from rack.tools.runs.display import RackView
-from rack.tools.runs.snapshot import RackMonitor
+from rack.tools.answers import show_status
+from rack.tools.console.parameters import Json, named, rack_names
 
 OnlyRack = Annotated[
     str | None,
@@ -37,9 +33,4 @@ def status(rack: OnlyRack = None, as_json: Json = False) -> None:
       rack status
       rack status nasrem --json
     """
-    running = racks()
-    if rack is None and len(running) != 1:
-        names = ", ".join(running)
-        raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
-    found = RackMonitor(Segment.attach(rack or running[0])).look()
-    print_json(asdict(found)) if as_json else console().print(RackView(found))
+    show_status(rack, as_json)

@@ -10,7 +10,8 @@ import typer
 from rack.backplane.process import is_alive, readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
-from rack.tools.console.answer import Failure, Json, RackName, print_answer
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json, RackName
 
 Wait = Annotated[float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the run's end")]
 

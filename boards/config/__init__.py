@@ -10,11 +10,28 @@
 Everything wrong with a config is a `ConfigError`, which reports all mistakes at once.
 """
 
-from rack.boards.config.files import CONFIGS, FAULTS, names
-from rack.boards.config.layout import shared_out
-from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
-from rack.boards.config.schema import RackConfig
-from rack.boards.config.timing import budgets, rack_timing
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rack.backplane.exports import on_first_use
+
+if TYPE_CHECKING:
+    from rack.boards.config.files import CONFIGS, FAULTS, names
+    from rack.boards.config.layout import shared_out
+    from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
+    from rack.boards.config.schema import RackConfig
+    from rack.boards.config.timing import budgets, rack_timing
 
 __all__ = ["CONFIGS", "FAULTS", "RackConfig", "Resolved", "budgets", "load", "loads", "names", "rack_timing"]
 __all__ += ["resolve", "shared_out", "wire"]
+_PLACES = {
+    "rack.boards.config.files": ("CONFIGS", "FAULTS", "names"),
+    "rack.boards.config.layout": ("shared_out",),
+    "rack.boards.config.resolved": ("Resolved", "load", "loads", "resolve", "wire"),
+    "rack.boards.config.schema": ("RackConfig",),
+    "rack.boards.config.timing": ("budgets", "rack_timing"),
+}
+
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
+    __getattr__ = on_first_use(__name__, _PLACES)

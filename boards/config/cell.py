@@ -1,11 +1,10 @@
-"""Data derived from the arm and its cell, built once per process.
+"""Data derived from the arm and its cell.
 
 Importing MuJoCo takes 0.5 s, so the import is inside functions: only racks with an arm pay for it.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,7 +63,6 @@ def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArr
     return _cell(robot, scene, clock_ns).limits.position
 
 
-@lru_cache(maxsize=4)
 def _cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     from rack.levels.robot.cell import build_cell
 

@@ -1,4 +1,4 @@
-"""Operator commands: checked against their rack, made into requests for the operator table, and described in words."""
+"""Operator commands: checked against their rack, and made into requests for the operator table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
-from rack.backplane.operator_table import Request, RequestEntry, RequestWord
+from rack.backplane.operator_table import Request
 from rack.boards.classes import find_class
 from rack.boards.config.cell import joint_ranges
 from rack.boards.config.mistakes import mistakes_of
@@ -21,7 +21,7 @@ from rack.boards.errors import ConfigError, Mistake
 from rack.levels.algebra import norm
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor
-from rack.levels.operator import Commands, Goal, Operation, goal_names, listed
+from rack.levels.operator import Commands, Goal, goal_names, listed
 
 OWN_OPERATOR = "own.operator"
 DOWN = (0.0, 0.0, -1.0)
@@ -160,32 +160,3 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
             yield Mistake(place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad")
-
-
-def level_of(entry: RequestEntry, layout: Layout) -> str:
-    """Return the board whose level a request addresses."""
-    return layout.mailboxes[entry[RequestWord.MAILBOX]].name.partition(".")[0]
-
-
-def message_of(entry: RequestEntry, layout: Layout) -> Message:
-    """Return a copy of a request's message, an `OPERATOR_COMMAND`."""
-    spec = layout.mailboxes[entry[RequestWord.MAILBOX]]
-    message = Message(message_dtype(spec.fields, spec.size))
-    message.raw[:] = entry.message[: spec.size]
-    return message
-
-
-def describe(message: Message) -> str:
-    """Return a command as one line: its verb and its goal."""
-    what, goal = Operation(message.what).name.lower(), message.goal
-    if goal == Goal.JOINTS:
-        return f"{what} joints {_numbers(message.joints[: message.count])}"
-    if goal == Goal.POSE:
-        return f"{what} position {_numbers(message.position)} quaternion {_numbers(message.quaternion)}"
-    if goal == Goal.DIRECTION:
-        return f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
-    return f"{what} home" if goal == Goal.HOME else what
-
-
-def _numbers(values: np.ndarray) -> str:
-    return ", ".join(f"{value:g}" for value in values.tolist())

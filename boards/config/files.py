@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rack.boards.config.toml import MAX_DEPTH, Tables, merge, parse
+from rack.boards.config.toml import MAX_DEPTH, Tables, merge, override, parse
 from rack.boards.errors import ConfigError, Mistake
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -15,6 +16,25 @@ FAULTS = CONFIGS / "faults"
 MAX_FILE_BYTES = 1_000_000
 EXTENDS = "configs that this file extends, by name or path, in order; its own keys override theirs"
 """Meaning of `extends`, the one key that only files have."""
+
+
+def assembled(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None) -> Tables:
+    """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults of a script.
+
+    Paths in an override are relative to the current folder. Raises `ConfigError`.
+    """
+    tables = read(name_or_path)
+    if faults is not None:
+        tables = with_faults(tables, faults)
+    return anchor(override(tables, overrides), Path.cwd())
+
+
+def named_classes(tables: Tables) -> tuple[str, ...]:
+    """Return the classes of levels that tables name, as "package.module:Class"; nothing else in them is checked."""
+    boards = tables.get("board")
+    found = [board for board in boards.values() if isinstance(board, dict)] if isinstance(boards, dict) else []
+    names = [board.get(role) for board in found for role in ("executor", "planner")]
+    return tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
 
 
 def read(name_or_path: str | Path) -> Tables:

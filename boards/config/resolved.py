@@ -22,13 +22,13 @@ from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
 from rack.boards.config.faults import fault_mistakes, injections, places
-from rack.boards.config.files import CONFIGS, anchor, read, with_faults
+from rack.boards.config.files import CONFIGS, anchor, assembled
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
 from rack.boards.config.ports import TaskPorts, reference
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
-from rack.boards.config.toml import Tables, override, parse
+from rack.boards.config.toml import Tables, parse
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
@@ -57,15 +57,12 @@ def load(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | 
     Faults of the script `faults`, by name or path, are appended to its own. Paths in an override are relative to the
     current folder. Raises `ConfigError` with every mistake if a single table is wrong; `resolve` checks the rest.
     """
-    tables = read(name_or_path)
-    if faults is not None:
-        tables = with_faults(tables, faults)
-    return _validated(anchor(override(tables, overrides), Path.cwd()))
+    return validated(assembled(name_or_path, overrides, faults))
 
 
 def loads(text: str) -> RackConfig:
     """Return the config in TOML text, as `RackConfig.text` writes it. Raises `ConfigError` as `load` does."""
-    return _validated(anchor(parse(text), CONFIGS))
+    return validated(anchor(parse(text), CONFIGS))
 
 
 def resolve(config: RackConfig) -> Resolved:
@@ -82,9 +79,9 @@ def wire(config: RackConfig) -> Layout:
     return resolve(config).layout
 
 
-def modules(config: RackConfig) -> tuple[str, ...]:
-    """Return the modules of all levels, for the crate to import while the config is checked."""
-    return tuple(dict.fromkeys(reference(config, place).partition(":")[0] for place in config.tasks()))
+def classes(config: RackConfig) -> tuple[str, ...]:
+    """Return the classes of all levels, for the crate to preload while the config is checked."""
+    return tuple(dict.fromkeys(reference(config, place) for place in config.tasks()))
 
 
 @dataclass(frozen=True)
@@ -234,7 +231,8 @@ class _Examined:
         )
 
 
-def _validated(tables: Tables) -> RackConfig:
+def validated(tables: Tables) -> RackConfig:
+    """Return the config in tables, and add its levels to the import path. Raises `ConfigError` as `load` does."""
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:

@@ -16,11 +16,11 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
-from rack.boards.config.commands import describe, level_of, message_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
 from rack.boards.faults.describe import board_of, joint_name, subject_of
 from rack.boards.faults.describe import describe as describe_fault
+from rack.boards.operator import describe, level_of, message_of
 from rack.levels.operator import Operation
 
 About = Literal["task", "mailbox", "joint", "geom", "nothing"]

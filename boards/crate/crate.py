@@ -1,15 +1,15 @@
-"""The crate: a small process that imports the boards' modules, then forks every board from itself.
+"""The crate: a small process that imports and preloads the boards' levels, then forks every board from itself.
 
-Importing numpy, MuJoCo and the planning libraries takes a second; forked boards share the result. The crate stays
+Importing numpy, MuJoCo and the planning libraries takes half a second, and loading compiled code as long again; forked
+boards share the result, and with it one compiled cell. The crate stays
 single-threaded, so that forking is safe at any time. As the boards' parent it reaps them, and the kernel kills them if
-it ends. The Rack starts it as `python -m rack.boards.crate.crate LINE ATTENTION`: the descriptors
-of the line and of the eventfd to which boards write.
+it ends. It is started as `python -m rack.boards.crate LINE ATTENTION`: the descriptors of the line and of the eventfd
+to which boards write.
 """
 
 from __future__ import annotations
 
 import gc
-import importlib
 import os
 import select
 import signal
@@ -24,10 +24,27 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
-from rack.boards.crate.line import Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload, received
+from rack.boards.classes import find_class
+from rack.boards.crate.line import received
+from rack.boards.crate.requests import (
+    CellConfig,
+    Ended,
+    Forked,
+    HogWiring,
+    Open,
+    Opened,
+    PowerOff,
+    PowerOn,
+    Preload,
+    PreloadFailed,
+    Preloading,
+)
+from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import hog
 from rack.boards.run.board import enter, run_clock_board, run_task_board
 from rack.boards.wiring import ClockWiring, TaskWiring
+from rack.levels.errors import RobotError
+from rack.levels.level import Executor, Planner
 
 LEAVE_S = 0.5
 """Time for boards to end by themselves after the launcher has gone."""
@@ -41,6 +58,7 @@ class Crate:
         self._attention = attention
         self._segment: Segment | None = None
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
+        self._preloaded: set[str] = set()
         self._poll = select.poll()
         self._poll.register(line, select.POLLIN)
         # The line alone does not show that the launcher is gone: a process that it forked may hold its end open.
@@ -61,14 +79,8 @@ class Crate:
 
     def _serve(self, request: object) -> None:
         match request:
-            case Preload(modules, path):
-                sys.path[:] = path
-                for name in modules:
-                    # A module that cannot be imported is a mistake in the config, which the Rack reports.
-                    with suppress(Exception):
-                        importlib.import_module(name)
-                gc.collect()
-                gc.freeze()
+            case Preload() as wanted:
+                self._preload(wanted)
             case Open(rack, priority):
                 self._segment = Segment.attach(rack)
                 semaphores.open_all(self._segment.layout)
@@ -82,6 +94,32 @@ class Crate:
                 self._fork(name, lambda segment: hog(segment, entry))
             case PowerOff(name):
                 self._kill(name)
+
+    def _preload(self, wanted: Preload) -> None:
+        """Load what boards share with the crate. What the Rack finds by itself, mistakes in the config, it reports."""
+        sys.path[:] = wanted.path
+        for reference in wanted.classes:
+            if reference not in self._preloaded and not self._is_preloaded(reference):
+                return
+        if wanted.cell is not None:
+            _compile_cell(wanted.cell)
+        gc.freeze()
+        gc.enable()
+
+    def _is_preloaded(self, reference: str) -> bool:
+        """Import a class and preload it; return False if it failed to preload."""
+        self._line.send(Preloading(reference))
+        with suppress(LookupError):
+            kind = find_class(reference, object)
+            try:
+                if issubclass(kind, Executor | Planner):
+                    kind.preload()
+            except Exception as error:
+                reason = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
+                self._line.send(PreloadFailed(reference, reason))
+                return False
+            self._preloaded.add(reference)
+        return True
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
         assert self._segment is not None, "the Rack opens the segment first"
@@ -147,6 +185,14 @@ class Crate:
             self._reap(pidfd)
 
 
+def _compile_cell(cell: CellConfig) -> None:
+    """Compile the cell, once for all boards. A cell with mistakes is the Rack's to report."""
+    from rack.levels.robot.cell import build_cell
+
+    with suppress(RobotError):
+        build_cell(cell.robot, cell.scene, cell.clock_ns)
+
+
 def main() -> None:
     """Serve as the crate of the Rack at the other end of the inherited socket."""
     # Ctrl-C reaches every process of the group, but the Rack decides how the run ends.
@@ -154,7 +200,3 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     line, attention = (int(fd) for fd in sys.argv[1:])
     Crate(Connection(line), attention).run()
-
-
-if __name__ == "__main__":
-    main()

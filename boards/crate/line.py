@@ -1,7 +1,8 @@
-"""The line between the Rack and its crate: the messages, and the Rack's end.
+"""The line between the Rack and its crate: the Rack's end.
 
-The line is a `multiprocessing.connection` on a socket pair. Both ends are processes of this program, one started by the
-other. Nothing else can reach the sockets, so pickles are safe.
+The crate starts with this object and imports what boards need while its owner still reads the config, so this module
+imports next to nothing. The line is a `multiprocessing.connection` on a socket pair. Both ends are processes of this
+program, one started by the other. Nothing else can reach the sockets, so pickles are safe.
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Self
 
 from rack.boards.errors import LaunchError
-from rack.boards.wiring import ClockWiring, TaskWiring
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """No threads in numerical libraries: the crate must have none when it forks, and a board has only its own core."""
@@ -24,78 +25,15 @@ SAME_LIBM = "glibc.cpu.hwcaps=-FMA,-FMA4"
 """The C library has two versions of `sin`, `exp` and others, with and without fused multiply-add. It selects one by
 processor, and they differ in the last bit. MuJoCo, OMPL, ruckig and Python's `math` call them. Boards use the version
 without, which runs on every processor. The choice is made at process start, so it must be in the environment."""
-
-
-@dataclass(frozen=True)
-class Preload:
-    """Import these modules, with `path` as import path; boards forked later share them."""
-
-    modules: tuple[str, ...]
-    path: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Open:
-    """Attach to a rack's segment and open its semaphores; take this SCHED_FIFO priority, if permitted.
-
-    The crate must notice deaths without waiting for planners to finish; no board waits for the crate.
-    """
-
-    rack: str
-    priority: int
-
-
-@dataclass(frozen=True)
-class HogWiring:
-    """A hog: its entry in the fault table."""
-
-    entry: int
-
-
-@dataclass(frozen=True)
-class PowerOn:
-    """Fork one board: a task, the clock, or a hog, which occupies a board's core."""
-
-    name: str
-    wiring: TaskWiring | ClockWiring | HogWiring
-
-
-@dataclass(frozen=True)
-class PowerOff:
-    """Kill one board, or every board still running."""
-
-    name: str | None = None
-
-
-@dataclass(frozen=True)
-class Opened:
-    """Answer to `Open`."""
-
-
-@dataclass(frozen=True)
-class Forked:
-    """A board was forked."""
-
-    name: str
-    pid: int
-
-
-@dataclass(frozen=True)
-class Ended:
-    """A board's process has ended; `status` is negative for a signal, as in subprocess.
-
-    `seen_ns` (CLOCK_MONOTONIC) and `tick` are the time at which the crate noticed.
-    """
-
-    name: str
-    pid: int
-    status: int
-    seen_ns: int
-    tick: int
+NO_WINDOWS = {"MUJOCO_GL": "disable"}
+"""Neither boards nor Rack draw: without this, importing MuJoCo also starts a process that looks for OpenGL."""
 
 
 class CrateLine:
-    """A running crate: the line to it, the eventfd `attention` to which its boards write, and their output."""
+    """A running crate: the line to it, the eventfd `attention` to which its boards write, and their output.
+
+    A `Rack` closes the line that it is given. As a context it is closed, too, if no Rack came to that.
+    """
 
     def __init__(self) -> None:
         self.line, theirs = Pipe()
@@ -105,7 +43,7 @@ class CrateLine:
         self._read_to = 0
         self._process = subprocess.Popen(
             # Unbuffered: a board ends by `os._exit`, which flushes no buffer.
-            [sys.executable, "-u", "-m", "rack.boards.crate.crate", str(theirs.fileno()), str(self.attention)],
+            [sys.executable, "-u", "-m", "rack.boards.crate", str(theirs.fileno()), str(self.attention)],
             pass_fds=(theirs.fileno(), self.attention),
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
@@ -113,6 +51,13 @@ class CrateLine:
             env=environment(),
         )
         theirs.close()
+        self._is_closed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close(0)
 
     @property
     def pid(self) -> int:
@@ -144,6 +89,9 @@ class CrateLine:
 
     def close(self, timeout_s: float) -> None:
         """Close the line, which makes the crate end its boards and itself; kill it after the timeout."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         self.line.close()
         try:
             self._process.wait(timeout_s)
@@ -157,7 +105,7 @@ class CrateLine:
 def environment() -> dict[str, str]:
     """Return the environment of the crate and its boards: the Rack's own, with settings that make runs repeatable."""
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
-    return {**os.environ, **SINGLE_THREADED, TUNABLES: tunables, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return {**os.environ, **SINGLE_THREADED, **NO_WINDOWS, TUNABLES: tunables, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 def received(line: Connection) -> object:

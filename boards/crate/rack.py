@@ -24,20 +24,31 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.config.commands import asked, request
-from rack.boards.config.resolved import load, modules, resolve
+from rack.boards.config.resolved import classes, load, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
-from rack.boards.crate.line import CrateLine, Ended, Forked, HogWiring, Open, Opened, PowerOff, PowerOn, Preload
+from rack.boards.crate.line import CrateLine
 from rack.boards.crate.neighbours import conflicts, holders, placed
+from rack.boards.crate.patience import Patience, await_opened
 from rack.boards.crate.recovery import Recovery, Supervision
+from rack.boards.crate.requests import (
+    CellConfig,
+    Ended,
+    Forked,
+    HogWiring,
+    Open,
+    PowerOff,
+    PowerOn,
+    Preload,
+)
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.events import Cause, Ending, Event, Journal, Outcome
 from rack.boards.faults.kind import KINDS
 
 LAUNCH_S = 60.0
-"""Time limit of the launch: every board compiles the model, which takes a while if it is large."""
+"""Time limit of each step of the launch: to preload one class, which may compile code, or to ready all boards."""
 UP = (TaskState.READY, TaskState.RUNNING)
 TO_SHARE = "stop that rack, choose other cores, or use --share"
 LEAVE_S = 2.0
@@ -50,16 +61,22 @@ class Rack:
     """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
 
     `on_event` is called with every `Event`, in the caller's process. Without `share`, a launch is refused if another
-    rack's real-time boards occupy a core that this one requests.
+    rack's real-time boards occupy a core that this one requests. A `crate` that was started earlier saves time.
     """
 
-    def __init__(self, config: RackConfig, on_event: Callable[[Event], None] | None = None, share: bool = True) -> None:
+    def __init__(
+        self,
+        config: RackConfig,
+        on_event: Callable[[Event], None] | None = None,
+        share: bool = True,
+        crate: CrateLine | None = None,
+    ) -> None:
         self.config = config
         self._share = share
         self.segment: Segment
         self.outcome: Outcome | None = None
         self._journal = Journal(on_event)
-        self._crate: CrateLine | None = None
+        self._crate = crate
         self._pids: dict[str, int] = {}
         self._faults: list[str] = []
         self._is_armed = False
@@ -103,9 +120,9 @@ class Rack:
         shared = conflicts(self.config, held)
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
-        self._crate = crate = CrateLine()
+        self._crate = crate = self._crate or CrateLine()
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
-        crate.send(Preload(modules(self.config), tuple(sys.path)))
+        crate.send(Preload(classes(self.config), tuple(sys.path), _cell(self.config)))
         self._plan = plan = resolve(self.config)
         remove_dead(self.config.name)
         self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
@@ -113,7 +130,7 @@ class Rack:
         semaphores.create(plan.layout)
         crate.send(Open(self.config.name, plan.crate_priority))
         self._journal.add("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
-        self._expect(Opened)
+        await_opened(crate, self._journal, LAUNCH_S)
         # The crate has them open and every board inherits them. Without names nothing can be left behind.
         semaphores.unlink(plan.layout)
         for wiring in plan.tasks:
@@ -132,13 +149,14 @@ class Rack:
         words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
 
     def _await_ready(self) -> None:
-        deadline = time.monotonic() + LAUNCH_S
+        patience = Patience(self._journal, LAUNCH_S)
         while absent := [t.name for t in self._plan.layout.tasks if self._state(t.name) not in UP]:
-            self._listen(deadline - time.monotonic())
+            self._listen(patience.left_s)
             if self._faults:
                 raise LaunchError("\n".join(self._line.printed()) or self._faults[0])
-            if time.monotonic() > deadline:
+            if patience.is_over:
                 raise LaunchError(f"boards {', '.join(absent)}: not ready within {LAUNCH_S:g} s")
+            patience.report(f"boards {', '.join(absent)} are starting")
 
     def _inject(self) -> None:
         """Fill the tables with the config's faults and commands; start the faults that are processes."""
@@ -257,11 +275,6 @@ class Rack:
             # Only the clock that was reported: its successor may be running by now.
             self._recovery.end_hanging(CLOCK)
 
-    def _expect(self, kind: type) -> None:
-        if not self._line.line.poll(LAUNCH_S) or not isinstance(self._line.receive(), kind):
-            late = f"the crate did not open the segment within {LAUNCH_S:g} s"
-            raise LaunchError("\n".join(self._line.printed()) or late)
-
     def _lose(self, end: Ended) -> None:
         """Record the end of a board, and restart it or give it up."""
         text = f"board '{end.name}' ended: {_status(end.status)}"
@@ -331,6 +344,10 @@ class Rack:
     def _line(self) -> CrateLine:
         assert self._crate is not None, "the rack is launched"
         return self._crate
+
+
+def _cell(config: RackConfig) -> CellConfig | None:
+    return None if config.robot is None else CellConfig(config.robot, config.scene, config.clock_ns)
 
 
 def _status(status: int) -> str:

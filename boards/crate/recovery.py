@@ -11,7 +11,8 @@ from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.line import CrateLine, PowerOff, PowerOn
+from rack.boards.crate.line import CrateLine
+from rack.boards.crate.requests import PowerOff, PowerOn
 from rack.boards.wiring import ClockWiring, TaskWiring
 
 

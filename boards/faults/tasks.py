@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import monotonic_ns
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Stage
@@ -17,7 +17,10 @@ from rack.backplane.process import pin
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.boards.faults.kind import KINDS
-from rack.levels.level import Executor, Fault, Planner
+from rack.levels.faults import Fault
+
+if TYPE_CHECKING:
+    from rack.levels.level import Executor, Planner
 
 LEAST_S = 0.001
 """Shortest polling interval of a waiting hog."""
@@ -98,9 +101,9 @@ class TaskFaults:
         self._outputs.apply([(kind.name, entry) for kind, entry in active if kind.where in ("writer", "lock")])
         arm = [(kind, entry) for kind, entry in active if kind.where == "arm"]
         self._arm = [entry for _, entry in arm]
-        if isinstance(self._level, Executor):
+        if self._spec.role == "executor":
             faults = [Fault(k.name, k.values(e), e[Entry.SEED], e[Entry.FROM], k.step) for k, e in arm]
-            self._level.inject(faults)
+            cast("Executor", self._level).inject(faults)
         return generation if len(active) == len(found) else -1
 
     def burn(self, tick: int) -> None:

@@ -1,11 +1,10 @@
-"""The cell: a robot and its surroundings, as one MuJoCo model and the indices into it.
-
-Every task that needs the model builds it from the config by itself: equal files give equal models.
-"""
+"""The cell: a robot and its surroundings, as one MuJoCo model and the indices into it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -61,11 +60,19 @@ class Cell:
 
 
 def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
-    """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps.
+    """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps. Each caller gets a model of its own.
+
+    The crate builds it once, before it forks the boards; in the same process only the model is copied from then on.
 
     Raises `RobotError`, one line, for a file, joint, site, body or geom that is missing or of the wrong kind, a list of
     the wrong length, a home outside the limits or in unintended contact.
     """
+    cell = _compiled(robot, scene, clock_ns)
+    return replace(cell, model=copy(cell.model))
+
+
+@lru_cache(maxsize=4)
+def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     spec = load_spec(robot.model)
     check_joints(robot, spec)
     motors, torque = fit_motors(spec, robot)

@@ -36,9 +36,16 @@ class TaskPlanner(Planner):
     params = TaskParams
     program = TaskConfig
 
+    @classmethod
+    def preload(cls) -> None:
+        """Load what plans motions: OMPL takes a while, which no board of this level need spend again."""
+        from rack.levels.planning import motion_planner
+
+        motion_planner.preload()
+
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        # OMPL takes time and memory to import: only a planner's process pays for it.
+        # OMPL takes time and memory to import: only racks that plan motions pay for it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
         self._program = read_program(context.task, context.robot, context.scene)

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import rack.boards.config
 from rack.boards.config import CONFIGS, load, loads, names, resolve
+from rack.boards.config.files import assembled, named_classes
+from rack.boards.config.resolved import classes
 from rack.boards.errors import ConfigError
 
 Write = Callable[[str, str], Path]
@@ -209,3 +212,23 @@ def test_every_impossible_override_is_reported(small: Path) -> None:
         '--set = "name.low=1": "low" cannot be set in "small", which is not a table',
         '--set = ".=2": must be key=value, as in clock.speed=2',
     ]
+
+
+def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
+    named = {"executor": "mine:Arm", "planner": "mine:Planner"}
+    boards = {"one": named, "two": {"executor": "mine:Arm"}, "odd": 3, "wrong": {"executor": 7}}
+    assert named_classes({"board": boards}) == ("mine:Arm", "mine:Planner")
+    assert named_classes({"board": [1]}) == named_classes({}) == ()
+
+
+def test_the_classes_that_a_config_names_are_those_that_are_preloaded() -> None:
+    for name in names():
+        assert named_classes(assembled(name)) == classes(load(name))
+
+
+def test_every_export_exists_once() -> None:
+    exported = rack.boards.config.__all__
+    assert len(exported) == len(set(exported))
+    assert all(hasattr(rack.boards.config, name) for name in exported)
+    with pytest.raises(AttributeError, match=r"module 'rack\.boards\.config' has no attribute 'nothing'"):
+        rack.boards.config.nothing  # noqa: B018

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -11,10 +13,11 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import racks
 from rack.backplane.words import Block, TaskState
 from rack.boards import Rack
+from rack.boards.crate.line import CrateLine
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event
 from tests.boards.conftest import PLAIN, MakeConfig
-from tests.processes import children_of, descriptors, wait_until
+from tests.processes import children_of, descriptors, runs, wait_until
 
 
 def refusal(rack: Rack) -> str:
@@ -66,9 +69,54 @@ def test_a_crate_killed_during_the_launch_is_reported(config: MakeConfig) -> Non
     assert rack.config.name not in racks()
 
 
-def command_of(pid: int) -> bytes:
-    from pathlib import Path
+def test_a_level_is_preloaded_once_in_the_process_that_forks_its_boards(config: MakeConfig) -> None:
+    reason = refusal(Rack(config("board.watch.executor=wave_levels:Preloaded", text=PLAIN)))
+    preloaded, forked = re.findall(r"\[(\d+)\]", reason)
+    assert preloaded == forked
+    assert int(preloaded) != os.getpid()
 
+
+def test_a_level_that_cannot_be_preloaded_fails_the_launch_in_one_line(config: MakeConfig) -> None:
+    reason = refusal(Rack(config("board.watch.executor=wave_levels:Unpreloadable", text=PLAIN)))
+    assert reason == "'wave_levels:Unpreloadable' cannot be preloaded: OSError: no room for compiled code"
+
+
+def test_a_launch_reports_what_it_waits_for(
+    config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rack.boards.crate.patience.PATIENCE_S", 0.1)
+    monkeypatch.setenv("WAVE_MAY_LOAD", str(tmp_path / "may-load"))
+    waits: list[str] = []
+
+    def let_it_load(event: Event) -> None:
+        if event.kind == "waiting" and "SlowlyPreloaded" in event.text:
+            waits.append(event.text)
+            (tmp_path / "may-load").touch()
+
+    # Without the report the file never comes into being, and the launch never ends.
+    with Rack(config("board.watch.executor=wave_levels:SlowlyPreloaded", text=PLAIN), let_it_load):
+        assert waits[0].startswith("preloading 'wave_levels:SlowlyPreloaded'")
+
+
+def test_a_preload_that_does_not_end_is_named(
+    config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
+    monkeypatch.setenv("WAVE_MAY_LOAD", str(tmp_path / "never"))
+    reason = refusal(Rack(config("board.watch.executor=wave_levels:SlowlyPreloaded", text=PLAIN)))
+    assert reason.startswith("preloading 'wave_levels:SlowlyPreloaded'")
+    assert reason.endswith("not done within 2 s")
+
+
+def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(config: MakeConfig) -> None:
+    with CrateLine() as crate:
+        with Rack(config(text=PLAIN), crate=crate) as rack:
+            boards = [rack.segment.block(task.name)[Block.PID] for task in rack.segment.layout.tasks]
+            assert set(boards) <= set(children_of(crate.pid))
+        assert not runs(crate.pid)
+
+
+def command_of(pid: int) -> bytes:
     return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 

@@ -15,11 +15,11 @@ from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, 
 from rack.backplane.words import Run, System
 from rack.boards import Rack
 from rack.boards.config import load, wire
-from rack.boards.config.commands import message_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
+from rack.boards.operator import message_of
 from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig

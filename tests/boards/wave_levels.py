@@ -154,3 +154,37 @@ class Endless(Watch):
         """Wait forever."""
         while True:
             time.sleep(1)
+
+
+class Preloaded(Watch):
+    """A level that fails its self-test with the processes in which it was preloaded, and that forked it."""
+
+    preloaded_in: list[int] = []
+
+    @classmethod
+    def preload(cls) -> None:
+        """Note the process."""
+        cls.preloaded_in.append(os.getpid())
+
+    def self_test(self) -> None:
+        """Report the processes."""
+        raise LevelError(f"preloaded in {self.preloaded_in}, forked by [{os.getppid()}]")
+
+
+class Unpreloadable(Watch):
+    """A level that cannot be preloaded."""
+
+    @classmethod
+    def preload(cls) -> None:
+        """Fail."""
+        raise OSError("no room for\ncompiled code")
+
+
+class SlowlyPreloaded(Watch):
+    """A level that is preloaded once the file of the environment variable WAVE_MAY_LOAD exists."""
+
+    @classmethod
+    def preload(cls) -> None:
+        """Wait for the file."""
+        while not os.path.exists(os.environ["WAVE_MAY_LOAD"]):  # noqa: PTH110
+            time.sleep(0.01)

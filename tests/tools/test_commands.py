@@ -15,8 +15,11 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.segment import racks
+from rack.boards import Rack
+from rack.boards.config import load
 from rack.tools.cli import COMMANDS
 from tests.processes import RACK
+from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
 
@@ -55,19 +58,45 @@ def wait_until_gone(name: str) -> bool:
     return name not in racks()
 
 
+HEAVY = ("mujoco", "numba", "numpy", "pyarrow", "pydantic", "rerun", "typer")
+
+
+def imported(*arguments: object) -> set[str]:
+    """Run a command as a process of its own; return which of the heavy libraries it has imported."""
+    command = [sys.executable, "-X", "importtime", *RACK[1:], *map(str, arguments)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout
+    names = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    assert "rack.tools.console.interrupt" in names
+    return names & {*HEAVY}
+
+
 @pytest.mark.parametrize(
-    ("arguments", "heavy"),
+    ("arguments", "needed"),
     [
-        (["--help"], ("numpy", "pydantic", "pyarrow", "mujoco", "rerun")),
-        (["list"], ("pyarrow", "mujoco", "rerun")),
-        (["clean", "--help"], ("pyarrow", "mujoco", "rerun")),
+        (["--help"], {"typer"}),
+        (["run", "--help"], {"typer", "pydantic"}),
+        (["clean", "--help"], {"typer", "pydantic"}),
+        (["list"], set()),
     ],
 )
-def test_a_command_starts_without_libraries_that_it_does_not_need(arguments: list[str], heavy: tuple[str, ...]) -> None:
-    code = f"import sys; from rack.tools.cli import commands; sys.argv[1:] = {arguments}\n"
-    code += f"try: commands()(prog_name='rack')\nfinally: print([m for m in {heavy} if m in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
-    assert found.stdout.endswith("\n[]\n"), found.stderr
+def test_a_command_starts_without_libraries_that_it_does_not_need(arguments: list[str], needed: set[str]) -> None:
+    assert imported(*arguments) <= needed
+
+
+def test_a_look_at_a_rack_needs_numpy_and_nothing_else(small: Path, rack_name: str) -> None:
+    with Rack(load(small, [f"name={rack_name}"])):
+        assert imported("status", rack_name) <= {"numpy"}
+        assert imported("status", rack_name, "--json") <= {"numpy"}
+        assert rack_name in rack("list").stdout
+
+
+def test_a_report_that_is_there_is_shown_without_any(tmp_path_factory: pytest.TempPathFactory) -> None:
+    folder = small_run(tmp_path_factory)
+    rack("report", folder)
+    assert imported("report", folder) == set()
+    assert imported("report", folder, "--json") == set()
 
 
 def test_help_has_a_whole_line_for_every_command() -> None:

@@ -1,14 +1,11 @@
-"""Shared by all commands: common arguments, the printing of an answer, and failure."""
+"""Shared by all commands: the printing of an answer, and failure."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Annotated, Any, NoReturn
-
-import typer
+from typing import Any, NoReturn
 
 from rack.boards.errors import one_line
 
@@ -44,54 +41,3 @@ def fail(reason: str, status: int) -> NoReturn:
     if "--json" in sys.argv[1:]:
         print_json({"error": lines})
     sys.exit(status)
-
-
-def config_names(start: str) -> list[str]:
-    """Return the shipped configs whose names begin with `start`, for shell completion."""
-    from rack.boards.config import names
-
-    return [name for name in names() if name.startswith(start)]
-
-
-def rack_names(start: str) -> list[str]:
-    """Return the racks in shared memory whose names begin with `start`, for shell completion."""
-    from rack.backplane.segment import racks
-
-    return [name for name in racks() if name.startswith(start)]
-
-
-def check_timeout(timeout: float | None, wait: bool) -> None:
-    """Raise `Failure` for --timeout without --wait."""
-    if timeout is not None and not wait:
-        raise Failure("--timeout needs --wait; give both, or neither", 2)
-
-
-def named(rack: str | None) -> str | None:
-    """Return the name of a rack. Raises `Failure` when it is empty."""
-    if rack == "":
-        raise Failure('RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2)
-    return rack
-
-
-Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout, and nothing else")]
-ConfigName = Annotated[
-    str, typer.Argument(metavar="CONFIG", help="config by name, or path to a .toml file", autocompletion=config_names)
-]
-RackName = Annotated[
-    str,
-    typer.Argument(
-        metavar="RACK", help="running rack by name, as 'rack list' shows it", autocompletion=rack_names, callback=named
-    ),
-]
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
-View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
-Timeout = Annotated[
-    float | None,
-    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: give up after S seconds of wall-clock time"),
-]
-Settings = Annotated[
-    list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")
-]
-Faults = Annotated[
-    str | None, typer.Option(metavar="FILE", help="fault script, by name or path; added to the config's own faults")
-]

@@ -11,6 +11,7 @@ import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,25 +23,36 @@ NICENESS = 10
 
 
 def main() -> None:
-    """Attach to the rack that one line of JSON names, and record until stdin closes."""
+    """Attach to the rack that one line of JSON names, and record until stdin closes; another line means: in a hurry."""
     # Ctrl-C reaches the whole foreground group; but the launcher decides when the recording is complete.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
     from rack.backplane.segment import Segment
+    from rack.backplane.words import System
     from rack.tools.recorder.recorder import Recorder, SafeSink
 
-    with suppress(ImportError):
-        import rack.tools.viewer.sink  # noqa: F401  takes a second, while the rack is being launched
+    # It takes half a second. A thread begins with it while the rack is being launched.
+    Thread(target=_import_viewer, daemon=True).start()
     line = sys.stdin.readline()
     if not line:
         return
     name, folder, port = json.loads(line)
     segment = Segment.attach(name)
-    view = SafeSink(lambda: _view(segment, Path(folder), port), _tell)
+    # A run in real time need not wait for the libraries of the viewer, unless the user wants to look on from the start.
+    in_background = port is None and not segment.words[System.LOCKSTEP]
+    view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
     with Recorder(segment, Path(folder), view) as recorder:
         _tell("recording")
         recorder.follow(until=sys.stdin.fileno())
+        if sys.stdin.readline():
+            view.hurry()
+
+
+def _import_viewer() -> None:
+    # If it is not there, opening the view says so.
+    with suppress(ImportError):
+        import rack.tools.viewer.sink  # noqa: F401
 
 
 def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
@@ -57,3 +69,5 @@ def _tell(text: str) -> None:
 
 if __name__ == "__main__":
     main()
+    # All files are complete. To take the interpreter apart under a thread that still imports could crash it.
+    os._exit(0)

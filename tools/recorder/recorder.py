@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import select
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
+from threading import Thread
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -23,6 +25,9 @@ REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
 """How often rings are drained. They hold two seconds; lockstep waits for its recorder and runs faster than time."""
 
+HURRIED_S = 0.5
+"""Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends within 2 s."""
+
 
 class Sink(Protocol):
     """Takes what a recorder drains."""
@@ -38,12 +43,22 @@ class Sink(Protocol):
 
 
 class SafeSink:
-    """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the recorder continues."""
+    """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the recorder continues.
 
-    def __init__(self, opened: Callable[[], Sink], tell: Callable[[str], None]) -> None:
+    Opened `in_background`, by a thread, it lets the recorder begin earlier: what it imports may take as long as a
+    launch. The rows of that time wait.
+    """
+
+    def __init__(self, opened: Callable[[], Sink], tell: Callable[[str], None], in_background: bool = False) -> None:
         self._tell = tell
         self._sink: Sink | None = None
-        self._guarded(lambda: setattr(self, "_sink", opened()))
+        self._waiting: list[Callable[[Sink], None]] = []
+        # A daemon: a process in a hurry does not wait for it.
+        self._opening = Thread(target=self._guarded, args=(lambda: setattr(self, "_sink", opened()),), daemon=True)
+        self._opening.start()
+        if not in_background:
+            self._opening.join()
+        self._patience_s: float | None = None
 
     def add(self, ring: str, rows: np.ndarray) -> None:
         """Pass rows on."""
@@ -54,12 +69,29 @@ class SafeSink:
         self._pass(lambda sink: sink.advance(tick, lost))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Finish the sink."""
+        """Finish the sink, once it is open."""
         self._pass(lambda sink: sink.close(tick, lost))
+        self._opening.join(self._patience_s)
+        if self._opening.is_alive():
+            self._tell("run.rrd is missing: the run was interrupted before the libraries of the viewer were loaded")
+        else:
+            self._hand_over()
+
+    def hurry(self) -> None:
+        """Do without a sink that will not be open soon."""
+        self._patience_s = HURRIED_S
 
     def _pass(self, call: Callable[[Sink], None]) -> None:
-        if (sink := self._sink) is not None:
-            self._guarded(lambda: call(sink))
+        self._waiting.append(call)
+        if not self._opening.is_alive():
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Make the calls that waited for the sink; there are none to make of one that has failed."""
+        waiting, self._waiting = self._waiting, []
+        for call in waiting:
+            if (sink := self._sink) is not None:
+                self._guarded(partial(call, sink))
 
     def _guarded(self, call: Callable[[], None]) -> None:
         try:

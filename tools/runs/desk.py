@@ -18,8 +18,9 @@ from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestSt
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads
-from rack.boards.config.commands import asked, commandable, describe, message_of, request
+from rack.boards.config.commands import asked, commandable, request
 from rack.boards.errors import ConfigError, Mistake
+from rack.boards.operator import describe, message_of
 from rack.levels.operator import Answer, Operation, listed
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import table

@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
@@ -20,6 +20,9 @@ from rack.boards.events import Event
 from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
 from rack.tools.runs.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
+
+if TYPE_CHECKING:
+    from rich.live import Live
 
 COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "slot": lambda row: str(row.slot),
@@ -115,6 +118,8 @@ def display_for(silent: bool) -> Iterator[Display]:
     if silent:
         yield Display()
     elif terminal.is_terminal:
+        from rich.live import Live
+
         with Live(console=terminal, auto_refresh=False) as live:
             yield LiveDisplay(live)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,9 @@ from rack.backplane.message import State
 from rack.levels.operator import Operation
 from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
 from rack.tools.console.answer import Failure
-from rack.tools.runs.recording import Recording
+
+if TYPE_CHECKING:
+    from rack.tools.runs.recording import Recording
 
 OWN = "holding"
 """`by` of a hold whose reason comes from the level itself."""

@@ -14,10 +14,9 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
-from rack.boards.config.commands import describe
 from rack.boards.events import Event
+from rack.boards.operator import describe
 from rack.levels.operator import Answer, Operation
-from rack.tools.faults.ending import arm_of
 
 STILL_S = 5.0
 """Simulated time without motion after which a held rack reports it as an event."""
@@ -134,6 +133,9 @@ class Standstill:
 
     def look(self) -> Iterator[Event]:
         """Yield an event for each hold that somebody must end and that has not been reported yet."""
+        # Here, not above: it needs the kinds of faults, for which `rack status` should not wait.
+        from rack.tools.faults.ending import arm_of
+
         tick = self._segment.words[System.TICK]
         kept = [hold for hold in self._holds.look() if hold.release]
         if not kept or not arm_of(self._segment).is_at_rest:

@@ -13,6 +13,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
+from rack.boards.crate.line import CrateLine
 from rack.boards.events import Event, Outcome
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
@@ -82,10 +83,12 @@ def run_rack(
     *,
     view: bool = False,
     share: bool = True,
+    crate: CrateLine | None = None,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder` unless that is None.
 
-    With `view`, open a viewer on what the recorder serves; it may be closed at any time. `share` is as in `Rack`.
+    With `view`, open a viewer on what the recorder serves; it may be closed at any time. `share` and `crate`
+    are as in `Rack`.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that fails does not
     change how the run ends.
@@ -98,7 +101,7 @@ def run_rack(
             recorder = None if folder is None else RecorderProcess()
             if recorder is not None:
                 stack.callback(recorder.finish)
-            rack = stack.enter_context(Rack(config, log.add, share))
+            rack = stack.enter_context(Rack(config, log.add, share, crate))
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())
@@ -113,7 +116,7 @@ def run_rack(
             outcome = _watch(rack, seconds, display, log, news)
             wall_s, segment = time.monotonic() - started, rack.segment
         rack.close()
-        recording = recorder.finish() if recorder is not None else "none"
+        recording = recorder.finish(in_a_hurry=INTERRUPT.number != 0) if recorder is not None else "none"
         _log_news(news, segment, log)
         blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
         result = RunResult(

@@ -120,11 +120,15 @@ class RecorderProcess:
         if self._words is not None and self._words[System.LOCKSTEP]:
             self._words[System.FOLLOWER_PID] = pid
 
-    def finish(self) -> str:
-        """Let it record what is left and finish its files; return "complete", or why the recording is not."""
+    def finish(self, in_a_hurry: bool = False) -> str:
+        """Let it record what is left and finish its files; return "complete", or why the recording is not.
+
+        In a hurry it does without the viewer's file if it has not begun that one yet.
+        """
         if not self._result:
             if self._process.stdin is not None:
                 with suppress(BrokenPipeError):
+                    self._process.stdin.write(b"hurry\n" if in_a_hurry else b"")
                     self._process.stdin.close()
             self._await_end(time.monotonic() + FINISH_S)
             status = self._process.returncode

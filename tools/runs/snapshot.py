@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rack.backplane.fault_table import FaultTable, Stage
@@ -13,7 +14,6 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
-from rack.boards.faults.describe import describe
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
 
@@ -114,11 +114,18 @@ class RackMonitor:
             clock_skipped=words[System.CLOCK_SKIPPED],
             lines=tuple(self._asserted()),
             demand=Demand(words[System.DEMAND]).name.lower(),
-            faults=tuple(describe(fault, layout, self._joints) for fault in self._faults.staged((Stage.ACTIVE,))),
+            faults=tuple(self._active_faults()),
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
             holds=self._holds.look(),
         )
+
+    def _active_faults(self) -> Iterator[str]:
+        for fault in self._faults.staged((Stage.ACTIVE,)):
+            # The kinds of faults take a while to import; most racks have none.
+            from rack.boards.faults.describe import describe
+
+            yield describe(fault, self._segment.layout, self._joints)
 
     def _asserted(self) -> list[str]:
         lines = self._lines

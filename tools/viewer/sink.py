@@ -55,7 +55,7 @@ class ViewSink:
         cell = None
         if config.robot is not None:
             cell = build_cell(config.robot, config.scene, config.clock_ns)
-        self._times = Timelines(layout.clock_ns)
+        self._times = Timelines(layout.clock_ns, words[Head.CREATED_NS])
         view = blueprint(layout, config, cell, live=port is not None)
         run = f"{folder.name}-{words[Head.CREATED_NS]}"
         self._stream = stream = Stream(folder.name, run, next_file(folder), self._times, view, port)

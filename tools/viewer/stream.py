@@ -28,14 +28,17 @@ SERVER_MEMORY = "200MB"
 
 
 class Timelines:
-    """Converts ticks and CLOCK_MONOTONIC stamps to time columns; all integers, ns."""
+    """Converts ticks and CLOCK_MONOTONIC stamps to time columns; all integers, ns.
 
-    def __init__(self, clock_ns: int) -> None:
+    `launched_ns`: when the rack was launched, CLOCK_REALTIME.
+    """
+
+    def __init__(self, clock_ns: int, launched_ns: int) -> None:
         self.clock_ns = clock_ns
         # One offset for the whole recording: setting the clock meanwhile must not fold the timeline.
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._ticks: Ints = np.zeros(1, dtype=np.int64)
-        self._stamps: Ints = np.array([time.monotonic_ns()])
+        self._stamps: Ints = np.array([self.monotonic(launched_ns)])
 
     def columns(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> list[rr.TimeColumn]:
         """Return the columns of rows released at `ticks`, `within_ns` of simulated time later, stamped `stamps_ns`."""

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.crate.line import CrateLine, Preload, received
+from rack.boards.crate.line import CrateLine, received
+from rack.boards.crate.requests import Preload, Preloading
 from rack.boards.errors import LaunchError
 from tests.processes import descriptors, runs, wait_until
 
@@ -53,7 +54,7 @@ def test_a_crate_that_does_not_end_is_killed() -> None:
 
 
 def test_output_comes_line_by_line_and_once(line: CrateLine) -> None:
-    line.send(Preload(("wave_printer",), PATH))
+    line.send(Preload(("wave_printer:Printer",), PATH))
     found: list[str] = []
     wait_until(lambda: found.extend(line.printed()) or len(found) == 2)
     assert found == ["first", "second"]
@@ -61,9 +62,20 @@ def test_output_comes_line_by_line_and_once(line: CrateLine) -> None:
 
 
 def test_the_crate_survives_a_module_that_cannot_be_imported(line: CrateLine) -> None:
-    line.send(Preload(("no_such_module", "wave_printer"), PATH))
+    line.send(Preload(("no_such_module:Level", "wave_printer:Printer"), PATH))
     wait_until(line.printed)
     assert runs(line.pid)
+
+
+def test_what_a_crate_has_preloaded_it_does_not_preload_again(line: CrateLine) -> None:
+    wanted = Preload(("wave_levels:Preloaded",), PATH)
+    line.send(wanted)
+    line.send(wanted)
+    line.send(Preload(("wave_levels:Wave",), PATH))
+    assert [line.receive() for _ in range(2)] == [
+        Preloading("wave_levels:Preloaded"),
+        Preloading("wave_levels:Wave"),
+    ]
 
 
 def test_a_request_to_a_crate_that_is_gone_is_a_launch_error(line: CrateLine) -> None:
@@ -76,7 +88,7 @@ def test_a_request_to_a_crate_that_is_gone_is_a_launch_error(line: CrateLine) ->
 
 def test_the_crate_ignores_an_interrupt_from_the_terminal() -> None:
     line = CrateLine()
-    line.send(Preload(("wave_printer",), PATH))
+    line.send(Preload(("wave_printer:Printer",), PATH))
     wait_until(line.printed)
     os.kill(line.pid, signal.SIGINT)
     line.close(20.0)

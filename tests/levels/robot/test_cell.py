@@ -55,6 +55,22 @@ def test_two_builds_give_equal_models() -> None:
         assert np.array_equal(getattr(first, name), getattr(second, name)), name
 
 
+def test_a_change_to_one_model_is_in_no_other() -> None:
+    first = build(*config("puma560")).model
+    before = first.body_mass.copy()
+    first.body_mass[:] = 7.0
+    assert np.array_equal(build(*config("puma560")).model.body_mass, before)
+
+
+def test_a_model_steps_as_the_one_it_was_copied_from() -> None:
+    states = []
+    for made in (build(*config("puma560")), build(*config("puma560"))):
+        data = made.start()
+        mujoco.mj_step(made.model, data, 100)
+        states.append((data.qpos.tobytes(), data.qvel.tobytes()))
+    assert states[0] == states[1]
+
+
 def test_planned_motion_leaves_room_within_the_bounds() -> None:
     made = cell("puma560")
     assert (made.limits.velocity < made.bounds.velocity).all()

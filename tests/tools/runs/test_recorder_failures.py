@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -75,6 +76,72 @@ def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
     assert sink.blocks == 2
 
 
+class Taking:
+    """A sink that takes everything, and keeps the calls."""
+
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    def add(self, ring: str, rows: np.ndarray) -> None:
+        """Keep the rows."""
+        self.calls.append((ring, rows.tolist()))
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Keep the tick."""
+        self.calls.append(tick)
+
+    def close(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Keep the end."""
+        self.calls.append("end")
+
+
+def test_rows_wait_for_a_sink_that_takes_long_to_open() -> None:
+    may_open, sink = threading.Event(), Taking()
+
+    def opened() -> Taking:
+        assert may_open.wait(WATCHDOG_S)
+        return sink
+
+    safe = SafeSink(opened, pytest.fail, in_background=True)
+    for tick in range(3):
+        safe.add("servo", np.array([tick]))
+        safe.advance(tick, {})
+    assert sink.calls == []
+    may_open.set()
+    safe.close(3, {})
+    assert sink.calls == [("servo", [0]), 0, ("servo", [1]), 1, ("servo", [2]), 2, "end"]
+
+
+def test_a_recorder_in_a_hurry_does_without_a_sink_that_is_not_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rack.tools.recorder.recorder.HURRIED_S", 0.05)
+    may_open, sink, notes = threading.Event(), Taking(), list[str]()
+
+    def opened() -> Taking:
+        assert may_open.wait(WATCHDOG_S)
+        return sink
+
+    safe = SafeSink(opened, notes.append, in_background=True)
+    safe.add("servo", np.zeros(1))
+    safe.hurry()
+    safe.close(1, {})
+    may_open.set()
+    assert sink.calls == []
+    assert len(notes) == 1
+    assert notes[0].startswith("run.rrd is missing: ")
+
+
+def test_a_sink_that_cannot_be_opened_is_reported_once() -> None:
+    notes: list[str] = []
+
+    def opened() -> Taking:
+        raise ImportError("no viewer here")
+
+    safe = SafeSink(opened, notes.append)
+    safe.add("servo", np.zeros(1))
+    safe.close(1, {})
+    assert notes == ["run.rrd ends here: no viewer here"]
+
+
 def test_a_rack_without_an_arm_is_recorded_too(tmp_path_factory: pytest.TempPathFactory) -> None:
     recording = Recording(small_run(tmp_path_factory))
     for field, mailbox in (("count", "lower.status"), ("goal", "upper.command")):
@@ -121,13 +188,22 @@ class AtTick(Display):
 
     period_s = 0.05
 
-    def __init__(self, number: signal.Signals, tick: int = FIRST_BLOCK) -> None:
-        self._number, self._tick = number, tick
+    def __init__(self, number: signal.Signals, tick: int = FIRST_BLOCK, view: Path | None = None) -> None:
+        self._number, self._tick, self._view = number, tick, view
+        self._view_began = 0
         self.struck: list[int] = []
 
+    def _has_view(self) -> bool:
+        """Say whether the viewer's file, if that matters, has grown since it was begun."""
+        if self._view is None:
+            return True
+        size = self._view.stat().st_size if self._view.is_file() else 0
+        self._view_began = self._view_began or size
+        return size > self._view_began > 0
+
     def show(self, snapshot: Snapshot) -> None:
-        """Look at the tick."""
-        if snapshot.tick > self._tick and not self.struck:
+        """Look at the tick, and at the viewer's file."""
+        if snapshot.tick > self._tick and not self.struck and self._has_view():
             self.struck = [pid for pid in children_of(os.getpid()) if b"rack.tools.recorder" in command_of(pid)]
             os.kill(self.struck[0], self._number)
 
@@ -165,7 +241,8 @@ def test_what_a_killed_recorder_took_is_readable(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_process, "RESTARTS", 0)
-    result = run_rack(realtime(config), 3.0, tmp_path / "run", AtTick(signal.SIGKILL))
+    display = AtTick(signal.SIGKILL, view=tmp_path / "run" / "run.rrd")
+    result = run_rack(realtime(config), LONG_S, tmp_path / "run", display)
     assert result.worked
     assert result.recording == "the recorder ended with status -9"
     report, _ = write_report(tmp_path / "run")

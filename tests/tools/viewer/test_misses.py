@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 4)
 
 def recorded(folder: Path, missed: list[list[int]]) -> Path:
     """Write blocks of 400 cycles with misses at those ticks."""
-    times = Timelines(TICK_NS)
+    times = Timelines(TICK_NS, time.time_ns())
     stream = Stream("misses", "run", folder / "run.rrd", times, rrb.Blueprint(), None)
     part = Misses(stream, TASK)
     for number, ticks in enumerate(missed):

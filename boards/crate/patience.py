@@ -1,0 +1,64 @@
+"""Waiting during a launch: with a time limit, and a line to the user when it takes long."""
+
+from __future__ import annotations
+
+import time
+
+from rack.boards.crate.line import CrateLine
+from rack.boards.crate.requests import Opened, PreloadFailed, Preloading
+from rack.boards.errors import LaunchError
+from rack.boards.events import Journal
+
+PATIENCE_S = 2.0
+"""Time after which a launch reports what it waits for; it does so again each time the wait has doubled."""
+
+
+class Patience:
+    """One wait of at most `limit_s`. A long one is reported to `journal`."""
+
+    def __init__(self, journal: Journal, limit_s: float) -> None:
+        self._journal, self._limit_s = journal, limit_s
+        self._began = time.monotonic()
+        self._report_s = PATIENCE_S
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the time limit is exceeded."""
+        return self._waited_s > self._limit_s
+
+    @property
+    def left_s(self) -> float:
+        """Time until the next report or the time limit, s."""
+        return max(0.0, min(self._report_s, self._limit_s) - self._waited_s)
+
+    def report(self, doing: str) -> None:
+        """Report what the launch waits for, if that is due."""
+        if self._waited_s >= self._report_s:
+            self._journal.add("waiting", "", f"{doing}, {self._waited_s:.0f} s so far")
+            self._report_s *= 2.0
+
+    @property
+    def _waited_s(self) -> float:
+        return time.monotonic() - self._began
+
+
+def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
+    """Wait until the crate has preloaded the levels and opened the segment; `limit_s` is for each class.
+
+    Raises `LaunchError` if a class cannot be preloaded, and when the time limit is exceeded.
+    """
+    patience, doing = Patience(journal, limit_s), "the crate is starting"
+    while not patience.is_over:
+        if not crate.line.poll(patience.left_s):
+            patience.report(doing)
+            continue
+        match crate.receive():
+            case Opened():
+                return
+            case Preloading(kind):
+                patience, doing = Patience(journal, limit_s), f"preloading '{kind}', whose first launch compiles code"
+            case PreloadFailed(kind, why):
+                raise LaunchError(f"'{kind}' cannot be preloaded: {why}")
+            case None:
+                raise LaunchError("\n".join(crate.printed()) or "the crate has ended")
+    raise LaunchError("\n".join(crate.printed()) or f"{doing}: not done within {limit_s:g} s")

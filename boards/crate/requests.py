@@ -1,0 +1,109 @@
+"""What the Rack and its crate send each other: requests to the crate, and its answers.
+
+Nothing is imported for them: the first request is sent before the libraries that read a config are there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rack.boards.wiring import ClockWiring, TaskWiring
+    from rack.levels.tables import RobotConfig, SceneConfig
+
+
+@dataclass(frozen=True)
+class CellConfig:
+    """What the compiled cell depends on."""
+
+    robot: RobotConfig
+    scene: SceneConfig
+    clock_ns: int
+
+
+@dataclass(frozen=True)
+class Preload:
+    """Import and preload these classes of levels, as "package.module:Class", with `path` as import path.
+
+    With a cell, compile its cell, too. Boards forked later share all of it. What is loaded already costs nothing.
+    """
+
+    classes: tuple[str, ...]
+    path: tuple[str, ...]
+    cell: CellConfig | None = None
+
+
+@dataclass(frozen=True)
+class Open:
+    """Attach to a rack's segment and open its semaphores; take this SCHED_FIFO priority, if permitted.
+
+    The crate must notice deaths without waiting for planners to finish; no board waits for the crate.
+    """
+
+    rack: str
+    priority: int
+
+
+@dataclass(frozen=True)
+class HogWiring:
+    """A hog: its entry in the fault table."""
+
+    entry: int
+
+
+@dataclass(frozen=True)
+class PowerOn:
+    """Fork one board: a task, the clock, or a hog, which occupies a board's core."""
+
+    name: str
+    wiring: TaskWiring | ClockWiring | HogWiring
+
+
+@dataclass(frozen=True)
+class PowerOff:
+    """Kill one board, or every board still running."""
+
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class Preloading:
+    """The crate begins to preload a class."""
+
+    kind: str
+
+
+@dataclass(frozen=True)
+class PreloadFailed:
+    """A class raised an error while it was preloaded; no board can be forked."""
+
+    kind: str
+    error: str
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Answer to `Open`."""
+
+
+@dataclass(frozen=True)
+class Forked:
+    """A board was forked."""
+
+    name: str
+    pid: int
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A board's process has ended; `status` is negative for a signal, as in subprocess.
+
+    `seen_ns` (CLOCK_MONOTONIC) and `tick` are the time at which the crate noticed.
+    """
+
+    name: str
+    pid: int
+    status: int
+    seen_ns: int
+    tick: int

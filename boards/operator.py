@@ -1,0 +1,40 @@
+"""An operator's requests: the level that each addresses, its message, and the command in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rack.backplane.layout import Layout
+from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.message import Message
+from rack.backplane.operator_table import RequestEntry, RequestWord
+from rack.levels.operator import Goal, Operation
+
+
+def level_of(entry: RequestEntry, layout: Layout) -> str:
+    """Return the board whose level a request addresses."""
+    return layout.mailboxes[entry[RequestWord.MAILBOX]].name.partition(".")[0]
+
+
+def message_of(entry: RequestEntry, layout: Layout) -> Message:
+    """Return a copy of a request's message, an `OPERATOR_COMMAND`."""
+    spec = layout.mailboxes[entry[RequestWord.MAILBOX]]
+    message = Message(message_dtype(spec.fields, spec.size))
+    message.raw[:] = entry.message[: spec.size]
+    return message
+
+
+def describe(message: Message) -> str:
+    """Return a command as one line: its verb and its goal."""
+    what, goal = Operation(message.what).name.lower(), message.goal
+    if goal == Goal.JOINTS:
+        return f"{what} joints {_numbers(message.joints[: message.count])}"
+    if goal == Goal.POSE:
+        return f"{what} position {_numbers(message.position)} quaternion {_numbers(message.quaternion)}"
+    if goal == Goal.DIRECTION:
+        return f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
+    return f"{what} home" if goal == Goal.HOME else what
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{value:g}" for value in values.tolist())
