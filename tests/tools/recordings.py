@@ -35,7 +35,7 @@ class Cycle(NamedTuple):
         release = self.tick * period_ns
         stamps = np.cumsum([round(ms * MS) for ms in (self.late, *self.parts)]) + release
         processor = sum(self.parts) if self.processor is None else self.processor
-        return (self.tick, release, *stamps.tolist(), self.flags, 0, round(processor * MS))
+        return (self.tick, release, *stamps.tolist(), self.flags, 0, round(processor * MS), 0)
 
 
 def cycle(
@@ -45,7 +45,7 @@ def cycle(
     moments = [EPOCH_NS + moment * US for moment in moments_us]
     flags = skipped << SKIPPED_SHIFT | (skipped > 0) * Flag.SKIPPED | planned * Flag.PLANNED
     used = moments_us[-1] - moments_us[0] if processor_us is None else processor_us
-    return (tick, EPOCH_NS + tick * tick_us * US, *moments, flags, 0, used * US)
+    return (tick, EPOCH_NS + tick * tick_us * US, *moments, flags, 0, used * US, 0)
 
 
 def recorded(

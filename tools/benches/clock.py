@@ -45,8 +45,8 @@ def measure(rates_hz: tuple[int, ...], runs: Runs, progress: Progress) -> Compar
             late_us = np.concatenate([[], *(late for late in found if not isinstance(late, str))])
             if len(late_us):
                 samples.append(Sample(f"{rate_hz} Hz", who, tuple(late_us.tolist()), "us"))
-            else:
-                absent.append(Absent(f"{who} at {rate_hz} Hz", reasons[0], "nothing is missing"))
+            if reasons:
+                absent.append(Absent(f"{who} at {rate_hz} Hz, {len(reasons)} of {runs.rounds} rounds", reasons[0]))
         progress.end(turn_s * runs.rounds * len(contestants), "done", ())
     refused = "" if is_fifo else "; SCHED_FIFO is refused, so all run under ordinary scheduling"
     own_grid = f"; {LINUXCNC}: after its earliest run" if LINUXCNC in contestants else ""
@@ -68,7 +68,7 @@ def _contestants(share: bool) -> tuple[Contestants, list[Absent]]:
     absent = []
     if len(os.sched_getaffinity(0)) < 2:
         del found["board, poll"]
-        absent.append(Absent("board, poll", "a board that polls needs a core of its own", "a second core"))
+        absent.append(Absent("board, poll", "a board that polls needs a core of its own, and this machine has one"))
     found[BARE] = sleep_loop
     for who, missing, peer in ((CYCLICTEST, absent_cyclictest(), cyclictest), (LINUXCNC, absent_linuxcnc(), linuxcnc)):
         if missing is None:

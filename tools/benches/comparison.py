@@ -81,16 +81,16 @@ class Sample:
 
 @dataclass(frozen=True)
 class Absent:
-    """A contestant that this machine lacks, and the command that installs it."""
+    """A contestant that this machine lacks, and the command that installs it; empty: none does."""
 
     who: str
     reason: str
-    install: str
+    install: str = ""
 
     @property
     def line(self) -> str:
         """All of it as one line."""
-        return f"absent: {self.who}: {self.reason}; to install: {self.install}"
+        return f"absent: {self.who}: {self.reason}{'; to install: ' if self.install else ''}{self.install}"
 
 
 def absent_package(who: str, module: str) -> Absent | None:

@@ -48,11 +48,7 @@ def absent_cyclictest() -> Absent | None:
     """Return what `cyclictest` lacks; None if it can run."""
     if absent := absent_program(CYCLICTEST, CYCLICTEST, "rt-tests"):
         return absent
-    return (
-        None
-        if permits_fifo()
-        else Absent(CYCLICTEST, "SCHED_FIFO is refused", "raise the limit 'rtprio', which `ulimit -r` shows")
-    )
+    return None if permits_fifo() else Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)")
 
 
 def permits_fifo() -> bool:

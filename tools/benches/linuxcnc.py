@@ -52,13 +52,14 @@ def absent_linuxcnc() -> Absent | None:
 
 def linuxcnc(grid: WakeGrid) -> np.ndarray:
     """Return the lateness of every run of the thread, us, shape (n,). Raises `Failure` if LinuxCNC does not run it."""
+    others = _threads()
     with TemporaryDirectory(prefix="rack-bench-") as folder, _hal(Path(folder)) as hal:
         assert hal.stdin is not None
         # If it has ended, its stderr says why.
         with suppress(BrokenPipeError):
             hal.stdin.write(SETUP.format(period_ns=grid.period_ns))
             hal.stdin.flush()
-        _schedule(_await_thread(hal), grid)
+        _schedule(_await_thread(hal, others), grid)
         try:
             out, err = hal.communicate(MEASURE.format(samples=grid.wakes + LEAD), grid.patience_s)
         except subprocess.TimeoutExpired:
@@ -105,24 +106,33 @@ def _environment(folder: Path) -> dict[str, str]:
     return {**os.environ, **own, **nobody}
 
 
-def _await_thread(hal: subprocess.Popen[str]) -> int:
-    """Return the id of the realtime thread once it runs."""
+def _await_thread(hal: subprocess.Popen[str], others: frozenset[int]) -> int:
+    """Return the id of the realtime thread once it runs; `others` ran before."""
     until = time.monotonic() + START_S
     while hal.poll() is None and time.monotonic() < until:
-        for name in Path("/proc").glob("[0-9]*/task/[0-9]*/comm"):
-            with suppress(OSError):
-                if name.read_text().strip() == THREAD:
-                    return int(name.parent.name)
+        if own := _threads() - others:
+            return min(own)
         time.sleep(0.02)
     if hal.poll() is None:
         raise Failure(f"{LINUXCNC}: it started no thread within {START_S:g} s")
     raise Failure(f"{LINUXCNC}: {_reason(hal.communicate()[1])}")
 
 
+def _threads() -> frozenset[int]:
+    """Return the ids of all threads with the name of LinuxCNC's first."""
+    found = set()
+    for name in Path("/proc").glob("[0-9]*/task/[0-9]*/comm"):
+        with suppress(OSError):
+            if name.read_text().strip() == THREAD:
+                found.add(int(name.parent.name))
+    return frozenset(found)
+
+
 def _schedule(thread: int, grid: WakeGrid) -> None:
-    os.sched_setaffinity(thread, {grid.cores[0]})
     policy = os.SCHED_FIFO if grid.priority else os.SCHED_OTHER
-    with suppress(PermissionError):
+    # A thread that has ended already leaves the reason on stderr.
+    with suppress(PermissionError, ProcessLookupError):
+        os.sched_setaffinity(thread, {grid.cores[0]})
         os.sched_setscheduler(thread, policy, os.sched_param(grid.priority))
 
 

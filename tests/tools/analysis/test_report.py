@@ -39,7 +39,7 @@ def cycle(tick: int, late: float, read: float, process: float, write: float) -> 
     """Return a trace record of a cycle of a 10 ms task, of times in ms."""
     release = tick * 10 * MS
     times = np.cumsum([release, late * MS, 0, read * MS, process * MS, write * MS]).astype(int)
-    return (tick, *times.tolist(), 0, 0, round((read + process + write) * MS))
+    return (tick, *times.tolist(), 0, 0, round((read + process + write) * MS), 0)
 
 
 def test_times_of_a_task_are_those_of_equation_3_5() -> None:

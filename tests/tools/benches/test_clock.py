@@ -57,7 +57,7 @@ def test_a_peer_that_fails_is_named_with_its_reason(monkeypatch: pytest.MonkeyPa
     found = measure((50,), Runs(0.1, 2), Progress())
     assert found.samples == ()
     (absent,) = found.absent
-    assert (absent.who, absent.reason) == ("cyclictest at 50 Hz", "cyclictest: Unable to change scheduling policy!")
+    assert absent.line == "absent: cyclictest at 50 Hz, 2 of 2 rounds: cyclictest: Unable to change scheduling policy!"
 
 
 def test_a_machine_without_real_time_says_so_and_measures(monkeypatch: pytest.MonkeyPatch) -> None:
