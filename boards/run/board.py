@@ -70,11 +70,12 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         if wiring.fails_self_test:
             raise LevelError("self-test failed: injected by a fault in the config")
         UtilityLines(segment).release_sysfail(spec.slot)
+        if spec.priority and not segment.words[System.LOCKSTEP]:
+            # Still at ordinary priority: a board that is restarted must not delay another board's cycle.
+            touch_memory()
         block[Block.PRIORITY] = take_processor(spec)
         block[Block.CORE] = spec.core
         task = _task(segment, wiring, level, attention)
-        if block[Block.PRIORITY] and not segment.words[System.LOCKSTEP]:
-            touch_memory()
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)
         task.stopwatch.notify_clock()
@@ -89,9 +90,8 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> in
     """Take the processor and run the system clock."""
     pin(wiring.core)
     is_realtime = set_priority(wiring.priority) and wiring.priority > 0
+    # Not touched: every board waits for the clock's start, and its lead over the grid has room for a page fault.
     lock_memory()
-    if is_realtime and not wiring.lockstep:
-        touch_memory()
     with cores_kept_awake() if is_realtime else nullcontext():
         run_clock(segment, wiring, attention)
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import mujoco
@@ -99,7 +100,10 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
             sound &= not (touch[geoms[contact, 0], geoms[contact, 1]] and distance[contact] < 0.0)
         for warned in warnings:
             sound &= warned == 0
-        sound &= bool(np.isfinite(qpos).all()) and bool(np.isfinite(qvel).all())
+        for value in qpos:
+            sound &= math.isfinite(value)
+        for value in qvel:
+            sound &= math.isfinite(value)
         if not sound:
             return -(step + 1)
     time_s = np.full(1, end_s)  # exactly: what steps add up to differs in the last bit

@@ -82,10 +82,10 @@ class ElementalMovePlanner(Planner):
 
     @classmethod
     def preload(cls) -> None:
-        """Import what plans motions: OMPL takes a while, which no board of this level need spend again."""
-        import numpy.random  # noqa: F401
+        """Load what plans motions: OMPL takes a while, which no board of this level need spend again."""
+        from rack.levels.planning import motion_planner
 
-        import rack.levels.planning.motion_planner  # noqa: F401
+        motion_planner.preload()
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

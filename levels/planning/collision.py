@@ -6,14 +6,17 @@ MuJoCo finds the close pairs of geoms. A matrix of required distances, one entry
 from __future__ import annotations
 
 import copy
+from functools import partial
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rack.levels.algebra import Array, mat_vec
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
 from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
+from rack.levels.robot.engine import contact_views, mj_collision, mj_kinematics, mju_mat_to_quat, mju_mul_quat
 from rack.levels.robot.lookup import geom_name
 from rack.levels.tables import SceneConfig
 
@@ -25,8 +28,6 @@ it moves fast, and its support pushes it back as it is put down."""
 
 ANY_DISTANCE = -np.inf
 """Required distance of a pair that may overlap."""
-NONE: Array = np.zeros(0)
-"""Shortfalls where no pair is close."""
 
 
 def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
@@ -56,12 +57,15 @@ class CollisionChecker:
         self._data = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
         self._row_geoms = [np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b) for b in cell.bodies]
-        self._offset = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-        self._tool_quaternion = np.zeros(4)
-        self._short = NONE
+        self._offset = np.zeros(7)  # pose of the held object in the tool's frame: m; w, x, y, z
         self._contype = self._filter_to_arm()
         self._base = self._required_distances()
         self._required = self._base.copy()
+        self._q, self._least = np.zeros(len(cell.qpos)), np.inf  # the last configuration checked, and its clearance
+        m, d = self._model, self._data
+        tool, quaternion = (d.site_xpos[cell.tool], d.site_xmat[cell.tool]), np.zeros(4)
+        arrays = self._q, cell.qpos.copy(), d.qpos, *tool, self._offset, quaternion, self._required
+        self._is_free = partial(is_free.load(), m._address, d._address, *arrays, *contact_views(m, d))
 
     def tool_at(self, q: Array) -> Pose:
         """Return the tool's pose at `q` (joints,), rad."""
@@ -81,7 +85,7 @@ class CollisionChecker:
     def hold(self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)) -> None:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
         self.held = row
-        self._offset = (np.array(position, dtype=float), np.array(quaternion, dtype=float))
+        self._offset[:3], self._offset[3:] = position, quaternion
         self._model.geom_contype[:] = self._contype
         if row is not None:
             self._model.geom_contype[self._row_geoms[row]] = 1
@@ -94,13 +98,13 @@ class CollisionChecker:
 
     def free(self, q: Array, clearance: float | None = None) -> bool:
         """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may lower the scene's."""
-        short = self._shortfalls(q, clearance)
-        return not (len(short) and (short > 0.0).any())
+        self._q[:], self._least = q, np.inf if clearance is None else float(clearance)
+        return self._is_free(-1 if self.held is None else self.cell.object_qpos[self.held], self._least)
 
     def room(self, q: Array) -> float:
         """Return the largest clearance, in m and at most the scene's, with which `q` is free; negative: with none."""
-        short = self._shortfalls(q, None)
-        pairs = self._data.contact.geom
+        self.free(q)
+        short, pairs = self._shortfalls(), self._data.contact.geom
         required = self._required[pairs[:, 0], pairs[:, 1]]
         if np.any((short > 0) & (required <= 0)):
             return -1.0
@@ -108,12 +112,12 @@ class CollisionChecker:
 
     def why(self, q: Array, clearance: float | None = None) -> str:
         """Name the pair of geoms that violates its distance most at `q`, and both distances; empty: `q` is free."""
-        self._shortfalls(q, clearance)
+        self.free(q, clearance)
         return self.nearest()
 
     def nearest(self) -> str:
         """Name that pair for the last configuration checked."""
-        short = self._short
+        short = self._shortfalls()
         if not np.any(short > 0):
             return ""
         worst = int(np.argmax(short))
@@ -123,32 +127,11 @@ class CollisionChecker:
         least = distance + short[worst]
         return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {least * 1e3:.1f} mm"
 
-    def _shortfalls(self, q: Array, clearance: float | None) -> Array:
-        """Return by how much each close pair falls short of its required distance, in m."""
-        m, d = self._model, self._data
-        d.qpos[self.cell.qpos] = q
-        mujoco.mj_kinematics(m, d)
-        if self.held is not None:
-            self._carry(self.held)
-            mujoco.mj_kinematics(m, d)
-        mujoco.mj_collision(m, d)
-        if not d.ncon:  # the usual case
-            self._short = NONE
-            return NONE
-        contact = d.contact
+    def _shortfalls(self) -> Array:
+        """Return by how much each close pair of the last configuration falls short of its required distance, in m."""
+        contact = self._data.contact
         pairs = contact.geom
-        required = self._required[pairs[:, 0], pairs[:, 1]]
-        if clearance is not None:
-            np.minimum(required, clearance, out=required)
-        self._short = np.asarray(required - contact.dist)
-        return self._short
-
-    def _carry(self, row: int) -> None:
-        d, address = self._data, self.cell.object_qpos[row]
-        tool = self.cell.tool
-        mujoco.mju_mat2Quat(self._tool_quaternion, d.site_xmat[tool])
-        d.qpos[address : address + 3] = d.site_xpos[tool] + mat_vec(d.site_xmat[tool].reshape(3, 3), self._offset[0])
-        mujoco.mju_mulQuat(d.qpos[address + 3 : address + 7], self._tool_quaternion, self._offset[1])
+        return np.asarray(np.minimum(self._required[pairs[:, 0], pairs[:, 1]], self._least) - contact.dist)
 
     def _filter_to_arm(self) -> NDArray[np.int32]:
         """Restrict MuJoCo to the pairs that involve the arm, a tenth of the work. Return the contact types."""
@@ -208,3 +191,47 @@ class CollisionChecker:
     def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:
         self._required[np.ix_(some, others)] = distance
         self._required[np.ix_(others, some)] = distance
+
+
+@compiled
+def is_free(
+    model: int,  # address
+    data: int,  # address
+    q: Array,  # (joints,), rad: to be checked
+    joints: NDArray[np.int64],  # (joints,): their addresses in qpos
+    qpos: Array,
+    tool: Array,  # (3,), m: where kinematics leave its position
+    turned: Array,  # (9,): and its rotation
+    offset: Array,  # (7,): pose of the held object in the tool's frame
+    quaternion: Array,  # (4,): room for the tool's
+    required: Array,  # (geoms, geoms), m: distances
+    number: NDArray[np.int32],  # of contacts, and so on: see `ContactViews`
+    geoms: NDArray[np.int32],
+    distance: Array,
+    held: int,  # address of the held object in qpos; -1: none
+    clearance: float,  # m: greatest distance that is required
+) -> bool:
+    """Bring arm and load to a configuration; return whether all pairs of geoms keep their distances."""
+    for j in range(len(joints)):
+        qpos[joints[j]] = q[j]
+    mj_kinematics(model, data)
+    if held >= 0:
+        for i in range(3):
+            along = turned[3 * i] * offset[0] + turned[3 * i + 1] * offset[1] + turned[3 * i + 2] * offset[2]
+            qpos[held + i] = tool[i] + along
+        mju_mat_to_quat(quaternion.ctypes.data, turned.ctypes.data)
+        mju_mul_quat(qpos[held + 3 : held + 7].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data)
+        mj_kinematics(model, data)
+    mj_collision(model, data)
+    for pair in range(number[0]):
+        if min(required[geoms[pair, 0], geoms[pair, 1]], clearance) - distance[pair] > 0.0:
+            return False
+    return True
+
+
+def preload() -> None:
+    """Load this module's compiled function."""
+    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+    none, square, room = np.zeros(0), np.zeros((0, 0)), contact_views(data.model, data)
+    arrays = none, np.zeros(0, dtype=int), none, np.zeros(3), np.zeros(9), np.zeros(7), np.zeros(4), square
+    is_free.load()(data.model._address, data._address, *arrays, *room, -1, 0.0)

@@ -8,6 +8,7 @@ from rack.levels.algebra import Array, mat_vec, norm
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
 from rack.levels.motion.path import BlendedPath, Path
+from rack.levels.planning import collision
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import SAME_RAD, InverseKinematics
 from rack.levels.planning.moves import VERB_NAMES, Move, Situation
@@ -29,6 +30,13 @@ LINES = (1, 2, 3, 4, 6, 8, 12, 16, 20)
 """Numbers of joint-space lines that are tried: the fewest that keep to the tool's line give the quickest path."""
 STRAY_SAMPLES = 5
 """Points of every joint-space line at which the tool's distance from its line is measured."""
+
+
+def preload() -> None:
+    """Load what every process that plans motions needs."""
+    import numpy.random  # noqa: F401  # numpy imports it at its first use
+
+    collision.preload()
 
 
 class MotionPlanner:

@@ -17,6 +17,7 @@ from rack.levels.messages import (
     SegmentKind,
 )
 from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Operation, Orders
+from rack.levels.planning import collision
 from rack.levels.primitive.guard import Guard, Sight
 from rack.levels.primitive.path_motion import JointSetPoint
 from rack.levels.primitive.planner import Plans
@@ -74,6 +75,11 @@ class PrimitiveExecutor(Executor):
         self._rest = JointSetPoint(self._position, *np.zeros((2, len(cell.home))))
         self._tick: int | None = None  # of the last cycle
         self._displaced = False  # the servo was out of step since the last path: the arm may not be at its end
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of collision checks."""
+        collision.preload()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read command, status, plan and world model; write the next set point and this level's status."""

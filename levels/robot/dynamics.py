@@ -40,7 +40,7 @@ class Terms(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """The newest evaluation of a `Dynamics`. The arrays stay the same ones."""
+    """The newest evaluation of a `Dynamics`, not to be written to. The arrays stay the same ones."""
 
     state: Array  # (2, joints), rad and rad/s; NaN: there is none
     inertia: Array  # (joints, joints), kg m2
@@ -59,15 +59,14 @@ class Dynamics:
         joints, nv = len(cell.dof), cell.model.nv
         self._wanted = np.zeros((2, joints))
         self.newest = Evaluated(np.full((2, joints), np.nan), np.zeros((joints, joints)), np.zeros(joints))
-        self._terms = Terms(*self.newest[1:])
-        self._loaded = Terms(np.zeros((joints, joints)), np.zeros(joints))
+        self._terms = Terms(np.zeros((joints, joints)), np.zeros(joints))  # a copy, with the payload
         self._offset = np.zeros(3)
         # Arguments of the compiled functions.
-        at = self._model._address, d._address, np.stack((cell.qpos, cell.dof))
-        self._evaluating = *at, d.qpos, d.qvel, d.qfrc_bias, d.qfrc_passive, np.zeros((nv, nv)), *self.newest
+        at, full = (self._model._address, d._address, np.stack((cell.qpos, cell.dof))), np.zeros((nv, nv))
+        self._evaluating = *at, d.qpos, d.qvel, d.qfrc_bias, d.qfrc_passive, full, *self.newest, *self._terms
         hand, tool = int(cell.model.site_bodyid[cell.tool]), (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
-        gravity = np.array(self._model.opt.gravity)
-        self._carrying = self._offset, *at, hand, *tool, gravity, np.zeros((2, 3, nv)), *self.newest, *self._loaded
+        gravity, jacobians = np.array(self._model.opt.gravity), np.zeros((2, 3, nv))
+        self._carrying = self._offset, *at, hand, *tool, gravity, jacobians, self.newest.state, *self._terms
         self._evaluate, self._carry = evaluate.load(), carry.load()
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
@@ -75,11 +74,10 @@ class Dynamics:
         """Return the terms at `q`, rad, and `qd`, rad/s, (joints,) each. The arrays are valid until the next call."""
         self._wanted[0], self._wanted[1] = q, qd
         self._evaluate(self._wanted, *self._evaluating)
-        if payload is None or not payload.mass > 0.0:
-            return self._terms
-        self._offset[:] = payload.offset
-        self._carry(float(payload.mass), *self._carrying)
-        return self._loaded
+        if payload is not None and payload.mass > 0.0:
+            self._offset[:] = payload.offset
+            self._carry(float(payload.mass), *self._carrying)
+        return self._terms
 
     def friction(self, velocity: Array) -> Array:
         """Return dry friction, N m, that opposes motion at `velocity`, rad/s, (joints,)."""
@@ -108,23 +106,27 @@ def evaluate(
     state: Array,
     inertia: Array,
     bias: Array,
+    inertia_copy: Array,
+    bias_copy: Array,
 ) -> None:
-    """Evaluate `inertia` and `bias` at the state `wanted`, (2, joints); `joints` are addresses in `qpos` and `qvel`."""
+    """Evaluate `inertia` and `bias` at the state `wanted`, (2, joints), unless that is `state` already; copy them.
+
+    `joints` are addresses in `qpos` and `qvel`.
+    """
     count, same = joints.shape[1], True
     for joint in range(count):
         same &= state[0, joint] == wanted[0, joint] and state[1, joint] == wanted[1, joint]
         state[0, joint] = qpos[joints[0, joint]] = wanted[0, joint]
         state[1, joint] = qvel[joints[1, joint]] = wanted[1, joint]
-    if same:
-        return
-    mj_fwd_position(model, data)
-    mj_fwd_velocity(model, data)
-    mj_full_m(model, data, full.ctypes.data)
+    if not same:
+        mj_fwd_position(model, data)
+        mj_fwd_velocity(model, data)
+        mj_full_m(model, data, full.ctypes.data)
     for joint in range(count):
         row = joints[1, joint]
-        bias[joint] = forces[row] - passive[row]
+        bias[joint] = bias_copy[joint] = forces[row] - passive[row]
         for other in range(count):
-            inertia[joint, other] = full[row, joints[1, other]]
+            inertia[joint, other] = inertia_copy[joint, other] = full[row, joints[1, other]]
 
 
 @compiled
@@ -142,8 +144,6 @@ def carry(
     state: Array,
     inertia: Array,
     bias: Array,
-    loaded_inertia: Array,
-    loaded_bias: Array,
 ) -> None:
     """Add a point mass at the tool: m J^T J to the inertia, m J^T (Jdot qd - g) to the bias."""
     centre = np.empty(3)
@@ -153,10 +153,6 @@ def carry(
     mj_jac(model, data, jacobians[0].ctypes.data, 0, centre.ctypes.data, hand)
     mj_jac_dot(model, data, jacobians[1].ctypes.data, 0, centre.ctypes.data, hand)
     count = joints.shape[1]
-    for joint in range(count):
-        loaded_bias[joint] = bias[joint]
-        for other in range(count):
-            loaded_inertia[joint, other] = inertia[joint, other]
     for axis in range(3):
         jacobian, change = jacobians[0, axis], jacobians[1, axis]
         acceleration = -gravity[axis]
@@ -164,9 +160,9 @@ def carry(
             acceleration += change[joints[1, joint]] * state[1, joint]
         for joint in range(count):
             force = mass * jacobian[joints[1, joint]]
-            loaded_bias[joint] += force * acceleration
+            bias[joint] += force * acceleration
             for other in range(count):
-                loaded_inertia[joint, other] += force * jacobian[joints[1, other]]
+                inertia[joint, other] += force * jacobian[joints[1, other]]
 
 
 def preload() -> None:
@@ -174,6 +170,6 @@ def preload() -> None:
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     data, joints, none, square = mujoco.MjData(model), np.zeros((2, 0), dtype=int), np.zeros(0), np.zeros((0, 0))
     at, state, place = (model._address, data._address, joints), np.zeros((2, 0)), np.zeros(3)
-    evaluate.load()(state, *at, none, none, none, none, square, state, square, none)
+    evaluate.load()(state, *at, none, none, none, none, square, state, square, none, square, none)
     jacobians = np.zeros((2, 3, 0))
-    carry.load()(0.0, place, *at, 0, place, np.zeros(9), place, jacobians, state, square, none, square, none)
+    carry.load()(0.0, place, *at, 0, place, np.zeros(9), place, jacobians, state, square, none)

@@ -45,12 +45,16 @@ class native(compiled[..., None]):  # noqa: N801  # stands for a function
 
 
 mj_step = native("mj_step", 2)
+mj_kinematics = native("mj_kinematics", 2)
+mj_collision = native("mj_collision", 2)
 mj_fwd_position = native("mj_fwdPosition", 2)
 mj_fwd_velocity = native("mj_fwdVelocity", 2)
 mj_full_m = native("mj_fullM", 3)
 mj_jac = native("mj_jac", 6)
 mj_jac_dot = native("mj_jacDot", 6)
 mj_get_state = native("mj_getState", 4)
+mju_mat_to_quat = native("mju_mat2Quat", 2)
+mju_mul_quat = native("mju_mulQuat", 3)
 mj_set_state = native("mj_setState", 4)
 
 

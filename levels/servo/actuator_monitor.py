@@ -51,10 +51,9 @@ class ActuatorMonitor:
             following,
             URGENT_SPEED_PART * cell.bounds.velocity,
         )
-        self._table = np.zeros((12 + joints, joints))  # in the rows of `left_over`
-        self._velocity, self._bias, self._torque, self._dry, early, least, uncertain, self._off = self._table[:8]
-        self._left, self._noise, *self._friction = self._table[8:12]
-        self._inertia = self._table[12:]
+        self._table = np.zeros((13 + joints, joints))  # in the rows of `left_over`
+        self._torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
+        self._left, self._noise, *self._friction, self._velocity = self._table[8:13]
         self._dry[:] = model.dof_frictionloss[dof]
         # Simulated friction slows a joint as a damper of that time constant does: if the joint brakes harder, the
         # friction changes sign before the velocity does.
@@ -70,10 +69,9 @@ class ActuatorMonitor:
         self._commanded = self._given = self._most = 0.0  # N m: commanded and given at first, most given since
         self._alone = True  # it is the only motor that lacks torque
 
-    def begin(self, velocity: Array, terms: Terms, torque: Array) -> None:
-        """Record velocity, rad/s, terms and commanded torques, N m, at the beginning of a cycle."""
-        self._velocity[...], self._bias[...], self._torque[...] = velocity, terms.bias, torque
-        self._inertia[...] = terms.inertia
+    def begin(self, torque: Array) -> None:
+        """Begin a cycle with commanded torques, N m, at the velocity and terms last looked at."""
+        self._torque[...] = torque
         self._begun = True
 
     def drop(self) -> None:
@@ -81,18 +79,22 @@ class ActuatorMonitor:
         self._begun = self._pushed = False
         self._cycles = 0
 
-    def look(self, velocity: Array, terms: Terms, astray: Array, holds: bool) -> Finding | None:
-        """Judge the cycle that ends now, at `velocity`, rad/s; `astray` is the distance from the set points, rad.
+    def look(self, state: tuple[Array, Array], terms: Terms, wanted: Array, holds: bool) -> Finding | None:
+        """Judge the cycle that ends now, at a state, rad and rad/s, where the set points are at `wanted`, rad.
+
+        Velocity and terms are kept for the cycle that may begin.
 
         `holds`: the gripper holds a part, which may touch something.
         """
+        position, velocity = state
+        verdict = self._judge(wanted, position, velocity, terms.inertia, terms.bias)
         if not self._begun:
             return None
-        verdict = self._judge(velocity, terms.inertia, terms.bias, astray)
         if verdict == EXPLAINED:
             self._cycles, self._pushed = 0, False
             return None
         if verdict == ASTRAY:
+            astray = wanted - position
             joint = int((np.abs(astray) - self._off).argmax())
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
         return self._lacking(self._left, velocity, holds)
@@ -144,17 +146,18 @@ class ActuatorMonitor:
 
 @compiled
 def left_over(
-    table: Array,  # (12 + joints, joints): rows as below
+    table: Array,  # (13 + joints, joints): rows as below
     period_s: float,
     following: float,  # rad
-    velocity: Array,  # (joints,), and so on: now
+    wanted: Array,  # (joints,), rad
+    position: Array,  # (joints,), rad, and so on: now
+    velocity: Array,
     inertia: Array,
     bias: Array,
-    astray: Array,  # (joints,), rad
 ) -> int:
-    """Compare the torques that a motion took with those commanded; return the verdict."""
+    """Compare the torques that a motion took with those commanded, keep what is now for then; return the verdict."""
     velocity_before, bias_before, torque = table[0], table[1], table[2]  # rad/s, N m, N m: at the cycle's beginning
-    inertia_before = table[12:]  # kg m2
+    inertia_before = table[13:]  # kg m2
     dry, early = table[3], table[4]  # friction, N m; time constant of the simulated one, s
     noise, uncertain = table[5], table[6]  # N m, rad/s2: of exact encoders, and acceleration that others may simulate
     off = table[7]  # rad: error of the positions
@@ -173,12 +176,17 @@ def left_over(
         table[8, j], table[9, j], table[10, j], table[11, j] = left, unsure, least, most
         if abs(left) > unsure:
             verdict = max(verdict, LEFT_OVER)
-        if abs(astray[j]) - off[j] > following:
+        if abs(wanted[j] - position[j]) - off[j] > following:
             verdict = ASTRAY
+    table[12] = velocity_before
+    for j in range(len(velocity)):
+        velocity_before[j], bias_before[j] = velocity[j], bias[j]
+        for k in range(len(velocity)):
+            inertia_before[j, k] = inertia[j, k]
     return verdict
 
 
 def preload() -> None:
     """Load this module's compiled functions."""
     square, joints = np.zeros((1, 1)), np.zeros(1)
-    left_over.load()(np.zeros((13, 1)), 1.0, 1.0, joints, square, joints, joints)
+    left_over.load()(np.zeros((14, 1)), 1.0, 1.0, joints, joints, joints, square, joints)

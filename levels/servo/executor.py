@@ -28,7 +28,7 @@ SCENES = Output(SCENE, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
 
 
-class Shown(NamedTuple):
+class SteadyStatus(NamedTuple):
     """What of a status seldom changes."""
 
     command: int
@@ -82,7 +82,8 @@ class ServoExecutor(Executor):
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._rest = np.zeros(len(cell.home))  # (joints,), always zero: velocity and acceleration at rest
         self._wanted = Motion(cell.home, self._rest, self._rest)  # motion wanted in the last cycle: rad, rad/s, rad/s2
-        self._shown: Shown | None = None  # in the last status
+        self._command = self._rests_on = 0  # serials of the newest command, and of the operator's that it rests on
+        self._shown: SteadyStatus | None = None  # in the last status
         self._started = False  # the first cycle has begun
         self._abandoned = False  # set points were abandoned in the last cycle: the arm was braked
 
@@ -111,12 +112,12 @@ class ServoExecutor(Executor):
         if reaction is Reaction.BRAKE:
             self._brake()
         elif sensors.fresh:
-            self._drive(read.command.value, sensed, reaction, missed, tick)
+            self._drive(sensed, reaction, missed, tick)
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
         self._brakes.after_cycle(tick, self.findings)
-        self._report(write.status, read.command.value.id, sensed, reaction)
-        self.operator.orders.report(write.status, read.command.value.operator)
+        self._report(write.status, sensed, reaction)
+        self.operator.orders.report(write.status, self._rests_on)
         self.arm.save(write.state)
         sensors.remember(write.state)
         self.stopping.remember(write.state)
@@ -125,11 +126,16 @@ class ServoExecutor(Executor):
 
     def _take_messages(self, read: Ports) -> None:
         """Take over what is new."""
-        self.operator.take(read.operator)
+        if read.operator.is_new:
+            self.operator.take(read.operator)
         if read.plan.is_new:
             self._loop.take(read.plan.value)
-        if read.command.is_new and self._grip is not None:
-            self._grip.take(read.command.value)
+        if read.command.is_new:
+            command: Message = read.command.value
+            self._command, self._rests_on = command.id, command.operator
+            self.reference.take(command)
+            if self._grip is not None:
+                self._grip.take(command)
 
     def _catch_up(self, before: Reading, tick: int) -> bool:
         """Advance the arm to `tick`; return whether cycles were missed. A restarted board first restores the arm."""
@@ -164,12 +170,12 @@ class ServoExecutor(Executor):
         self._wanted = Motion(self.sensors.position, self.sensors.velocity, self._rest)
         self._abandoned = True
 
-    def _drive(self, command: Message, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
+    def _drive(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
         """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is complete."""
         position, velocity = self.sensors.position, self.sensors.velocity
-        wanted = self._next_motion(command, reaction, missed, tick)
+        wanted = self._next_motion(reaction, missed, tick)
         terms = self._loop.terms(position, velocity)
-        failed = self.motors.look(velocity, terms, wanted.position - position, self._loop.holds)
+        failed = self.motors.look((position, velocity), terms, wanted.position, self._loop.holds)
         if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
             return self._brake()
         if reaction is Reaction.STOP and (self._abandoned or not wanted.velocity.any()):
@@ -180,9 +186,9 @@ class ServoExecutor(Executor):
         if refused is not None:
             return self._refuse(refused, tick)
         self._wanted, self._abandoned, self.stopping.refused = wanted, False, None
-        return self.motors.begin(velocity, terms, self.arm.torque)
+        return self.motors.begin(self.arm.torque)
 
-    def _next_motion(self, command: Message, reaction: Reaction, missed: bool, tick: int) -> Motion:
+    def _next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
         """Return the wanted motion; after braking it begins where the arm is."""
         sensors, reference = self.sensors, self.reference
         if self._abandoned:
@@ -191,7 +197,7 @@ class ServoExecutor(Executor):
             reference.meet(sensors.position, sensors.velocity, tick)
         if reaction:
             return reference.rest(tick)
-        return self.operator.wanted(reference, tick) if self.operator.stands else reference.at(command, tick)
+        return self.operator.wanted(reference, tick) if self.operator.stands else reference.at(tick)
 
     def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
         if not self.stopping.trying:
@@ -206,15 +212,15 @@ class ServoExecutor(Executor):
         self.stopping.refuse(finding, tick)
         self._brake()
 
-    def _report(self, status: Message, command: int, sensed: Sensed, reaction: Reaction) -> None:
-        """Fill the status that answers `command`; what seldom changes only when it does."""
+    def _report(self, status: Message, sensed: Sensed, reaction: Reaction) -> None:
+        """Fill the status; what seldom changes only when it does."""
         arm, sensors, wanted = self.arm, self.sensors, self._wanted
         status.position[...], status.velocity[...], status.torque[...] = sensors.position, sensors.velocity, arm.torque
         status.target[...], status.target_velocity[...] = wanted.position, wanted.velocity
         status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
         status.grip_force = arm.grip_force
         shown = (
-            command,
+            self._command,
             self._abandoned or self.reference.holding,
             self._abandoned or reaction > 0 or self.operator.stands,
             arm.braked,
@@ -228,10 +234,10 @@ class ServoExecutor(Executor):
             arm.fault,
         )
         if shown != self._shown:
-            self._shown = Shown(*shown)
+            self._shown = SteadyStatus(*shown)
             self._show(status, self._shown)
 
-    def _show(self, status: Message, shown: Shown) -> None:
+    def _show(self, status: Message, shown: SteadyStatus) -> None:
         """Fill in what seldom changes."""
         status.echo, status.holding, status.stopped, status.braked = shown[:4]
         status.demand, status.clipped, status.touches, status.violations, status.pushed = shown[4:9]

@@ -40,7 +40,7 @@ class SetPoint(NamedTuple):
 
 
 class Reference:
-    """Interpolates set points: tick by tick, `at(command, tick)` gives the motion wanted at that tick."""
+    """Interpolates set points: `take` takes them, and tick by tick `at(tick)` gives the motion wanted at that tick."""
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
         self._limits, self._tick_s = limits, tick_s
@@ -50,6 +50,8 @@ class Reference:
         self._motions = np.zeros((2, 3, joints))  # on the curve, and the difference
         self._wanted = Motion(*self._motions[0])
         self._interpolate, self._admit = interpolate.load(), admit.load()
+        self._command: Message | None = None  # the newest `JOINT_SET_POINT`
+        self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # the set point to follow after that
         self.goal: Array | None = None  # (joints,), rad: goal of `to`, until another motion begins; None: none
@@ -75,13 +77,16 @@ class Reference:
         else:
             self._join(position, velocity, tick)
 
-    def at(self, command: Message, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, given the newest `JOINT_SET_POINT`; its acceleration is mid-cycle."""
-        self._advance(tick)
-        due, waiting = command.due, self._next
-        if tick < due != self._due and (waiting is None or due != waiting.due):
-            self._receive(command, due, tick)
+    def take(self, command: Message) -> None:
+        """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is taken."""
+        self._command, self._offered = command, command.due
+
+    def at(self, tick: int) -> Motion:
+        """Return the motion wanted at `tick`, by the set points taken; its acceleration is mid-cycle."""
+        if self._next is not None:
             self._advance(tick)
+        if tick < self._offered != self._due:
+            self._receive(self._offered, tick)
         if not self.holding and tick >= self._due:
             last = self._motion(self._due)
             self.start(last.position, last.velocity, self._due)
@@ -110,8 +115,11 @@ class Reference:
         self._difference, self.goal = None, goal
         return self._motion(tick)
 
-    def _receive(self, command: Message, due: int, tick: int) -> None:
-        """Copy a set point. It waits until the one before it is due: some protocols deliver early."""
+    def _receive(self, due: int, tick: int) -> None:
+        """Copy the set point offered. It waits until the one before it is due: some protocols deliver early."""
+        command, waiting = self._command, self._next
+        if command is None or (waiting is not None and due == waiting.due):
+            return
         position, velocity = np.array(command.position), np.array(command.velocity)
         verdict = WRONG
         if (due - tick) * self._tick_s <= MAX_AHEAD_S:
@@ -119,6 +127,7 @@ class Reference:
         self.refused += verdict != WITHIN
         if verdict != WRONG:
             self._next = SetPoint(due, position, velocity)
+        self._advance(tick)
 
     def _advance(self, tick: int) -> None:
         """Begin the curve to the waiting set point when its time has come."""

@@ -112,5 +112,32 @@ def test_a_launch_resolves_and_checks_everything_once(small: Path, monkeypatch: 
     ]
     assert (len(found.faults), found.commands, found.ends_run) == (1, (), "upper.status")
     assert found.tasks[1].transfer.read_ns == 500_000
+    assert [task.wake for task in found.layout.tasks] == ["timer"] * 3
     clock = found.clock(10.0)
     assert (clock.stop_tick, clock.linger, clock.silent, clock.history) == (4000, 200, 12_000, 400)
+
+
+POLLING = (
+    "board.lower.wake=poll",
+    "board.lower.core=1",
+    "board.lower.coupling=loose",
+    "board.lower.planner_slot=9",
+    "board.lower.planner_core=0",
+)
+
+
+def test_a_board_may_wait_otherwise_than_the_rack_and_a_planner_does_not_poll(small: Path) -> None:
+    found = resolve(load(small, ["clock.wake=signal", *POLLING]))
+    assert {task.name: task.wake for task in found.layout.tasks} == {
+        "upper": "signal",
+        "lower": "poll",
+        "lower.planner": "timer",
+    }
+
+
+def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_gives_it_away(small: Path) -> None:
+    def core(mode: str, *settings: str) -> int:
+        return resolve(load(small, [f"clock.mode={mode}", "clock.core=0", *settings])).clock(None).core
+
+    assert (core("realtime", "board.lower.core=1"), core("lockstep", "board.lower.core=1")) == (0, 1)
+    assert core("lockstep", "board.upper.core=0", *POLLING) == 0

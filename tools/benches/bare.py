@@ -26,11 +26,15 @@ from rack.levels.level import Executor, Planner, Ports, Reading, Verdict
 
 @dataclass(frozen=True)
 class BareRun:
-    """A finished run. `processor_s` is the time of its ticks; `last` holds the last message of each mailbox."""
+    """A finished run. `processor_s` is the time of its ticks.
+
+    `last` is the newest message of each mailbox that was visible before the end, `serials` its number; without one, a
+    mailbox is left out.
+    """
 
     ticks: int
     processor_s: float
-    written: Mapping[str, int]
+    serials: Mapping[str, int]
     last: Mapping[str, np.ndarray]
 
 
@@ -51,6 +55,13 @@ class Post:
             self.serial += 1
             self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
+    def newest(self, tick: int) -> tuple[int, bytes] | None:
+        """Return serial and bytes of the newest message visible at `tick`; None: there is none."""
+        for visible_at, serial, data in reversed(self.kept):
+            if visible_at <= tick:
+                return serial, data
+        return None
+
 
 class PostReader:
     """One reader of a mailbox."""
@@ -61,21 +72,23 @@ class PostReader:
 
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, and its verdict."""
-        for visible_at, serial, data in reversed(self._post.kept):
-            if visible_at <= tick:
-                if serial == self._serial:
-                    return self._readings[Verdict.OLD]
-                self._serial = serial
-                self._message.raw[:] = data
-                return self._readings[Verdict.NEW]
-        return self._readings[Verdict.NONE]
+        newest = self._post.newest(tick)
+        if newest is None:
+            return self._readings[Verdict.NONE]
+        serial, data = newest
+        if serial == self._serial:
+            return self._readings[Verdict.OLD]
+        self._serial = serial
+        self._message.raw[:] = data
+        return self._readings[Verdict.NEW]
 
 
 class BareTask:
     """An executor or a planner with its ports."""
 
-    def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post]) -> None:
+    def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post], ticks: int) -> None:
         self.spec = layout.task(wiring.task)
+        self._ticks = ticks
         self._readers = [(port, PostReader(posts[name]).read) for port, name in wiring.inputs.items()]
         self._values = Ports(**{port: read(-1) for port, read in self._readers})
         self._posts = [posts[name] for name in wiring.outputs.values()]
@@ -102,9 +115,11 @@ class BareTask:
         self._read(tick)
         assert isinstance(self.level, Planner), "an executor executes"
         if self.level.wanted(self._values, tick):
-            self.level.plan(self._values, self._messages.plan, tick)
             self._busy_until = tick + self.spec.every * self.spec.within_cycles
-            self._write(tick)
+            # A rack does not wait for a plan that comes after its end.
+            if self._busy_until < self._ticks:
+                self.level.plan(self._values, self._messages.plan, tick)
+                self._write(tick)
 
     def _read(self, tick: int) -> None:
         values = self._values.__dict__
@@ -119,7 +134,7 @@ class BareTask:
 def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:
     """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it."""
     posts = {spec.name: Post(spec) for spec in layout.mailboxes}
-    tasks = [BareTask(layout, wiring, posts) for wiring in wirings]
+    tasks = [BareTask(layout, wiring, posts, ticks) for wiring in wirings]
     try:
         for task in tasks:
             task.level.self_test()
@@ -131,12 +146,12 @@ def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareR
     finally:
         for task in tasks:
             task.level.close()
-    written = {name: post for name, post in posts.items() if post.serial}
+    found = {name: newest for name, post in posts.items() if (newest := post.newest(ticks - 1)) is not None}
     return BareRun(
         ticks=ticks,
         processor_s=processor_s,
-        written={name: post.serial for name, post in written.items()},
-        last={name: np.frombuffer(post.kept[-1][2], post.dtype)[0] for name, post in written.items()},
+        serials={name: serial for name, (serial, _) in found.items()},
+        last={name: np.frombuffer(data, posts[name].dtype)[0] for name, (_, data) in found.items()},
     )
 
 

@@ -153,16 +153,20 @@ def _check(rack: str, seconds: float | None, folder: Path) -> int:
 
 
 def differences(recording: Recording, bare: BareRun) -> Iterator[str]:
-    """Yield every mailbox, or field of its last message, in which a recorded run and its levels alone differ."""
-    for name in sorted({*recording.mailboxes, *bare.written}):
-        serials = recording.signal(name, "serial") if name in recording.mailboxes else np.empty(0)
-        if not len(serials) or bare.written.get(name) != serials[-1]:
+    """Yield every mailbox, or field of a message, in which a recorded run and its levels alone differ.
+
+    The message of each mailbox is the newest that was visible before the end. A later one need not be recorded.
+    """
+    for name in sorted({*recording.mailboxes, *bare.serials}):
+        seen = np.flatnonzero(recording.signal(name, "visible_at") < bare.ticks)
+        serial = recording.signal(name, "serial")[seen[-1]] if len(seen) else None
+        if serial != bare.serials.get(name):
             yield f"the number of messages in {name}"
-            continue
-        last = bare.last[name]
-        for field in sorted(recording.fields(name) & set(last.dtype.names or ())):
-            if not np.array_equal(_plain(recording.signal(name, field)[-1]), _plain(last[field])):
-                yield f"{name}, field {field}"
+        elif serial is not None:
+            last = bare.last[name]
+            for field in sorted(recording.fields(name) & set(last.dtype.names or ())):
+                if not np.array_equal(_plain(recording.signal(name, field)[seen[-1]]), _plain(last[field])):
+                    yield f"{name}, field {field}"
 
 
 def _plain(value: Any) -> Any:

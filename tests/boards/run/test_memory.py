@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from rack.backplane.process import set_priority
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
-from tests.processes import exit_status, fork, in_thread, wait_until
+from tests.machine import needs_fifo
+from tests.processes import in_thread, wait_until
 
 FIRST = 40
 """Cycles in which a process may still meet a page for the first time."""
@@ -26,9 +24,8 @@ def faults_of(pid: int) -> int:
     return int(fields[7]) + int(fields[9])
 
 
+@needs_fifo
 def test_no_page_fault_comes_in_a_cycle_after_the_first_ones(config: MakeConfig) -> None:
-    if exit_status(fork(lambda: set_priority(1))):
-        pytest.skip("real-time priorities are refused here")
     rack = Rack(config("clock.mode=realtime", *PRIORITIES, text=PLAIN))
     found: dict[str, list[int]] = {}
     with rack:

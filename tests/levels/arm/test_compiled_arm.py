@@ -113,6 +113,27 @@ def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> 
     assert [len(machine.signatures) for machine in machines] == [1] * len(machines)  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize("elsewhere", [0.0, 1e-3])
+def test_the_gate_predicts_with_the_controllers_evaluation_only_if_it_is_of_the_arms_state(elsewhere: float) -> None:
+    made, looked = cell("puma560"), list[Array]()
+    arm, alone = (SimulatedArm(made, config("puma560")[1], CLOCK_NS) for _ in range(2))
+    admit = arm._gate.admit
+
+    def counted(torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
+        looked.append(q)
+        return admit(torque, q, qd)
+
+    arm._gate.admit = counted  # type: ignore[method-assign]
+    for _ in range(30):
+        sensed = arm.sense()
+        bias = arm.dynamics.terms(sensed.position + elsewhere, sensed.velocity).bias.copy()
+        for one in (arm, alone):
+            one.drive(bias, 0.0)
+            one.step(1)
+    assert len(looked) == (30 if elsewhere else 0)
+    assert np.array_equal(arm.sense().position, alone.sense().position)
+
+
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_what_is_clear_of_all_limits_would_also_pass_a_careful_look(name: str) -> None:
     made = cell(name)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker
+from rack.levels.planning import collision
+from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, is_free
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.robot.cell import Cell, build_cell
@@ -159,3 +161,21 @@ def test_arm_may_be_near_the_fixed_body_that_carries_it(tmp_path: Path) -> None:
     checker = CollisionChecker(build_cell(robot, scene, CLOCK_NS), scene)
     assert checker.free(np.zeros(1))
     assert not checker.free(np.array([3.0]))
+
+
+@pytest.mark.parametrize("held", [None, BLOCK1])
+def test_compiled_checks_decide_as_python_does_and_are_loaded_before(puma: Cell, held: int | None) -> None:
+    collision.preload()
+    loaded = list(is_free.load().signatures)  # type: ignore[attr-defined]
+    checker, under_python = (CollisionChecker(puma, config("puma560")[1]) for _ in range(2))
+    under_python._is_free = partial(is_free, *under_python._is_free.args)
+    rng, decided = np.random.default_rng(4), set()
+    for one in (checker, under_python):
+        one.hold(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))
+    for q in puma.home + rng.normal(0.0, 0.6, (100, len(puma.home))):
+        free = checker.free(q)
+        assert under_python.free(q) == free == (checker.why(q) == "")
+        assert np.array_equal(checker._data.qpos, under_python._data.qpos)
+        decided.add(free)
+    assert decided == {True, False}
+    assert list(is_free.load().signatures) == loaded  # type: ignore[attr-defined]

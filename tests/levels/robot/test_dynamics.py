@@ -98,6 +98,16 @@ def test_terms_do_not_depend_on_what_was_asked_before(puma: Cell) -> None:
     assert np.array_equal(first.bias, second.bias)
 
 
+def test_terms_may_be_changed_by_who_asked_for_them(puma: Cell) -> None:
+    dynamics, (q, qd) = Dynamics(puma), np.random.default_rng(6).uniform(-1, 1, (2, 6))
+    once = dynamics.terms(q, qd)
+    bias, known = once.bias.copy(), dynamics.newest.bias.copy()
+    for array in once:
+        array[:] = 7.0
+    assert np.array_equal(dynamics.newest.bias, known)
+    assert np.array_equal(dynamics.terms(q, qd).bias, bias)
+
+
 def test_a_payload_acts_like_a_small_mass_fixed_to_the_tool(tmp_path: Path) -> None:
     robot, _ = config("puma560")
     mass, offset = 1.7, np.array([0.02, -0.03, 0.05])

@@ -200,6 +200,7 @@ class Bench:
     def __init__(self) -> None:
         self.monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)
         self.terms = Dynamics(CELL).terms(CELL.home, REST)
+        self.monitor.look((REST, REST), self.terms, REST, False)
 
     def leave(self, cycles: int, holds: bool = False, **left: float) -> list[Finding]:
         """Leave these torques over, N m, by joint from `j1` on, for some cycles; return what is found."""
@@ -209,8 +210,8 @@ class Bench:
         found = []
         for _ in range(cycles):
             taken = np.where(over, np.copysign(HELD_BY_FRICTION, over), 0.0)
-            self.monitor.begin(REST, self.terms, self.terms.bias + over + taken)
-            found.append(self.monitor.look(REST, self.terms, REST, holds))
+            self.monitor.begin(self.terms.bias + over + taken)
+            found.append(self.monitor.look((REST, REST), self.terms, REST, holds))
         return [finding for finding in found if finding is not None]
 
 

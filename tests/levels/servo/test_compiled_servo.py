@@ -52,8 +52,8 @@ def table(seed: int) -> Array:
 def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
     """Return the arguments of `left_over`."""
     before, inertia = noise(seed, 3, JOINTS), noise(seed + 1, 2, JOINTS, JOINTS)
-    table = np.concatenate((before, rules * np.abs(noise(seed + 2, 5, JOINTS)), np.zeros((4, JOINTS)), inertia[0]))
-    return table, 0.0025, float(following), noise(seed + 3), inertia[1], noise(seed + 4), noise(seed + 5)
+    table = np.concatenate((before, rules * np.abs(noise(seed + 2, 5, JOINTS)), np.zeros((5, JOINTS)), inertia[0]))
+    return table, 0.0025, float(following), *noise(seed + 3, 3, JOINTS), inertia[1], noise(seed + 4)
 
 
 def wanted_of(seed: int, limit: float) -> tuple[Any, ...]:

@@ -26,7 +26,7 @@ def test_levels_without_a_rack_write_what_they_write_in_one(tmp_path_factory: py
     assert list(differences(recording, bare)) == []
     assert bare.processor_s > 0.0
     # Other work is noticed: one message less, or one value that differs in its last bit.
-    fewer = replace(bare, written={**bare.written, "servo.plan": bare.written["servo.plan"] - 1})
+    fewer = replace(bare, serials={**bare.serials, "servo.plan": bare.serials["servo.plan"] - 1})
     assert list(differences(recording, fewer)) == ["the number of messages in servo.plan"]
     status = bare.last["servo.status"].copy()
     status["position"][0] = np.nextafter(status["position"][0], 10.0)
