@@ -13,7 +13,6 @@ from pathlib import Path
 from time import process_time_ns
 
 from rack.backplane.layout import TaskSpec
-from rack.backplane.memory import lock_memory
 
 GONE = "ZX"
 """States of a process that has ended."""
@@ -92,6 +91,9 @@ def take_processor(spec: TaskSpec) -> int:
     priority = spec.priority if set_priority(spec.priority) else 0
     # Ordinary processes wake up to 50 us late without this, to save power.
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    # Here, not above: it needs numpy, for which `rack list` and the like should not wait.
+    from rack.backplane.memory import lock_memory
+
     lock_memory()
     return priority
 

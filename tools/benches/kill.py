@@ -53,10 +53,13 @@ class Killing:
         seen: list[Event] = []
         with Rack(config, seen.append) as rack:
             rack.start()
-            for _ in range(self._kills):
+            while len(found[SAFE]) < self._kills:
                 _watch(rack, SETTLE_S + self._random.uniform(0.0, PHASES_S), lambda: False)
-                for what, seconds in self._kill(rack, board, seen).items():
-                    found[what].append(seconds)
+                reaction = self._kill(rack, board, seen)
+                # On a busy machine the brakes may have engaged for another reason, just before the kill.
+                if reaction[SAFE] > 0.0:
+                    for what, seconds in reaction.items():
+                        found[what].append(seconds)
             rack.stop("measured")
             while rack.watch(LOOK_S):
                 continue
@@ -78,17 +81,19 @@ class Killing:
         seen.clear()
         block = rack.segment.block(board)
         killed_ns, offset_ns = time.monotonic_ns(), time.time_ns() - time.monotonic_ns()
+        tick = rack.segment.words[System.TICK]
         os.kill(block[Block.PID], signal.SIGKILL)
 
+        def first(code: str) -> Event | None:
+            return next((event for event in seen if event.code == code and event.tick >= tick), None)
+
         def is_over() -> bool:
-            codes = {event.code for event in seen if event.board == board or event.code == "brakes_closed"}
-            return codes >= {"died", "brakes_closed"} and block[Block.STATE] == TaskState.RUNNING
+            return bool(first("died") and first("brakes_closed")) and block[Block.STATE] == TaskState.RUNNING
 
         _watch(rack, REACT_S, is_over)
-        if not is_over():
+        died, braked = first("died"), first("brakes_closed")
+        if died is None or braked is None:
             raise Failure(f"'{board}' was killed: no reaction within {REACT_S:g} s")
-        died = next(event for event in seen if event.code == "died" and event.board == board)
-        braked = next(event for event in seen if event.code == "brakes_closed")
         return {
             DETECTED: (died.time_ns - offset_ns - killed_ns) * 1e-9,
             SAFE: (self._braked_ns(rack, braked, offset_ns) - killed_ns) * 1e-9,

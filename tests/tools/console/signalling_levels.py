@@ -21,7 +21,7 @@ def send(moment: str) -> None:
             os.kill(here(), int(number))
 
 
-send("crate" if "rack.boards.crate" in sys.argv[0] or sys.argv[0].endswith("crate.py") else "config")
+send("crate" if sys.argv[0].endswith("crate/__main__.py") else "config")
 
 
 class Signalling(Upper):
