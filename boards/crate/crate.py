@@ -21,6 +21,7 @@ from multiprocessing.connection import Connection
 
 from rack.backplane import semaphores
 from rack.backplane.lines import UtilityLines
+from rack.backplane.memory import note_used_files
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
@@ -105,6 +106,7 @@ class Crate:
             _compile_cell(wanted.cell)
         gc.freeze()
         gc.enable()
+        note_used_files()
 
     def _is_preloaded(self, reference: str) -> bool:
         """Import a class and preload it; return False if it failed to preload."""
