@@ -239,7 +239,7 @@ def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ah
     assert cycle.wait() == 0
     # The task is kept from its core from its first grid point to shortly before its second: a clock that works ahead
     # has released both.
-    start_grid(bus, -(2 * EVERY * PERIOD_NS - PERIOD_NS))
+    start_grid(bus, 2 * EVERY * PERIOD_NS - PERIOD_NS)
     publish(bus, 2 * EVERY)
     assert (cycle.wait(), cycle.skipped) == (EVERY, 0)
     assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 0)
