@@ -85,6 +85,7 @@ class Crate:
             case Open(rack, priority):
                 self._segment = Segment.attach(rack)
                 semaphores.open_all(self._segment.layout)
+                note_used_files()
                 set_priority(priority)
                 self._line.send(Opened())
             case PowerOn(name, TaskWiring() as task):
@@ -106,7 +107,6 @@ class Crate:
             _compile_cell(wanted.cell)
         gc.freeze()
         gc.enable()
-        note_used_files()
 
     def _is_preloaded(self, reference: str) -> bool:
         """Import a class and preload it; return False if it failed to preload."""
