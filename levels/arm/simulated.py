@@ -12,12 +12,13 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
 from rack.levels.arm.arm import Arm, Sensed
-from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, Motors, give
+from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, give
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
 from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.engine import one_view
 from rack.levels.tables import MotionConfig, SceneConfig
 
 STRUCK_TICKS = 40
@@ -63,12 +64,12 @@ class SimulatedArm(Arm):
         ]
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._struck = 0  # ticks for which the motion is still blamed on a blow
-        self._asked, self._command = np.zeros((2, joints))  # N m: the newest command, and the one in force
+        # N m: the newest command, the one in force, and its torque as given.
+        self._asked, self._command, self.torque = torques = np.zeros((3, joints))
         self._given = False  # the command for the coming tick has passed the gate
-        motors = Motors(
-            self._steps.joints, cell.actuators, d.qpos, d.qvel, d.ctrl, d.qfrc_applied, self._command, self.torque
-        )
-        self._clear = *self.dynamics.newest, *self._gate.clearance, *motors
+        memory, (qpos, qvel, ctrl, brakes) = one_view(d.qpos, d.qvel, d.ctrl, d.qfrc_applied)
+        places = np.stack((qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof))
+        self._clear = torques, self.dynamics.newest, *self._gate.clearance, places, memory
         self._give_clear, self._advance, self._copy_state = give.load(), advance.load(), copy_state.load()
         # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda _: None)
@@ -107,7 +108,7 @@ class SimulatedArm(Arm):
         self._asked[:] = torque
         if self._grip is not None and math.isfinite(grip_force):
             self._cells.ctrl[self._grip] = self.grip_force = grip_force
-        if self._most is None and self._give_clear(self._asked, *self._clear):
+        if self._most is None and self._give_clear(*self._clear):
             self.waited, self.braked, self._given = 0, False, True
             return None
         finding = self.refused(torque)
@@ -223,7 +224,7 @@ class SimulatedArm(Arm):
             self._struck = STRUCK_TICKS if broken else self._struck - 1
         self.fault = self._broken()
         if self.fault:
-            mujoco.mj_setState(self._model, self._data, self._steps.before, STATE)
+            mujoco.mj_setState(self._model, self._data, self._steps.states[0], STATE)
             self._refresh()
         self._data.time = self._after_s
         contacts, limits = self._contacts, self._limits
