@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,14 +24,6 @@ STRUCK_TICKS = 40
 """Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the blow."""
 
 
-class Cells(NamedTuple):
-    """Views of MuJoCo's state that give single numbers in a third of the time of an array's."""
-
-    qpos: memoryview[float]
-    qvel: memoryview[float]
-    ctrl: memoryview[float]
-
-
 class SimulatedArm(Arm):
     """Implements `Arm`: `substeps` MuJoCo steps a tick; simulated time is tick times period, always.
 
@@ -48,7 +39,9 @@ class SimulatedArm(Arm):
         self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
         self._state = self._steps.seen[-1, 0], self._steps.seen[-1, 1]  # (joints,): true positions and velocities
         self._refresh()
-        self._cells = Cells(memoryview(d.qpos), memoryview(d.qvel), memoryview(d.ctrl))
+        self._addresses = self._steps.model, self._steps.data
+        # They give single numbers in a third of the time of an array's.
+        self._qpos, self._qvel, self._ctrl = memoryview(d.qpos), memoryview(d.qvel), memoryview(d.ctrl)
         self._grip = cell.gripper_actuator
         gripped = cell.gripper_qpos, cell.gripper_dof
         self._gripper = None if gripped[0] is None or gripped[1] is None else (gripped[0], gripped[1])
@@ -63,7 +56,6 @@ class SimulatedArm(Arm):
             for mocap, body, name in obstacles
         ]
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
-        self._struck = 0  # ticks for which the motion is still blamed on a blow
         # N m: the newest command, the one in force, and its torque as given.
         self._asked, self._command, self.torque = torques = np.zeros((3, joints))
         self._given = False  # the command for the coming tick has passed the gate
@@ -96,7 +88,7 @@ class SimulatedArm(Arm):
         if self._gripper is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
         at, dof = self._gripper
-        return Sensed(position, velocity, self._cells.qpos[at], self._cells.qvel[dof], self.tick)
+        return Sensed(position, velocity, self._qpos[at], self._qvel[dof], self.tick)
 
     def _refresh(self) -> None:
         """Take positions and velocities of the joints from MuJoCo's state: it was set by other than a step."""
@@ -107,7 +99,7 @@ class SimulatedArm(Arm):
         """Release the brakes and give torques and gripper force for the coming torque cycle; see `Link.drive`."""
         self._asked[:] = torque
         if self._grip is not None and math.isfinite(grip_force):
-            self._cells.ctrl[self._grip] = self.grip_force = grip_force
+            self._ctrl[self._grip] = self.grip_force = grip_force
         if self._most is None and self._give_clear(*self._clear):
             self.waited, self.braked, self._given = 0, False, True
             return None
@@ -159,8 +151,7 @@ class SimulatedArm(Arm):
         """Fill an `ARM_STATE`."""
         before = self._saved
         super().save(state)
-        self._copy_state(self._steps.model, self._steps.data, state.state)
-        state.struck = self._struck
+        self._copy_state(*self._addresses, state.state)
         if self.braked or self._saved is not before:
             state.rest = self._brake.rest
 
@@ -169,12 +160,12 @@ class SimulatedArm(Arm):
         super().restore(state)
         d, cell = self._data, self.cell
         mujoco.mj_setState(self._model, d, state.state, STATE)
-        self._contacts.count, self._struck = state.touches, state.struck
+        self._contacts.count = state.touches
         self._limits.count, self._limits.pushed = state.violations, state.pushed
         np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
-        self.grip_force = 0.0 if self._grip is None else self._cells.ctrl[self._grip]
+        self.grip_force = 0.0 if self._grip is None else self._ctrl[self._grip]
         self._given = True
         self._refresh()
 
@@ -202,11 +193,11 @@ class SimulatedArm(Arm):
         """Simulate one tick."""
         for mocap, motion in self._motions:
             self._data.mocap_pos[mocap] = motion.position(self._now_s)
-        made = self._advance(0, self._after_s, *self._steps)
+        made = self._advance(0, (self.tick + 1) * self._clock_ns * 1e-9, *self._steps)
         if made < 0:
             self._look_closer(-made)
-        elif self._struck:
-            self._struck -= 1
+        elif self.struck:
+            self.struck -= 1
 
     def _look_closer(self, made: int) -> None:
         """Finish a tick of which step `made` is not as it should be; on a fault, restore the state before the tick."""
@@ -218,10 +209,10 @@ class SimulatedArm(Arm):
                 made = -made
                 self._contacts.look(self._data)
         if self._contacts.count > touches and self._contacts.struck is not None:
-            self._struck = STRUCK_TICKS
-        broken = self._limits.judge(self._now_s, self._struck > 0)
-        if self._struck:
-            self._struck = STRUCK_TICKS if broken else self._struck - 1
+            self.struck = STRUCK_TICKS
+        broken = self._limits.judge(self._now_s, self.struck > 0)
+        if self.struck:
+            self.struck = STRUCK_TICKS if broken else self.struck - 1
         self.fault = self._broken()
         if self.fault:
             mujoco.mj_setState(self._model, self._data, self._steps.states[0], STATE)
