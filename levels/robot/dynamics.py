@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 from rack.levels.algebra import Array, each
 from rack.levels.compiled import compiled
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.engine import mj_fwd_position, mj_fwd_velocity, mj_jac, mj_jac_dot, one_view
+from rack.levels.robot.engine import (
+    mj_com_pos,
+    mj_flex,
+    mj_fwd_velocity,
+    mj_jac,
+    mj_jac_dot,
+    mj_kinematics,
+    mj_make_m,
+    mj_tendon,
+    mj_transmission,
+    one_view,
+)
 
 FRICTION_SPEED = 0.01
 """Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at zero speed would excite the arm."""
@@ -118,7 +129,12 @@ def evaluate(model: int, data: int, places: NDArray[np.int64], memory: Array, ev
             same &= newest[row, joint] == given[row, joint]
             newest[row, joint] = memory[places[row, joint]] = given[row, joint]
     if not same:
-        mj_fwd_position(model, data)
+        mj_kinematics(model, data)  # with the next five, all that `mj_fwdPosition` does for inertia and bias
+        mj_com_pos(model, data)
+        mj_flex(model, data)
+        mj_tendon(model, data)
+        mj_make_m(model, data)
+        mj_transmission(model, data)
         mj_fwd_velocity(model, data)
         for joint in range(joints):
             newest[BIAS_ROW, joint] = memory[places[2, joint]] - memory[places[3, joint]]
