@@ -41,7 +41,9 @@ class SimulatedArm(Arm):
         self._refresh()
         self._addresses = self._steps.model, self._steps.data
         # They give single numbers in a third of the time of an array's.
-        self._qpos, self._qvel, self._ctrl = memoryview(d.qpos), memoryview(d.qvel), memoryview(d.ctrl)
+        self._qpos: memoryview[float] = memoryview(d.qpos)
+        self._qvel: memoryview[float] = memoryview(d.qvel)
+        self._ctrl: memoryview[float] = memoryview(d.ctrl)
         self._grip = cell.gripper_actuator
         gripped = cell.gripper_qpos, cell.gripper_dof
         self._gripper = None if gripped[0] is None or gripped[1] is None else (gripped[0], gripped[1])

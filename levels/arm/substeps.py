@@ -117,5 +117,6 @@ def preload() -> None:
     data, table, touch = mujoco.MjData(model), np.zeros((3, 3, 0)), np.zeros((0, 0), dtype=bool)
     states = np.zeros((2, mujoco.mj_stateSize(model, STATE)))
     own: list[Any] = [np.zeros((4, 0), dtype=int), np.zeros(0), table, states, data.warning.number]
-    advance.load()(1, 0.0, model._address, data._address, *own, *contact_views(model, data), touch)
+    own += [*contact_views(model, data), touch]
+    advance.load()(1, 0.0, model._address, data._address, *own)
     copy_state.load()(model._address, data._address, states[0])
