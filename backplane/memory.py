@@ -6,7 +6,7 @@ ask for it again: a page fault in every second cycle for the first seconds, and 
 
 `mlockall` without MCL_ONFAULT would do it in one call, but it also fills memory that was reserved and never used, twice
 of what a board needs, and later mappings at once. So pages are locked as they are touched, and touched here by kind:
-memory of the process itself where it is in use, the segment and the libraries whole.
+memory of the process itself where it is in use, files where the crate has used them, the segment whole.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ RESERVE = 4 << 20
 """Bytes of heap kept beyond those in use."""
 GAP = 16
 """Unused pages between used ones that are touched with them: one call takes as long as some pages."""
+_USER_END = 1 << 63
+"""Addresses from here on are the kernel's, as [vsyscall]."""
 _PRESENT = 63
 """Bit of /proc/self/pagemap: the page is in memory."""
 
@@ -40,21 +42,40 @@ def lock_memory() -> None:
     gc.disable()
 
 
+_FILES: list[tuple[int, int]] = []
+"""First and last address of every stretch of a library that the crate has used."""
+
+
+def note_used_files() -> None:
+    """Note which pages of files this process has used: a fork forgets that, and its memory is touched by it."""
+    _FILES[:] = [stretch for _, rights, pages in _mappings() if rights[:2] == "r-" for stretch in pages]
+
+
 def touch_memory() -> None:
-    """Touch every page that a cycle may need, and let the C library keep what it has obtained."""
+    """Touch every page that a cycle may need, and let the C library keep what it has obtained.
+
+    It takes about a tenth of a second, mostly to copy what is shared with the crate.
+    """
     _libc.mallopt(_M_TRIM_THRESHOLD, -1)
     _libc.mallopt(_M_MMAP_MAX, 0)
     reserve = ctypes.create_string_buffer(RESERVE)
     del reserve
+    for span, rights, used in _mappings():
+        # What is shared with other processes is the segment.
+        for first, last in [span] if rights == "rw-s" else used if rights[1] == "w" else ():
+            _libc.madvise(first, last - first, _POPULATE_WRITE)
+    for first, last in _FILES:
+        _libc.madvise(first, last - first, _POPULATE_READ)
+
+
+def _mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
+    """Yield span, rights and the stretches in memory of every mapping of this process that it may read."""
     with Path("/proc/self/pagemap").open("rb", buffering=0) as pagemap:
         for line in Path("/proc/self/maps").read_text().splitlines():
-            span, rights, _, device, *_ = line.split(maxsplit=4)
-            start, end = (int(address, 16) for address in span.split("-"))
-            if rights == "rw-p" and device == "00:00":
-                for first, last in _used(pagemap.fileno(), start, end):
-                    _libc.madvise(first, last - first, _POPULATE_WRITE)
-            elif rights[0] == "r":
-                _libc.madvise(start, end - start, _POPULATE_WRITE if rights[1] == "w" else _POPULATE_READ)
+            addresses, rights, *_ = line.split(maxsplit=2)
+            start, end = (int(address, 16) for address in addresses.split("-"))
+            if rights[0] == "r" and start < _USER_END:
+                yield (start, end), rights, list(_used(pagemap.fileno(), start, end))
 
 
 def _used(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:

@@ -129,7 +129,8 @@ def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
         text=True,
         timeout=BOUND_S,
         check=False,
-        env={**os.environ, "PYTHONPATH": str(folder)},
+        # Code that is compiled for the copy goes with it.
+        env={**os.environ, "PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder / "cache")},
     )
     return done.returncode, done.stdout + done.stderr
 

@@ -78,7 +78,10 @@ class NextCycle:
             is_over = words[_STATE] == _STOPPED
             # The task's own release, not the clock's tick: in lockstep its turn may come later in a tick.
             newest = block[_RELEASED]
-            if newest >= self._due and not (self._sleeps and self._is_ahead(newest)):
+            if self._sleeps and newest >= self._due and self._is_ahead(newest):
+                # A task woken late may find the next release there already: the one before it is still to be taken.
+                newest -= self._spec.every
+            if newest >= self._due:
                 if is_posted:
                     # Its post, which nobody waited for: else the semaphore would overflow within weeks.
                     self._semaphore.take()

@@ -21,6 +21,7 @@ from multiprocessing.connection import Connection
 
 from rack.backplane import semaphores
 from rack.backplane.lines import UtilityLines
+from rack.backplane.memory import note_used_files
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
@@ -84,6 +85,7 @@ class Crate:
             case Open(rack, priority):
                 self._segment = Segment.attach(rack)
                 semaphores.open_all(self._segment.layout)
+                note_used_files()
                 set_priority(priority)
                 self._line.send(Opened())
             case PowerOn(name, TaskWiring() as task):

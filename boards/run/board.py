@@ -24,6 +24,8 @@ from rack.levels.level import Executor, Planner
 
 SELF_TEST_FAILED = 3
 """Exit status of a board whose start-up test failed."""
+FAST_NS = 10_000_000
+"""Longest cycle that page faults can spoil: all take some milliseconds, touching the memory a tenth of a second."""
 
 
 def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
@@ -70,7 +72,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         if wiring.fails_self_test:
             raise LevelError("self-test failed: injected by a fault in the config")
         UtilityLines(segment).release_sysfail(spec.slot)
-        if spec.priority and not segment.words[System.LOCKSTEP]:
+        is_fast = spec.every * segment.layout.clock_ns <= FAST_NS
+        if is_fast and spec.priority and not segment.words[System.LOCKSTEP]:
             # Still at ordinary priority: a board that is restarted must not delay another board's cycle.
             touch_memory()
         block[Block.PRIORITY] = take_processor(spec)

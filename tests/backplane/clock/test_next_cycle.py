@@ -232,6 +232,20 @@ def test_a_sleeping_task_sleeps_on_to_its_next_grid_point_if_the_clock_skips_one
 
 
 @TIMER
+def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ahead(bus: Segment) -> None:
+    cycle = NextCycle(bus, "level")
+    start_grid(bus, -PERIOD_NS)
+    publish(bus, 0)
+    assert cycle.wait() == 0
+    # The task is kept from its core from its first grid point to shortly before its second: a clock that works ahead
+    # has released both.
+    start_grid(bus, 2 * EVERY * PERIOD_NS - PERIOD_NS)
+    publish(bus, 2 * EVERY)
+    assert (cycle.wait(), cycle.skipped) == (EVERY, 0)
+    assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 0)
+
+
+@TIMER
 def test_a_late_clock_wakes_a_sleeping_task_with_a_post(bus: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
     hour_ns = 3_600_000_000_000

@@ -152,7 +152,8 @@ def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) ->
     outcome, events = run(faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 120}))
     (stopped,) = of(events, "detection", "clock_stopped")
     assert stopped.board == "wave"
-    assert stopped.since == 120
+    # The clock itself may have been late and skipped the fault's tick.
+    assert stopped.since == of(events, "fault", "begins")[0].tick
     assert of(events, "recovery", "rejoined")[0].board == "clock"
     assert outcome.worked
 
