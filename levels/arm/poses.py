@@ -15,7 +15,7 @@ from rack.levels.robot.cell import Cell, sizes
 from rack.levels.robot.engine import mj_kinematics, mju_mat_to_quat, one_view
 
 
-class Poses(NamedTuple):
+class PoseViews(NamedTuple):
     """First arguments of `show`, prepared once."""
 
     model: int  # address
@@ -26,7 +26,7 @@ class Poses(NamedTuple):
     quaternion: int  # where the tool's is in a scene
 
 
-def poses(cell: Cell, data: mujoco.MjData) -> Poses:
+def poses(cell: Cell, data: mujoco.MjData) -> PoseViews:
     """Return the arguments of `show` for `data` of a cell."""
     scene, number = SCENE.dtype(sizes(cell)), np.dtype(np.float64).itemsize
     begins = {name: field[1] // number for name, field in (scene.fields or {}).items()}
@@ -40,7 +40,7 @@ def poses(cell: Cell, data: mujoco.MjData) -> Poses:
         where = first + width * rows[:, None] + np.arange(width)
         places[begin : begin + where.size] = where.ravel()
     turned = data.site_xmat[cell.tool]
-    return Poses(cell.model._address, data._address, places, memory, turned, begins["tool_quaternion"])
+    return PoseViews(cell.model._address, data._address, places, memory, turned, begins["tool_quaternion"])
 
 
 @compiled
