@@ -1,6 +1,6 @@
 """The arm: its interface to the servo level, the simulated one, and the faults injected between the two."""
 
-from rack.levels.arm import drives, substeps
+from rack.levels.arm import drives, poses, substeps
 from rack.levels.arm.arm import Arm, Link, Sensed, find_arm
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.simulated import SimulatedArm
@@ -11,5 +11,5 @@ __all__ = ["Arm", "FaultyLink", "Link", "Sensed", "SimulatedArm", "find_arm", "p
 
 def preload() -> None:
     """Load the compiled functions of an arm, for any robot: see `Executor.preload`."""
-    for module in (dynamics, substeps, drives):
+    for module in (dynamics, substeps, drives, poses):
         module.preload()

@@ -13,12 +13,12 @@ import importlib
 from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
-import mujoco
 import numpy as np
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
+from rack.levels.arm.poses import poses, show
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -75,11 +75,13 @@ class Arm(ABC):
         self.touches = 0  # unintended contacts so far
         self.first_touch = ""  # the first of them, readable: which geoms, and when
         self.violations = 0  # steps in which the drives broke a limit of position, velocity or torque
+        self.struck = 0  # ticks for which the motion is still blamed on a blow
         self.pushed = 0  # steps in which a blow pushed a joint beyond a limit of position or velocity
         self.first_violation = ""  # the first violation, readable: which limit, by how much, and when
         self.dynamics = Dynamics(cell)  # for the level that drives the arm; one that senses exactly shares it with it
         self._saved: tuple[Message, tuple[int, ...]] | None = None  # last message filled, with what seldom changes
         self._data = cell.start()
+        self._poses, self._fill = poses(cell, self._data), show.load()
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
     @abstractmethod
@@ -137,13 +139,7 @@ class Arm(ABC):
 
     def _show(self, scene: Message) -> None:
         """Fill a `SCENE` from `_data`."""
-        m, d, cell = self.cell.model, self._data, self.cell
-        mujoco.mj_kinematics(m, d)  # after a step, poses are those before it
-        rows = len(cell.bodies)
-        scene.position[:rows] = d.xpos[cell.bodies]
-        scene.quaternion[:rows] = d.xquat[cell.bodies]
-        scene.tool_position = d.site_xpos[cell.tool]
-        mujoco.mju_mat2Quat(scene.tool_quaternion, d.site_xmat[cell.tool])
+        self._fill(*self._poses, np.frombuffer(scene.raw))
 
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
@@ -151,16 +147,17 @@ class Arm(ABC):
         A simulation adds its state: `state.state` has room for MuJoCo's integration state of the cell.
         """
         state.tick = self.tick
-        seldom = self.waited, self.braked, self.clipped, self.touches, self.violations, self.pushed
+        seldom = self.waited, self.braked, self.clipped, self.touches, self.violations, self.pushed, self.struck
         if (state, seldom) != self._saved:
-            state.waited, state.braked, state.clipped, state.touches, state.violations, state.pushed = seldom
+            state.waited, state.braked, state.clipped, state.touches = seldom[:4]
+            state.violations, state.pushed, state.struck = seldom[4:]
             self._saved = state, seldom
 
     def restore(self, state: Message) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted board."""
         self.tick, self.waited, self.braked = state.tick, state.waited, bool(state.braked)
         self.clipped, self.touches = state.clipped, state.touches
-        self.violations, self.pushed = state.violations, state.pushed
+        self.violations, self.pushed, self.struck = state.violations, state.pushed, state.struck
 
 
 def find_arm(reference: str) -> type[Arm]:

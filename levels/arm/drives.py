@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import daqp
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from rack.levels.algebra import Array, cholesky_solve, mat_vec, solve
 from rack.levels.compiled import compiled
-from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
+from rack.levels.robot.dynamics import BIAS_ROW, FRICTION_SPEED, INERTIA_ROW, STATE_ROWS, Dynamics
 from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
 
 STANDSTILL = 0.01
@@ -78,7 +77,7 @@ class LimitGate:
         `torque` must be finite.
         """
         self._dynamics.terms(q, qd)
-        if self._is_clear(torque, *self._dynamics.newest, *self.clearance):
+        if self._is_clear(torque, self._dynamics.newest, *self.clearance):
             return torque, False
         passed: Array = np.clip(torque, -self._torque, self._torque)
         least = -self._speed_towards(q - self._low, -qd) - qd
@@ -115,18 +114,17 @@ class LimitGate:
 @compiled
 def is_clear(
     torque: Array,
-    state: Array,  # (2, joints), rad and rad/s
-    inertia: Array,
-    bias: Array,
-    limits: Array,  # (6, joints): see `LimitGate`
+    evaluation: Array,  # of the equation of motion: (3 + joints, joints)
+    limits: Array,  # (6, joints): torque, speed, low and high end of the range, braking, dry friction
     period_s: float,
 ) -> bool:
-    """Return whether `torque` leads nowhere near a limit, by the equation of motion at `state`.
+    """Return whether `torque` leads nowhere near a limit, by the equation of motion at the state of `evaluation`.
 
     It does not if the velocity stays within its bounds at no gain as at twice the gain predicted, with some room: more
     than inertia and bias change in a cycle.
     """
-    (q, qd), (most_torque, fastest, low, high, braking, dry) = state, limits
+    q, qd, bias, inertia = evaluation[0], evaluation[1], evaluation[BIAS_ROW], evaluation[INERTIA_ROW:]
+    most_torque, fastest, low, high, braking, dry = limits
     left = torque - bias
     for joint in range(len(q)):
         if not abs(torque[joint]) <= most_torque[joint]:
@@ -142,48 +140,28 @@ def is_clear(
     return True
 
 
-class Motors(NamedTuple):
-    """More arguments of `give`."""
-
-    joints: NDArray[np.int64]  # (2, joints): their addresses in qpos and in qvel
-    actuators: NDArray[np.int64]  # (joints,), in ctrl
-    qpos: Array
-    qvel: Array
-    ctrl: Array
-    brakes: Array  # (nv,), N m
-    command: Array  # (joints,), N m: the torque as commanded, and as given
-    given: Array
-
-
 @compiled
 def give(
-    torque: Array,
-    state: Array,  # this and the next as for `is_clear`, evaluated at any state
-    inertia: Array,
-    bias: Array,
+    torques: Array,  # (3, joints), N m: asked for, as commanded, as given
+    evaluation: Array,  # this and the next two as for `is_clear`, evaluated at any state
     limits: Array,
     period_s: float,
-    joints: NDArray[np.int64],  # this and the next: see `Motors`
-    actuators: NDArray[np.int64],
-    qpos: Array,
-    qvel: Array,
-    ctrl: Array,
-    brakes: Array,
-    command: Array,
-    given: Array,
+    places: NDArray[np.int64],  # (4, joints), in the next: of position, velocity, motor, brake
+    memory: Array,
 ) -> bool:
-    """Give `torque` to the motors, and none to the brakes, if it is clear; return whether it is.
+    """Give the torque asked for to the motors, and none to the brakes, if it is clear; return whether it is.
 
     The usual case in one call: the equation of motion has been evaluated, for the controller, at the arm's state.
     """
-    for joint in range(len(torque)):
-        if not (state[0, joint] == qpos[joints[0, joint]] and state[1, joint] == qvel[joints[1, joint]]):
-            return False
-    if not is_clear(torque, state, inertia, bias, limits, period_s):
+    for row in range(STATE_ROWS):
+        for joint in range(torques.shape[1]):
+            if evaluation[row, joint] != memory[places[row, joint]]:
+                return False
+    if not is_clear(torques[0], evaluation, limits, period_s):
         return False
-    for joint in range(len(torque)):
-        command[joint] = given[joint] = ctrl[actuators[joint]] = torque[joint]
-        brakes[joints[1, joint]] = 0.0
+    for joint in range(torques.shape[1]):
+        torques[1, joint] = torques[2, joint] = memory[places[2, joint]] = torques[0, joint]
+        memory[places[3, joint]] = 0.0
     return True
 
 
@@ -253,8 +231,7 @@ def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def preload() -> None:
     """Load this module's compiled functions."""
-    none, square, state, joints = np.zeros(0), np.zeros((0, 0)), np.zeros((2, 0)), np.zeros((2, 0), dtype=int)
-    clearance = state, square, none, np.zeros((6, 0)), 1.0
-    is_clear.load()(none, *clearance)
-    give.load()(none, *clearance, joints, joints[0], *[none] * 6)
-    sense_coarsely.load()(state, 0, 0, state, state)
+    none, table, places = np.zeros(0), np.zeros((6, 0)), np.zeros((4, 0), dtype=int)
+    is_clear.load()(none, table, table, 1.0)
+    give.load()(table, table, table, 1.0, places, none)
+    sense_coarsely.load()(table, 0, 0, table, table)

@@ -22,7 +22,7 @@ class LimitMonitor:
     def __init__(self, cell: Cell, steps: Substeps) -> None:
         """Judge what `advance` records in `steps`."""
         self._names = [cell.model.joint(int(joint)).name for joint in cell.model.dof_jntid[cell.dof]]
-        self._seen, (self._low, self._high) = steps.seen, steps.bounds
+        self._seen, (self._low, self._high) = steps.seen, steps.judged[:2]
         self.count = 0  # steps in which the drives broke a limit
         self.pushed = 0  # steps in which a blow broke a limit of position or velocity: no drive can prevent it
         self.first = ""  # the first broken limit, readable

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,24 +11,17 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
 from rack.levels.arm.arm import Arm, Sensed
-from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, Motors, give
+from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, give
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
 from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.engine import one_view
 from rack.levels.tables import MotionConfig, SceneConfig
 
 STRUCK_TICKS = 40
 """Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the blow."""
-
-
-class Cells(NamedTuple):
-    """Views of MuJoCo's state that give single numbers in a third of the time of an array's."""
-
-    qpos: memoryview[float]
-    qvel: memoryview[float]
-    ctrl: memoryview[float]
 
 
 class SimulatedArm(Arm):
@@ -47,7 +39,11 @@ class SimulatedArm(Arm):
         self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
         self._state = self._steps.seen[-1, 0], self._steps.seen[-1, 1]  # (joints,): true positions and velocities
         self._refresh()
-        self._cells = Cells(memoryview(d.qpos), memoryview(d.qvel), memoryview(d.ctrl))
+        self._addresses = self._steps.model, self._steps.data
+        # They give single numbers in a third of the time of an array's.
+        self._qpos: memoryview[float] = memoryview(d.qpos)
+        self._qvel: memoryview[float] = memoryview(d.qvel)
+        self._ctrl: memoryview[float] = memoryview(d.ctrl)
         self._grip = cell.gripper_actuator
         gripped = cell.gripper_qpos, cell.gripper_dof
         self._gripper = None if gripped[0] is None or gripped[1] is None else (gripped[0], gripped[1])
@@ -62,13 +58,12 @@ class SimulatedArm(Arm):
             for mocap, body, name in obstacles
         ]
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
-        self._struck = 0  # ticks for which the motion is still blamed on a blow
-        self._asked, self._command = np.zeros((2, joints))  # N m: the newest command, and the one in force
+        # N m: the newest command, the one in force, and its torque as given.
+        self._asked, self._command, self.torque = torques = np.zeros((3, joints))
         self._given = False  # the command for the coming tick has passed the gate
-        motors = Motors(
-            self._steps.joints, cell.actuators, d.qpos, d.qvel, d.ctrl, d.qfrc_applied, self._command, self.torque
-        )
-        self._clear = *self.dynamics.newest, *self._gate.clearance, *motors
+        memory, (qpos, qvel, ctrl, brakes) = one_view(d.qpos, d.qvel, d.ctrl, d.qfrc_applied)
+        places = np.stack((qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof))
+        self._clear = torques, self.dynamics.newest, *self._gate.clearance, places, memory
         self._give_clear, self._advance, self._copy_state = give.load(), advance.load(), copy_state.load()
         # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda _: None)
@@ -95,7 +90,7 @@ class SimulatedArm(Arm):
         if self._gripper is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
         at, dof = self._gripper
-        return Sensed(position, velocity, self._cells.qpos[at], self._cells.qvel[dof], self.tick)
+        return Sensed(position, velocity, self._qpos[at], self._qvel[dof], self.tick)
 
     def _refresh(self) -> None:
         """Take positions and velocities of the joints from MuJoCo's state: it was set by other than a step."""
@@ -106,8 +101,8 @@ class SimulatedArm(Arm):
         """Release the brakes and give torques and gripper force for the coming torque cycle; see `Link.drive`."""
         self._asked[:] = torque
         if self._grip is not None and math.isfinite(grip_force):
-            self._cells.ctrl[self._grip] = self.grip_force = grip_force
-        if self._most is None and self._give_clear(self._asked, *self._clear):
+            self._ctrl[self._grip] = self.grip_force = grip_force
+        if self._most is None and self._give_clear(*self._clear):
             self.waited, self.braked, self._given = 0, False, True
             return None
         finding = self.refused(torque)
@@ -158,8 +153,7 @@ class SimulatedArm(Arm):
         """Fill an `ARM_STATE`."""
         before = self._saved
         super().save(state)
-        self._copy_state(self._steps.model, self._steps.data, state.state)
-        state.struck = self._struck
+        self._copy_state(*self._addresses, state.state)
         if self.braked or self._saved is not before:
             state.rest = self._brake.rest
 
@@ -168,12 +162,12 @@ class SimulatedArm(Arm):
         super().restore(state)
         d, cell = self._data, self.cell
         mujoco.mj_setState(self._model, d, state.state, STATE)
-        self._contacts.count, self._struck = state.touches, state.struck
+        self._contacts.count = state.touches
         self._limits.count, self._limits.pushed = state.violations, state.pushed
         np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
-        self.grip_force = 0.0 if self._grip is None else self._cells.ctrl[self._grip]
+        self.grip_force = 0.0 if self._grip is None else self._ctrl[self._grip]
         self._given = True
         self._refresh()
 
@@ -201,11 +195,11 @@ class SimulatedArm(Arm):
         """Simulate one tick."""
         for mocap, motion in self._motions:
             self._data.mocap_pos[mocap] = motion.position(self._now_s)
-        made = self._advance(0, self._after_s, *self._steps)
+        made = self._advance(0, (self.tick + 1) * self._clock_ns * 1e-9, *self._steps)
         if made < 0:
             self._look_closer(-made)
-        elif self._struck:
-            self._struck -= 1
+        elif self.struck:
+            self.struck -= 1
 
     def _look_closer(self, made: int) -> None:
         """Finish a tick of which step `made` is not as it should be; on a fault, restore the state before the tick."""
@@ -217,13 +211,13 @@ class SimulatedArm(Arm):
                 made = -made
                 self._contacts.look(self._data)
         if self._contacts.count > touches and self._contacts.struck is not None:
-            self._struck = STRUCK_TICKS
-        broken = self._limits.judge(self._now_s, self._struck > 0)
-        if self._struck:
-            self._struck = STRUCK_TICKS if broken else self._struck - 1
+            self.struck = STRUCK_TICKS
+        broken = self._limits.judge(self._now_s, self.struck > 0)
+        if self.struck:
+            self.struck = STRUCK_TICKS if broken else self.struck - 1
         self.fault = self._broken()
         if self.fault:
-            mujoco.mj_setState(self._model, self._data, self._steps.before, STATE)
+            mujoco.mj_setState(self._model, self._data, self._steps.states[0], STATE)
             self._refresh()
         self._data.time = self._after_s
         contacts, limits = self._contacts, self._limits

@@ -12,29 +12,30 @@ from numpy.typing import NDArray
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 from rack.levels.robot.cell import STATE, Cell
-from rack.levels.robot.engine import contact_views, mj_get_state, mj_set_state, mj_step
+from rack.levels.robot.engine import contact_views, mj_get_state, mj_set_state, mj_step, one_view
 
-TIME = int(mujoco.mjtState.mjSTATE_TIME)
+TIME, PHYSICS = int(mujoco.mjtState.mjSTATE_TIME), int(mujoco.mjtState.mjSTATE_PHYSICS)
 
 
 class Substeps(NamedTuple):
-    """Further arguments of `advance`, prepared once."""
+    """Further arguments of `advance`, prepared once: few, because each array costs more than the arithmetic on it."""
 
     model: int  # address
     data: int  # address
-    before: Array  # (state,): MuJoCo's state before the tick
+    places: NDArray[np.int64]  # (4, joints), in `memory`: of position, velocity, motor, brake
+    memory: Array  # MuJoCo's
+    judged: Array  # (2 + substeps, 3, joints): lowest, highest and, after each step, position, velocity, torque
+    states: Array  # (2, state): MuJoCo's before the tick; after it, as far as the steps change it
     warnings: NDArray[np.int32]  # (kinds,), how often MuJoCo has raised each
-    qpos: Array
-    qvel: Array
-    motors: Array  # (nv,), N m
-    brakes: Array  # (nv,), N m
-    joints: NDArray[np.int64]  # (2, joints): their addresses in qpos and in qvel
-    bounds: Array  # (2, 3, joints): low and high of position, velocity, torque
-    seen: Array  # (substeps, 3, joints): position, velocity, torque after each step
     contacts: NDArray[np.int32]  # (1,), their number
     geoms: NDArray[np.int32]  # (room, 2), of the contacts
     distance: Array  # (room,), m
     touch: NDArray[np.bool_]  # (ngeom, ngeom), True where a contact is unintended
+
+    @property
+    def seen(self) -> Array:
+        """Position, velocity, torque after each step: (substeps, 3, joints)."""
+        return self.judged[2:]
 
 
 def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
@@ -42,18 +43,15 @@ def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
     bounds = cell.bounds
     high = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
     low = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
+    memory, (qpos, qvel, motors, brakes) = one_view(data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied)
     return Substeps(
         cell.model._address,
         data._address,
-        np.zeros(mujoco.mj_stateSize(cell.model, STATE)),
+        np.stack((qpos + cell.qpos, qvel + cell.dof, motors + cell.dof, brakes + cell.dof)),
+        memory,
+        np.stack((low, high, *np.zeros((steps, *low.shape)))),
+        np.zeros((2, mujoco.mj_stateSize(cell.model, STATE))),
         data.warning.number,
-        data.qpos,
-        data.qvel,
-        data.qfrc_actuator,
-        data.qfrc_applied,
-        np.stack((cell.qpos, cell.dof)),
-        np.stack((low, high)),
-        np.zeros((steps, *low.shape)),
         *contact_views(cell.model, data),
         cell.touch,
     )
@@ -65,15 +63,11 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     end_s: float,
     model: int,
     data: int,
-    before: Array,
+    places: NDArray[np.int64],
+    memory: Array,
+    judged: Array,
+    states: Array,
     warnings: NDArray[np.int32],
-    qpos: Array,
-    qvel: Array,
-    motors: Array,
-    brakes: Array,
-    joints: NDArray[np.int64],
-    bounds: Array,
-    seen: Array,
     contacts: NDArray[np.int32],
     geoms: NDArray[np.int32],
     distance: Array,
@@ -84,26 +78,26 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     Returns the number of the step to continue with; negative if the last one made broke a limit, or has an unintended
     contact, a warning, or a state that is not finite.
     """
+    before, after, low, high, seen = states[0], states[1], judged[0], judged[1], judged[2:]
     if begin == 0:
         mj_get_state(model, data, before.ctypes.data, STATE)
     for step in range(begin, len(seen)):
         mj_step(model, data)
         sound = True
-        for joint in range(joints.shape[1]):
-            dof = joints[1, joint]
-            seen[step, 0, joint] = qpos[joints[0, joint]]
-            seen[step, 1, joint] = qvel[dof]
-            seen[step, 2, joint] = motors[dof] + brakes[dof]
+        for joint in range(places.shape[1]):
+            seen[step, 0, joint] = memory[places[0, joint]]
+            seen[step, 1, joint] = memory[places[1, joint]]
+            seen[step, 2, joint] = memory[places[2, joint]] + memory[places[3, joint]]
             for kind in range(3):
-                sound &= bounds[0, kind, joint] <= seen[step, kind, joint] <= bounds[1, kind, joint]
+                sound &= low[kind, joint] <= seen[step, kind, joint] <= high[kind, joint]
         for contact in range(contacts[0]):
             sound &= not (touch[geoms[contact, 0], geoms[contact, 1]] and distance[contact] < 0.0)
         for warned in warnings:
             sound &= warned == 0
-        for value in qpos:
-            sound &= math.isfinite(value)
-        for value in qvel:
-            sound &= math.isfinite(value)
+        if step + 1 == len(seen):  # an earlier step's would be a warning of the next
+            mj_get_state(model, data, after.ctypes.data, PHYSICS)
+            for value in after:
+                sound &= math.isfinite(value)
         if not sound:
             return -(step + 1)
     time_s = np.full(1, end_s)  # exactly: what steps add up to differs in the last bit
@@ -119,10 +113,10 @@ def copy_state(model: int, data: int, state: Array) -> None:
 
 def preload() -> None:
     """Load this module's compiled functions."""
-    model, none, table = mujoco.MjModel.from_xml_string("<mujoco/>"), np.zeros(0), np.zeros((0, 3, 0))
-    data = mujoco.MjData(model)
-    joints, touch = np.zeros((2, 0), dtype=int), np.zeros((0, 0), dtype=bool)
-    state: list[Any] = [none, data.warning.number, none, none, none, none, joints, table, table]
-    state += [*contact_views(model, data), touch]
-    advance.load()(1, 0.0, model._address, data._address, *state)
-    copy_state.load()(model._address, data._address, np.zeros(mujoco.mj_stateSize(model, STATE)))
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    data, table, touch = mujoco.MjData(model), np.zeros((3, 3, 0)), np.zeros((0, 0), dtype=bool)
+    states = np.zeros((2, mujoco.mj_stateSize(model, STATE)))
+    own: list[Any] = [np.zeros((4, 0), dtype=int), np.zeros(0), table, states, data.warning.number]
+    own += [*contact_views(model, data), touch]
+    advance.load()(1, 0.0, model._address, data._address, *own)
+    copy_state.load()(model._address, data._address, states[0])

@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 from rack.levels.algebra import Array, each
 from rack.levels.compiled import compiled
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.engine import mj_full_m, mj_fwd_position, mj_fwd_velocity, mj_jac, mj_jac_dot
+from rack.levels.robot.engine import (
+    mj_com_pos,
+    mj_flex,
+    mj_fwd_velocity,
+    mj_jac,
+    mj_jac_dot,
+    mj_kinematics,
+    mj_make_m,
+    mj_tendon,
+    mj_transmission,
+    one_view,
+)
 
 FRICTION_SPEED = 0.01
 """Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at zero speed would excite the arm."""
@@ -39,12 +50,8 @@ class Terms(NamedTuple):
     bias: Array  # (joints,), N m: gravity, Coriolis and centrifugal torques, springs, viscous friction
 
 
-class Evaluated(NamedTuple):
-    """The newest evaluation of a `Dynamics`, not to be written to. The arrays stay the same ones."""
-
-    state: Array  # (2, joints), rad and rad/s; NaN: there is none
-    inertia: Array  # (joints, joints), kg m2
-    bias: Array  # (joints,), N m
+STATE_ROWS, BIAS_ROW, INERTIA_ROW = 2, 2, 3
+"""An evaluation is one array, (3 + joints, joints): position, velocity, bias, inertia."""
 
 
 class Dynamics:
@@ -56,24 +63,26 @@ class Dynamics:
         self._model.opt.disableflags |= int(OFF)
         self._data = d = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, d, 0)
-        joints, nv = len(cell.dof), cell.model.nv
-        self._wanted = np.zeros((2, joints))
-        self.newest = Evaluated(np.full((2, joints), np.nan), np.zeros((joints, joints)), np.zeros(joints))
-        self._terms = Terms(np.zeros((joints, joints)), np.zeros(joints))  # a copy, with the payload
+        joints = len(cell.dof)
+        # One array, and not eight, for the compiled functions: each costs more than the arithmetic on it.
+        self._evaluations = np.zeros((2, INERTIA_ROW + joints, joints))
+        self.newest, given = self._evaluations  # the first is not to be written to, the second has the payload
+        self.newest[:STATE_ROWS] = np.nan  # there is none
+        self._terms = Terms(given[INERTIA_ROW:], given[BIAS_ROW])
+        self._position, self._velocity = given[:STATE_ROWS]
         self._offset = np.zeros(3)
-        # Arguments of the compiled functions.
-        at, full = (self._model._address, d._address, np.stack((cell.qpos, cell.dof))), np.zeros((nv, nv))
-        self._evaluating = *at, d.qpos, d.qvel, d.qfrc_bias, d.qfrc_passive, full, *self.newest, *self._terms
+        at = self._model._address, d._address
+        self._evaluating = *at, *addresses(self._model, d, cell), self._evaluations
         hand, tool = int(cell.model.site_bodyid[cell.tool]), (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
-        gravity, jacobians = np.array(self._model.opt.gravity), np.zeros((2, 3, nv))
-        self._carrying = self._offset, *at, hand, *tool, gravity, jacobians, self.newest.state, *self._terms
+        gravity, jacobians = np.array(self._model.opt.gravity), np.zeros((2, 3, cell.model.nv))
+        self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, given
         self._evaluate, self._carry = evaluate.load(), carry.load()
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
         """Return the terms at `q`, rad, and `qd`, rad/s, (joints,) each. The arrays are valid until the next call."""
-        self._wanted[0], self._wanted[1] = q, qd
-        self._evaluate(self._wanted, *self._evaluating)
+        self._position[:], self._velocity[:] = q, qd
+        self._evaluate(*self._evaluating)
         if payload is not None and payload.mass > 0.0:
             self._offset[:] = payload.offset
             self._carry(float(payload.mass), *self._carrying)
@@ -86,47 +95,53 @@ class Dynamics:
     def pose(self, q: Array) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the tool at `q`. The arrays are valid until the next call."""
         m, d = self._model, self._data
-        self.newest.state[:] = np.nan
+        self.newest[:STATE_ROWS] = np.nan
         d.qpos[self._cell.qpos] = q
         mujoco.mj_kinematics(m, d)
         return d.site_xpos[self._cell.tool], d.site_xmat[self._cell.tool].reshape(3, 3)
 
 
-@compiled
-def evaluate(
-    wanted: Array,
-    model: int,
-    data: int,
-    joints: NDArray[np.int64],
-    qpos: Array,
-    qvel: Array,
-    forces: Array,
-    passive: Array,
-    full: Array,
-    state: Array,
-    inertia: Array,
-    bias: Array,
-    inertia_copy: Array,
-    bias_copy: Array,
-) -> None:
-    """Evaluate `inertia` and `bias` at the state `wanted`, (2, joints), unless that is `state` already; copy them.
+def addresses(model: mujoco.MjModel, data: mujoco.MjData, cell: Cell) -> tuple[NDArray[np.int64], Array]:
+    """Return where an evaluation reads and writes, (4 + joints, joints), and the memory of `data` that this indexes.
 
-    `joints` are addresses in `qpos` and `qvel`.
+    The rows are position, velocity, bias, passive force, and those of the inertia: -1 where it is always zero.
     """
-    count, same = joints.shape[1], True
-    for joint in range(count):
-        same &= state[0, joint] == wanted[0, joint] and state[1, joint] == wanted[1, joint]
-        state[0, joint] = qpos[joints[0, joint]] = wanted[0, joint]
-        state[1, joint] = qvel[joints[1, joint]] = wanted[1, joint]
+    memory, (qpos, qvel, bias, passive, inertia) = one_view(
+        data.qpos, data.qvel, data.qfrc_bias, data.qfrc_passive, data.M
+    )
+    below = np.full((model.nv, model.nv), -1)  # MuJoCo keeps what is not zero of a lower triangle, row by row
+    for row, (first, count) in enumerate(zip(model.M_rowadr, model.M_rownnz, strict=True)):
+        entries = np.arange(first, first + count)
+        below[row, model.M_colind[entries]] = inertia + entries
+    whole = np.maximum(below, below.T)[np.ix_(cell.dof, cell.dof)]
+    return np.vstack((qpos + cell.qpos, qvel + cell.dof, bias + cell.dof, passive + cell.dof, whole)), memory
+
+
+@compiled
+def evaluate(model: int, data: int, places: NDArray[np.int64], memory: Array, evaluations: Array) -> None:
+    """Evaluate the equation at the state in the second of `evaluations`, unless the first is of that state already.
+
+    Both are (3 + joints, joints), and equal afterwards; `places` are addresses in `memory`, see `addresses`.
+    """
+    newest, given, joints, same = evaluations[0], evaluations[1], places.shape[1], True
+    for row in range(STATE_ROWS):
+        for joint in range(joints):
+            same &= newest[row, joint] == given[row, joint]
+            newest[row, joint] = memory[places[row, joint]] = given[row, joint]
     if not same:
-        mj_fwd_position(model, data)
+        mj_kinematics(model, data)  # with the next five, all that `mj_fwdPosition` does for inertia and bias
+        mj_com_pos(model, data)
+        mj_flex(model, data)
+        mj_tendon(model, data)
+        mj_make_m(model, data)
+        mj_transmission(model, data)
         mj_fwd_velocity(model, data)
-        mj_full_m(model, data, full.ctypes.data)
-    for joint in range(count):
-        row = joints[1, joint]
-        bias[joint] = bias_copy[joint] = forces[row] - passive[row]
-        for other in range(count):
-            inertia[joint, other] = inertia_copy[joint, other] = full[row, joints[1, other]]
+        for joint in range(joints):
+            newest[BIAS_ROW, joint] = memory[places[2, joint]] - memory[places[3, joint]]
+            for other in range(joints):
+                place = places[4 + joint, other]
+                newest[INERTIA_ROW + joint, other] = memory[place] if place >= 0 else 0.0
+    given[BIAS_ROW:] = newest[BIAS_ROW:]
 
 
 @compiled
@@ -135,41 +150,40 @@ def carry(
     offset: Array,
     model: int,
     data: int,
-    joints: NDArray[np.int64],
+    dof: NDArray[np.int64],
     hand: int,
     tool: Array,
     turned: Array,
     gravity: Array,
     jacobians: Array,
-    state: Array,
-    inertia: Array,
-    bias: Array,
+    evaluation: Array,
 ) -> None:
     """Add a point mass at the tool: m J^T J to the inertia, m J^T (Jdot qd - g) to the bias."""
+    velocity, bias, inertia = evaluation[1], evaluation[BIAS_ROW], evaluation[INERTIA_ROW:]
     centre = np.empty(3)
     for axis in range(3):
         of = turned[3 * axis : 3 * axis + 3]
         centre[axis] = tool[axis] + (of[0] * offset[0] + of[1] * offset[1] + of[2] * offset[2])
     mj_jac(model, data, jacobians[0].ctypes.data, 0, centre.ctypes.data, hand)
     mj_jac_dot(model, data, jacobians[1].ctypes.data, 0, centre.ctypes.data, hand)
-    count = joints.shape[1]
+    count = len(dof)
     for axis in range(3):
         jacobian, change = jacobians[0, axis], jacobians[1, axis]
         acceleration = -gravity[axis]
         for joint in range(count):
-            acceleration += change[joints[1, joint]] * state[1, joint]
+            acceleration += change[dof[joint]] * velocity[joint]
         for joint in range(count):
-            force = mass * jacobian[joints[1, joint]]
+            force = mass * jacobian[dof[joint]]
             bias[joint] += force * acceleration
             for other in range(count):
-                inertia[joint, other] += force * jacobian[joints[1, other]]
+                inertia[joint, other] += force * jacobian[dof[other]]
 
 
 def preload() -> None:
     """Load this module's compiled functions."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data, joints, none, square = mujoco.MjData(model), np.zeros((2, 0), dtype=int), np.zeros(0), np.zeros((0, 0))
-    at, state, place = (model._address, data._address, joints), np.zeros((2, 0)), np.zeros(3)
-    evaluate.load()(state, *at, none, none, none, none, square, state, square, none, square, none)
+    data, places, none = mujoco.MjData(model), np.zeros((4, 0), dtype=int), np.zeros(0)
+    at, evaluations, place = (model._address, data._address), np.zeros((2, 3, 0)), np.zeros(3)
+    evaluate.load()(*at, places, none, evaluations)
     jacobians = np.zeros((2, 3, 0))
-    carry.load()(0.0, place, *at, 0, place, np.zeros(9), place, jacobians, state, square, none)
+    carry.load()(0.0, place, *at, places[0], 0, place, np.zeros(9), place, jacobians, evaluations[0])

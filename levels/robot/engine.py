@@ -47,15 +47,29 @@ class native(compiled[..., None]):  # noqa: N801  # stands for a function
 mj_step = native("mj_step", 2)
 mj_kinematics = native("mj_kinematics", 2)
 mj_collision = native("mj_collision", 2)
-mj_fwd_position = native("mj_fwdPosition", 2)
+mj_com_pos = native("mj_comPos", 2)
+mj_flex = native("mj_flex", 2)
+mj_tendon = native("mj_tendon", 2)
+mj_make_m = native("mj_makeM", 2)
+mj_transmission = native("mj_transmission", 2)
 mj_fwd_velocity = native("mj_fwdVelocity", 2)
-mj_full_m = native("mj_fullM", 3)
 mj_jac = native("mj_jac", 6)
 mj_jac_dot = native("mj_jacDot", 6)
 mj_get_state = native("mj_getState", 4)
 mju_mat_to_quat = native("mju_mat2Quat", 2)
 mju_mul_quat = native("mju_mulQuat", 3)
 mj_set_state = native("mj_setState", 4)
+
+
+def one_view(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the memory from the first to the last of some arrays of one `MjData`, and where in it each begins.
+
+    It is valid as long as the data.
+    """
+    begins = np.array([array.ctypes.data for array in arrays])
+    ends = [int(begin) + array.nbytes for begin, array in zip(begins, arrays, strict=True)]
+    first, item = int(begins.min()), np.dtype(np.float64).itemsize
+    return _view(first, np.float64, ((max(ends) - first) // item,), (item,)), (begins - first) // item
 
 
 class ContactViews(NamedTuple):

@@ -12,9 +12,9 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels import arm as arm_package
 from rack.levels.algebra import Array, cholesky_solve
-from rack.levels.arm import SimulatedArm, drives, substeps
+from rack.levels.arm import SimulatedArm, drives, poses, substeps
 from rack.levels.compiled import compiled
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ARM_STATE, SCENE
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.robot.dynamics import Dynamics, Payload
@@ -37,9 +37,16 @@ def driven(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
     return state
 
 
+def scene(arm: SimulatedArm, made: Cell) -> Message:
+    """Return what an arm shows."""
+    seen = Message(SCENE.dtype(sizes(made)))
+    arm.look(seen)
+    return seen
+
+
 def in_python(arm: SimulatedArm) -> None:
     """Replace an arm's compiled functions by their Python."""
-    arm._advance, arm._give_clear = substeps.advance, drives.give
+    arm._advance, arm._give_clear, arm._fill = substeps.advance, drives.give, poses.show
     arm._gate._is_clear = drives.is_clear
     for used in (arm.dynamics, arm._gate._dynamics):
         used._evaluate, used._carry = dynamics.evaluate, dynamics.carry
@@ -52,6 +59,7 @@ def test_an_arm_moves_bit_for_bit_as_in_python(name: str) -> None:
     in_python(other)
     assert driven(one, made, 300).raw == driven(other, made, 300).raw
     assert one.touches == other.touches
+    assert scene(one, made).raw == scene(other, made).raw
 
 
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
@@ -98,16 +106,18 @@ def samples(tick: int) -> Array:
 def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> None:
     arm_package.preload()
     four = four_bar(tmp_path)
-    for made, scene in ((cell("puma560"), config("puma560")[1]), (build_cell(*four, CLOCK_NS), four[1])):
-        arm = SimulatedArm(made, scene, CLOCK_NS)
+    for made, surroundings in ((cell("puma560"), config("puma560")[1]), (build_cell(*four, CLOCK_NS), four[1])):
+        arm = SimulatedArm(made, surroundings, CLOCK_NS)
         arm.dynamics.terms(made.home, np.zeros(6), Payload(1.0, OFFSET))
         driven(arm, made, 3)
         arm.drive(made.bounds.torque, 0.0)
         arm.brake()
         arm.step(2)
+        scene(arm, made)
     samples(1)
     functions: list[compiled[..., Any]] = [
-        *(dynamics.evaluate, dynamics.carry, substeps.advance, drives.give, drives.is_clear, drives.sense_coarsely)
+        *(dynamics.evaluate, dynamics.carry, substeps.advance, drives.give, drives.is_clear),
+        *(drives.sense_coarsely, poses.show),
     ]
     machines: list[Callable[..., Any]] = [function.load() for function in functions]
     assert [len(machine.signatures) for machine in machines] == [1] * len(machines)  # type: ignore[attr-defined]
