@@ -187,15 +187,10 @@ class Orders:
 
     def report(self, status: Message, above: int = 0) -> None:
         """Fill the fields of `ANSWER` when they change."""
-        rests_on = self.rests_on(above)
+        rests_on = max(self.basis, above)
         if rests_on != self._reported:
-            status.operator, status.order, status.answer, status.standing = (
-                rests_on,
-                self.serial,
-                self.answer,
-                self.standing,
-            )
-            status.objection = self._objection
+            status.operator, status.order, status.answer = rests_on, self.serial, self.answer
+            status.standing, status.objection = self.standing, self._objection
             self._reported = rests_on
 
 

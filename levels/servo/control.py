@@ -124,7 +124,7 @@ class Grip:
     """
 
     def __init__(self, config: GripperConfig) -> None:
-        self._config = config
+        self._stiffness, self._damping, self._most_force = config.stiffness, config.damping, config.force
         self._least, self._most = sorted((config.open, config.closed))
         self._opening, self._limit = config.open, config.force
         self._kept: float | None = None
@@ -137,14 +137,14 @@ class Grip:
         """Take a new `JOINT_SET_POINT`."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
-            self._limit = min(max(command.force, 0.0), self._config.force)
+            self._limit = min(max(command.force, 0.0), self._most_force)
             self._kept = None
 
     def force(self, opening: float, velocity: float) -> float:
         """Return the force, N, at `opening`, m, and its `velocity`, m/s."""
         if self._kept is not None:
             return self._kept
-        force = self._config.stiffness * (self._opening - opening) - self._config.damping * velocity
+        force = self._stiffness * (self._opening - opening) - self._damping * velocity
         return min(max(force, -self._limit), self._limit)
 
 
