@@ -12,7 +12,7 @@ from rack.levels.algebra import Array
 from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
 from rack.levels.arm.faulty import STEPS
 from rack.levels.compiled import compiled
-from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelContext, Output, Ports, Reading
+from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelContext, Output, Ports, Reading, Verdict
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell
@@ -131,11 +131,11 @@ class ServoExecutor(Executor):
 
     def _take_messages(self, read: Ports) -> None:
         """Take over what is new."""
-        if read.operator.is_new:
+        if read.operator.verdict is Verdict.NEW:
             self.operator.take(read.operator)
-        if read.plan.is_new:
+        if read.plan.verdict is Verdict.NEW:
             self._loop.take(read.plan.value)
-        if read.command.is_new:
+        if read.command.verdict is Verdict.NEW:
             command: Message = read.command.value
             self._command, self._rests_on = command.id, command.operator
             self.reference.take(command)
