@@ -52,7 +52,8 @@ class ActuatorMonitor:
             URGENT_SPEED_PART * cell.bounds.velocity,
         )
         self._table = np.zeros((13 + joints, joints))  # in the rows of `left_over`
-        self._torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
+        # `torque`, (joints,), N m: given in the cycle that begins; the level fills it in.
+        self.torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
         self._left, self._noise, *self._friction, self._velocity = self._table[8:13]
         self._dry[:] = model.dof_frictionloss[dof]
         # Simulated friction slows a joint as a damper of that time constant does: if the joint brakes harder, the
@@ -69,9 +70,8 @@ class ActuatorMonitor:
         self._commanded = self._given = self._most = 0.0  # N m: commanded and given at first, most given since
         self._alone = True  # it is the only motor that lacks torque
 
-    def begin(self, torque: Array) -> None:
-        """Begin a cycle with commanded torques, N m, at the velocity and terms last looked at."""
-        self._torque[...] = torque
+    def begin(self) -> None:
+        """Begin a cycle with `torque`, at the velocity and terms last looked at."""
         self._begun = True
 
     def drop(self) -> None:
@@ -99,8 +99,8 @@ class ActuatorMonitor:
 
     def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
         """Follow cycles in which motors that lack torque explain the difference, until it is certain."""
-        commanded = np.abs(self._torque)
-        lacks = left * np.sign(self._torque)
+        commanded = np.abs(self.torque)
+        lacks = left * np.sign(self.torque)
         explained = (lacks >= -self._noise) & (lacks <= commanded + self._noise)
         if not self._pushed and not explained.all():
             self._pushed, self._cycles = True, 0

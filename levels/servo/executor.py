@@ -84,7 +84,7 @@ class ServoExecutor(Executor):
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._wanted = np.zeros((2, len(cell.home)))  # the motion wanted in the last cycle begins with: rad, rad/s
         self._wanted[0] = cell.home
-        self._numbers: tuple[Array, Array] | None = None  # of the status and state that the cycles fill in
+        self._numbers: tuple[Array, Array, Array] | None = None  # set in every cycle: the first arguments of `show`
         self._show_numbers = show.load()
         self._command = self._rests_on = 0  # serials of the newest command, and of the operator's that it rests on
         self._shown: SteadyStatus | None = None  # in the last status
@@ -98,7 +98,7 @@ class ServoExecutor(Executor):
         for module in (control, reference, sensor_monitor, actuator_monitor):
             module.preload()
         joints = np.zeros((3, 1))
-        show.load()(np.zeros(8), joints[0], joints, joints, joints[0], 0.0, 0.0, 0.0)
+        show.load()(np.zeros(8), joints[0], joints[0], joints, joints, joints[0], 0.0, 0.0, 0.0)
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
@@ -191,7 +191,7 @@ class ServoExecutor(Executor):
         if refused is not None:
             return self._refuse(refused, tick)
         self._wanted, self._abandoned, self.stopping.refused = wanted.table, False, None
-        return self.motors.begin(self.arm.torque)
+        return self.motors.begin()
 
     def _next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
         """Return the wanted motion; after braking it begins where the arm is."""
@@ -221,7 +221,8 @@ class ServoExecutor(Executor):
         """Fill the status, and the estimate in the state; what seldom changes only when it does."""
         arm, status = self.arm, write.status
         if self._numbers is None:
-            self._numbers = numbers(status, "position", "grip_force"), numbers(write.state, "position", "doubt")
+            moving, kept = numbers(status, "position", "grip_force"), numbers(write.state, "position", "doubt")
+            self._numbers = moving, kept, self.motors.torque
         _, _, opening, opening_velocity, _ = sensed
         self._show_numbers(
             *self._numbers, self.sensors.estimate, self._wanted, arm.torque, opening, opening_velocity, arm.grip_force
@@ -271,6 +272,7 @@ def numbers(message: Message, first: str, last: str) -> Array:
 def show(
     status: Array,  # (5 joints + 3,): set, its fields from `position` to `grip_force`
     state: Array,  # (3 joints,): set, its fields from `position` to `doubt`
+    begun: Array,  # (joints,), N m: set, see `ActuatorMonitor.torque`
     estimate: Array,  # (3, joints), rad, rad/s, rad
     wanted: Array,  # (2, joints) or more, rad, rad/s
     torque: Array,  # (joints,), N m
@@ -285,5 +287,5 @@ def show(
             state[row * joints + j] = estimate[row, j]
         for row in range(2):
             status[row * joints + j], status[(3 + row) * joints + j] = estimate[row, j], wanted[row, j]
-        status[2 * joints + j] = torque[j]
+        status[2 * joints + j] = begun[j] = torque[j]
     status[-3], status[-2], status[-1] = opening, opening_velocity, grip_force

@@ -211,7 +211,8 @@ class Bench:
         found = []
         for _ in range(cycles):
             taken = np.where(over, np.copysign(HELD_BY_FRICTION, over), 0.0)
-            self.monitor.begin(self.terms.bias + over + taken)
+            self.monitor.torque[:] = self.terms.bias + over + taken
+            self.monitor.begin()
             found.append(self.monitor.look(RESTING, RESTING, self.terms, holds))
         return [finding for finding in found if finding is not None]
 

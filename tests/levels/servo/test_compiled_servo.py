@@ -76,7 +76,9 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         motion_of(k, following, size) for k in range(20) for following, size in ((0.02, 1), (9, 1), (9, 1e6))
     ],
     "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
-    "show": [(noise(1, 5 * JOINTS + 3), noise(2, 3 * JOINTS), *noise(3, 2, 3, JOINTS), noise(4), 0.1, 0.2, 0.3)],
+    "show": [
+        (noise(1, 5 * JOINTS + 3), noise(2, 3 * JOINTS), noise(5), *noise(3, 2, 3, JOINTS), noise(4), 0.1, 0.2, 0.3)
+    ],
 }
 VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2}
 """Kinds of verdicts that the cases reach; else: None."""
