@@ -119,7 +119,7 @@ class Orders:
         self.answer = Answer.NONE
         self._objection = ""
         self._before = 0, Operation.NONE
-        self._is_reported = False
+        self._reported: int | None = None  # newest command rested on, in the last report; None: there is news
 
     def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
         """Read the mailbox; return True in the cycle that accepts a command.
@@ -141,7 +141,7 @@ class Orders:
         if message.id <= self.serial:
             return False
         self._before = self.basis, self.standing
-        self.serial, self._objection, self._is_reported = message.id, "", False
+        self.serial, self._objection, self._reported = message.id, "", None
         what, goal = message.what, message.goal
         if what not in self._commands or goal not in (self._commands[Operation(what)] or (Goal.NONE,)):
             self.refuse(f"{described(what, goal)} is not a command of this level; permitted: {listed(self._commands)}")
@@ -179,19 +179,19 @@ class Orders:
         return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
 
     def _answer(self, answer: Answer, why: str = "") -> None:
-        self.answer, self._objection, self._is_reported = answer, why, False
+        self.answer, self._objection, self._reported = answer, why, None
 
     def rests_on(self, above: int) -> int:
         """Return the newest command that this cycle rests on; `above` is that of the command from above."""
         return max(self.basis, above)
 
     def report(self, status: Message, above: int = 0) -> None:
-        """Fill the fields of `ANSWER`."""
-        status.operator = max(self.basis, above)
-        if not self._is_reported:
-            status.order, status.answer, status.standing = self.serial, self.answer, self.standing
-            status.objection = self._objection
-            self._is_reported = True
+        """Fill the fields of `ANSWER` when they change."""
+        rests_on = max(self.basis, above)
+        if rests_on != self._reported:
+            status.operator, status.order, status.answer = rests_on, self.serial, self.answer
+            status.standing, status.objection = self.standing, self._objection
+            self._reported = rests_on
 
 
 def joints_of(message: Message, names: Sequence[str], ranges: NDArray[np.float64]) -> NDArray[np.float64]:

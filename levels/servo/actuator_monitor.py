@@ -52,7 +52,8 @@ class ActuatorMonitor:
             URGENT_SPEED_PART * cell.bounds.velocity,
         )
         self._table = np.zeros((13 + joints, joints))  # in the rows of `left_over`
-        self._torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
+        # `torque`, (joints,), N m: given in the cycle that begins; the level fills it in.
+        self.torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
         self._left, self._noise, *self._friction, self._velocity = self._table[8:13]
         self._dry[:] = model.dof_frictionloss[dof]
         # Simulated friction slows a joint as a damper of that time constant does: if the joint brakes harder, the
@@ -62,16 +63,15 @@ class ActuatorMonitor:
         # The change in velocity that the encoders' errors may simulate.
         uncertain[:] = 2.0 * cell.encoders.speed_off / period_s
         self._off[:] = cell.encoders.off
-        self._judge = partial(left_over.load(), self._table, period_s, following)
+        self._judge = partial(left_over.load(), self._table, 0.5 / period_s, following)
         self._begun = False
         self._pushed = False  # weak motors do not explain the difference
         self._cycles, self._joint = 0, -1  # cycles for which a motor has lacked torque, and its joint
         self._commanded = self._given = self._most = 0.0  # N m: commanded and given at first, most given since
         self._alone = True  # it is the only motor that lacks torque
 
-    def begin(self, torque: Array) -> None:
-        """Begin a cycle with commanded torques, N m, at the velocity and terms last looked at."""
-        self._torque[...] = torque
+    def begin(self) -> None:
+        """Begin a cycle with `torque`, at the velocity and terms last looked at."""
         self._begun = True
 
     def drop(self) -> None:
@@ -79,30 +79,28 @@ class ActuatorMonitor:
         self._begun = self._pushed = False
         self._cycles = 0
 
-    def look(self, state: tuple[Array, Array], terms: Terms, wanted: Array, holds: bool) -> Finding | None:
+    def look(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
         """Judge the cycle that ends now, at a state, rad and rad/s, where the set points are at `wanted`, rad.
 
-        Velocity and terms are kept for the cycle that may begin.
-
-        `holds`: the gripper holds a part, which may touch something.
+        `wanted` and `state` begin with a row of positions, (joints,); then follow velocities. `holds`: the gripper
+        holds a part, which may touch something. Velocity and terms are kept for the cycle that may begin.
         """
-        position, velocity = state
-        verdict = self._judge(wanted, position, velocity, terms.inertia, terms.bias)
+        verdict = self._judge(wanted, state, terms.inertia, terms.bias)
         if not self._begun:
             return None
         if verdict == EXPLAINED:
             self._cycles, self._pushed = 0, False
             return None
         if verdict == ASTRAY:
-            astray = wanted - position
+            astray = wanted[0] - state[0]
             joint = int((np.abs(astray) - self._off).argmax())
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
-        return self._lacking(self._left, velocity, holds)
+        return self._lacking(self._left, state[1], holds)
 
     def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
         """Follow cycles in which motors that lack torque explain the difference, until it is certain."""
-        commanded = np.abs(self._torque)
-        lacks = left * np.sign(self._torque)
+        commanded = np.abs(self.torque)
+        lacks = left * np.sign(self.torque)
         explained = (lacks >= -self._noise) & (lacks <= commanded + self._noise)
         if not self._pushed and not explained.all():
             self._pushed, self._cycles = True, 0
@@ -147,13 +145,12 @@ class ActuatorMonitor:
 @compiled
 def left_over(
     table: Array,  # (13 + joints, joints): rows as below
-    period_s: float,
+    half_rate: float,  # 1/s: of the cycles
     following: float,  # rad
-    wanted: Array,  # (joints,), rad
-    position: Array,  # (joints,), rad, and so on: now
-    velocity: Array,
-    inertia: Array,
-    bias: Array,
+    wanted: Array,  # (3, joints), rad: positions in the first row
+    state: Array,  # (2, joints), rad, rad/s: now
+    inertia: Array,  # (joints, joints), kg m2: now
+    bias: Array,  # (joints,), N m: now
 ) -> int:
     """Compare the torques that a motion took with those commanded, keep what is now for then; return the verdict."""
     velocity_before, bias_before, torque = table[0], table[1], table[2]  # rad/s, N m, N m: at the cycle's beginning
@@ -161,13 +158,13 @@ def left_over(
     dry, early = table[3], table[4]  # friction, N m; time constant of the simulated one, s
     noise, uncertain = table[5], table[6]  # N m, rad/s2: of exact encoders, and acceleration that others may simulate
     off = table[7]  # rad: error of the positions
-    verdict = EXPLAINED
+    position, velocity, verdict = state[0], state[1], EXPLAINED
     for j in range(len(velocity)):
         left, unsure = torque[j] - 0.5 * (bias_before[j] + bias[j]), noise[j]
         for k in range(len(velocity)):
-            left -= (inertia_before[j, k] + inertia[j, k]) * ((0.5 / period_s) * (velocity[k] - velocity_before[k]))
+            left -= (inertia_before[j, k] + inertia[j, k]) * (half_rate * (velocity[k] - velocity_before[k]))
             unsure += abs(inertia[j, k]) * uncertain[k]
-        ahead = velocity[j] + early[j] * ((0.5 / period_s) * (velocity[j] - velocity_before[j]))
+        ahead = velocity[j] + early[j] * (half_rate * (velocity[j] - velocity_before[j]))
         slowest, fastest = min(ahead, velocity_before[j]), max(ahead, velocity_before[j])
         least = dry[j] * math.tanh(slowest / FRICTION_SPEED - TURNING)
         most = dry[j] * math.tanh(fastest / FRICTION_SPEED + TURNING)
@@ -176,10 +173,10 @@ def left_over(
         table[8, j], table[9, j], table[10, j], table[11, j] = left, unsure, least, most
         if abs(left) > unsure:
             verdict = max(verdict, LEFT_OVER)
-        if abs(wanted[j] - position[j]) - off[j] > following:
+        if abs(wanted[0, j] - position[j]) - off[j] > following:
             verdict = ASTRAY
-    table[12] = velocity_before
     for j in range(len(velocity)):
+        table[12, j] = velocity_before[j]
         velocity_before[j], bias_before[j] = velocity[j], bias[j]
         for k in range(len(velocity)):
             inertia_before[j, k] = inertia[j, k]
@@ -188,5 +185,5 @@ def left_over(
 
 def preload() -> None:
     """Load this module's compiled functions."""
-    square, joints = np.zeros((1, 1)), np.zeros(1)
-    left_over.load()(np.zeros((14, 1)), 1.0, 1.0, joints, joints, joints, square, joints)
+    square = np.zeros((1, 1))
+    left_over.load()(np.zeros((14, 1)), 1.0, 1.0, np.zeros((3, 1)), np.zeros((2, 1)), square, np.zeros(1))

@@ -60,8 +60,11 @@ class ComputedTorque:
     def __init__(self, cell: Cell, params: ServoParams, dynamics: Dynamics) -> None:
         """Use `dynamics` of the cell: the arm's, which saves its limit gate another evaluation."""
         self._dynamics = dynamics
-        gains = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
-        self._set = partial(set_torque.load(), *gains, dynamics.dry, cell.bounds.torque.copy())
+        table = np.zeros((5, len(cell.dof)))  # in the rows of `set_torque`
+        table[0], table[1] = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
+        table[2], table[3] = dynamics.dry, cell.bounds.torque
+        self._torque: Array = table[4]
+        self._set = partial(set_torque.load(), table)
         self.holds = False  # the gripper holds a part, says the plan
         self.cut = 0  # cycles in which a torque limit cut a torque
         self._payload: Payload | None = None
@@ -77,36 +80,38 @@ class ComputedTorque:
         """Return the equation of motion at rad, rad/s, with the held object. Valid until the next call."""
         return self._dynamics.terms(position, velocity, self._payload)
 
-    def torque(self, wanted: Motion, position: Array, velocity: Array, terms: Terms) -> Array:
-        """Return the torques, (joints,), N m, for the wanted motion."""
-        torque = np.empty(len(position))
+    def torque(self, wanted: Motion, state: Array, terms: Terms) -> Array:
+        """Return the torques, (joints,), N m, for the wanted motion at `state`, rad, rad/s. Valid until the next call.
+
+        The rows of `state` are positions and velocities, (2, joints).
+        """
         inertia = terms.inertia if self._inertia is None else self._inertia
-        self.cut += self._set(*wanted, position, velocity, inertia, terms.bias, torque)
-        return torque
+        if self._set(wanted.table, state, inertia, terms.bias):
+            self.cut += 1
+        return self._torque
 
 
 @compiled
 def set_torque(
-    stiffness: float,  # 1/s2
-    damping: float,  # 1/s
-    dry: Array,  # (joints,), N m: friction
-    limits: Array,  # (joints,), N m
-    wanted: Array,  # (joints,), rad; then rad/s and rad/s2
-    wanted_velocity: Array,
-    wanted_acceleration: Array,
-    position: Array,  # (joints,), rad
-    velocity: Array,  # (joints,), rad/s
+    table: Array,  # (5, joints): rows as below
+    wanted: Array,  # (3, joints): rad, rad/s, rad/s2
+    state: Array,  # (2, joints): rad, rad/s
     inertia: Array,  # (joints, joints), kg m2
     bias: Array,  # (joints,), N m
-    torque: Array,  # (joints,), N m: set
 ) -> bool:
     """Set the torques of `ComputedTorque`; return whether a limit cut one."""
-    acceleration = wanted_acceleration + damping * (wanted_velocity - velocity) + stiffness * (wanted - position)
+    stiffness, damping, dry, limits = table[0], table[1], table[2], table[3]  # 1/s2, 1/s, N m (friction), N m
+    torque = table[4]  # N m: set
     cut = False
     for j in range(len(torque)):
-        needed = bias[j] + dry[j] * math.tanh(wanted_velocity[j] / FRICTION_SPEED)
-        for k in range(len(torque)):
-            needed += inertia[j, k] * acceleration[k]
+        torque[j] = bias[j] + dry[j] * math.tanh(wanted[1, j] / FRICTION_SPEED)
+    for k in range(len(torque)):
+        damped = wanted[2, k] + damping[k] * (wanted[1, k] - state[1, k])
+        acceleration = damped + stiffness[k] * (wanted[0, k] - state[0, k])
+        for j in range(len(torque)):
+            torque[j] += inertia[j, k] * acceleration
+    for j in range(len(torque)):
+        needed = torque[j]
         torque[j] = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
         cut = cut or needed != torque[j]
     return cut
@@ -119,7 +124,7 @@ class Grip:
     """
 
     def __init__(self, config: GripperConfig) -> None:
-        self._config = config
+        self._stiffness, self._damping, self._most_force = config.stiffness, config.damping, config.force
         self._least, self._most = sorted((config.open, config.closed))
         self._opening, self._limit = config.open, config.force
         self._kept: float | None = None
@@ -132,18 +137,18 @@ class Grip:
         """Take a new `JOINT_SET_POINT`."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
-            self._limit = min(max(command.force, 0.0), self._config.force)
+            self._limit = min(max(command.force, 0.0), self._most_force)
             self._kept = None
 
     def force(self, opening: float, velocity: float) -> float:
         """Return the force, N, at `opening`, m, and its `velocity`, m/s."""
         if self._kept is not None:
             return self._kept
-        force = self._config.stiffness * (self._opening - opening) - self._config.damping * velocity
+        force = self._stiffness * (self._opening - opening) - self._damping * velocity
         return min(max(force, -self._limit), self._limit)
 
 
 def preload() -> None:
     """Load this module's compiled functions."""
-    square, one = np.zeros((1, 1)), np.zeros(1)
-    set_torque.load()(0.0, 0.0, one, one, one, one, one, one, one, square, one, one)
+    square = np.zeros((1, 1))
+    set_torque.load()(np.zeros((5, 1)), np.zeros((3, 1)), np.zeros((2, 1)), square, np.zeros(1))

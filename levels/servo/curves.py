@@ -6,8 +6,6 @@ the joints rest after it. So one compiled function gives the motion on any of th
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from rack.levels.algebra import Array
@@ -17,12 +15,14 @@ REST = 6
 """Row of a curve's table: where the joints rest after it."""
 
 
-class Motion(NamedTuple):
-    """Joint positions, rad, velocities, rad/s, and accelerations, rad/s2, (joints,) each."""
+class Motion:
+    """Joint positions, rad, velocities, rad/s, and accelerations, rad/s2, (joints,) each: the rows of `table`."""
 
-    position: Array
-    velocity: Array
-    acceleration: Array
+    __slots__ = ("acceleration", "position", "table", "velocity")
+
+    def __init__(self, table: Array) -> None:
+        self.table = table  # (3, joints)
+        self.position, self.velocity, self.acceleration = table
 
 
 class Curve:
@@ -39,24 +39,25 @@ class Curve:
 
     def at(self, time_s: float) -> Motion:
         """Return the motion at `time_s` from 0 on."""
-        motion = np.zeros((3, self.table.shape[1]))
-        set_motion.load()(self.table, self.duration_s, self.ends_s, time_s, motion)
-        return Motion(*motion)
+        motion = Motion(np.zeros((3, self.table.shape[1])))
+        set_motion.load()(self.table, self.duration_s, self.ends_s, time_s, 0.0, motion.table)
+        return motion
 
 
 @compiled
-def set_motion(table: Array, duration_s: float, ends_s: float, time_s: float, motion: Array) -> None:
-    """Set position, velocity and acceleration, (3, joints), to those on a curve."""
-    if time_s >= ends_s:
-        motion[0] = table[REST]
-        motion[1:] = 0.0
-        return
-    h, u = duration_s, time_s / duration_s
+def set_motion(table: Array, duration_s: float, ends_s: float, time_s: float, ahead_s: float, motion: Array) -> None:
+    """Set position, velocity and, `ahead_s` later, acceleration, (3, joints), to those on a curve."""
+    h, u, later = duration_s, time_s / duration_s, (time_s + ahead_s) / duration_s
+    moves, accelerates = time_s < ends_s, time_s + ahead_s < ends_s
     for j in range(table.shape[1]):
+        if not moves:
+            motion[0, j], motion[1, j], motion[2, j] = table[REST, j], 0.0, 0.0
+            continue
         c0, c1, c2, c3, c4, c5 = table[0, j], table[1, j], table[2, j], table[3, j], table[4, j], table[5, j]
         motion[0, j] = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
         motion[1, j] = (c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
-        motion[2, j] = (2.0 * c2 + u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5))) / (h * h)
+        acceleration = (2.0 * c2 + later * (6.0 * c3 + later * (12.0 * c4 + later * 20.0 * c5))) / (h * h)
+        motion[2, j] = acceleration if accelerates else 0.0
 
 
 class Bridge(Curve):
@@ -88,7 +89,7 @@ def set_bridge(
 ) -> None:
     """Set the coefficients of the cubic Hermite curve in `table`, (7, joints)."""
     motion = np.zeros((3, table.shape[1]))
-    set_motion(before, before_duration_s, before_ends_s, begin_s, motion)
+    set_motion(before, before_duration_s, before_ends_s, begin_s, 0.0, motion)
     first, second, way = motion[1] * duration_s, velocity * duration_s, position - motion[0]
     table[0] = motion[0]
     table[1] = first
@@ -140,6 +141,6 @@ class Passage(Decay):
 def preload() -> None:
     """Load this module's compiled functions."""
     table, joints = np.zeros((REST + 1, 1)), np.zeros(1)
-    set_motion.load()(table, 1.0, 1.0, 0.0, table[:3])
+    set_motion.load()(table, 1.0, 1.0, 0.0, 0.0, table[:3])
     set_bridge.load()(table, 1.0, 1.0, 0.0, joints, joints, 1.0, table)
     is_within.load()(table, 1.0, joints)

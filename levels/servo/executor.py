@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
 from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
 from rack.levels.arm.faulty import STEPS
-from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelContext, Output, Ports, Reading
+from rack.levels.compiled import compiled
+from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelContext, Output, Ports, Reading, Verdict
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell
@@ -80,8 +82,10 @@ class ServoExecutor(Executor):
         self.operator = OperatorControl(self.commands, context.robot.joints, cell.limits.position)
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
-        self._rest = np.zeros(len(cell.home))  # (joints,), always zero: velocity and acceleration at rest
-        self._wanted = Motion(cell.home, self._rest, self._rest)  # motion wanted in the last cycle: rad, rad/s, rad/s2
+        self._wanted = np.zeros((2, len(cell.home)))  # the motion wanted in the last cycle begins with: rad, rad/s
+        self._wanted[0] = cell.home
+        self._numbers: tuple[Array, Array, Array] | None = None  # set in every cycle: the first arguments of `show`
+        self._show_numbers = show.load()
         self._command = self._rests_on = 0  # serials of the newest command, and of the operator's that it rests on
         self._shown: SteadyStatus | None = None  # in the last status
         self._started = False  # the first cycle has begun
@@ -93,6 +97,8 @@ class ServoExecutor(Executor):
         preload()
         for module in (control, reference, sensor_monitor, actuator_monitor):
             module.preload()
+        joints = np.zeros((3, 1))
+        show.load()(np.zeros(8), joints[0], joints[0], joints, joints, joints[0], 0.0, 0.0, 0.0)
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
@@ -105,7 +111,7 @@ class ServoExecutor(Executor):
         self._take_messages(read)
         sensed, sensors = self._link.sense(), self.sensors
         contact = self.arm.contact
-        sensors.look(sensed, tick, None if missed or self._abandoned else self._wanted.velocity, contact is not None)
+        sensors.look(sensed, tick, None if missed or self._abandoned else self._wanted, contact is not None)
         if contact is not None:
             self.stopping.struck(contact, self.arm.named(contact), tick)
         reaction = self.stopping.decide(self.demand, sensors, tick)
@@ -116,21 +122,20 @@ class ServoExecutor(Executor):
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
         self._brakes.after_cycle(tick, self.findings)
-        self._report(write.status, sensed, reaction)
+        self._report(write, sensed, reaction)
         self.operator.orders.report(write.status, self._rests_on)
         self.arm.save(write.state)
-        sensors.remember(write.state)
         self.stopping.remember(write.state)
         if SCENES.is_due(tick, self.context.every):
             self.arm.look(write.scene)
 
     def _take_messages(self, read: Ports) -> None:
         """Take over what is new."""
-        if read.operator.is_new:
+        if read.operator.verdict is Verdict.NEW:
             self.operator.take(read.operator)
-        if read.plan.is_new:
+        if read.plan.verdict is Verdict.NEW:
             self._loop.take(read.plan.value)
-        if read.command.is_new:
+        if read.command.verdict is Verdict.NEW:
             command: Message = read.command.value
             self._command, self._rests_on = command.id, command.operator
             self.reference.take(command)
@@ -167,26 +172,26 @@ class ServoExecutor(Executor):
         """Brake, and abandon the set points."""
         self.arm.brake()
         self.motors.drop()
-        self._wanted = Motion(self.sensors.position, self.sensors.velocity, self._rest)
+        self._wanted = self.sensors.state
         self._abandoned = True
 
     def _drive(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
         """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is complete."""
-        position, velocity = self.sensors.position, self.sensors.velocity
+        sensors, loop = self.sensors, self._loop
         wanted = self._next_motion(reaction, missed, tick)
-        terms = self._loop.terms(position, velocity)
-        failed = self.motors.look((position, velocity), terms, wanted.position, self._loop.holds)
+        terms = loop.terms(sensors.position, sensors.velocity)
+        failed = self.motors.look(wanted.table, sensors.state, terms, loop.holds)
         if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
             return self._brake()
         if reaction is Reaction.STOP and (self._abandoned or not wanted.velocity.any()):
             return self._brake()
-        torque = self._loop.torque(wanted, position, velocity, terms)
+        torque = loop.torque(wanted, sensors.state, terms)
         grip_force = 0.0 if self._grip is None else self._grip.force(sensed.opening, sensed.opening_velocity)
         refused = self._link.drive(torque, grip_force)
         if refused is not None:
             return self._refuse(refused, tick)
-        self._wanted, self._abandoned, self.stopping.refused = wanted, False, None
-        return self.motors.begin(self.arm.torque)
+        self._wanted, self._abandoned, self.stopping.refused = wanted.table, False, None
+        return self.motors.begin()
 
     def _next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
         """Return the wanted motion; after braking it begins where the arm is."""
@@ -212,13 +217,16 @@ class ServoExecutor(Executor):
         self.stopping.refuse(finding, tick)
         self._brake()
 
-    def _report(self, status: Message, sensed: Sensed, reaction: Reaction) -> None:
-        """Fill the status; what seldom changes only when it does."""
-        arm, sensors, wanted = self.arm, self.sensors, self._wanted
-        status.position[...], status.velocity[...], status.torque[...] = sensors.position, sensors.velocity, arm.torque
-        status.target[...], status.target_velocity[...] = wanted.position, wanted.velocity
-        status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
-        status.grip_force = arm.grip_force
+    def _report(self, write: Ports, sensed: Sensed, reaction: Reaction) -> None:
+        """Fill the status, and the estimate in the state; what seldom changes only when it does."""
+        arm, status = self.arm, write.status
+        if self._numbers is None:
+            moving, kept = numbers(status, "position", "grip_force"), numbers(write.state, "position", "doubt")
+            self._numbers = moving, kept, self.motors.torque
+        _, _, opening, opening_velocity, _ = sensed
+        self._show_numbers(
+            *self._numbers, self.sensors.estimate, self._wanted, arm.torque, opening, opening_velocity, arm.grip_force
+        )
         shown = (
             self._command,
             self._abandoned or self.reference.holding,
@@ -229,7 +237,7 @@ class ServoExecutor(Executor):
             arm.touches,
             arm.violations,
             arm.pushed,
-            self.stopping.reason or self.operator.reason,
+            self.stopping.reason or (self.operator.reason if self.operator.stands else ""),
             self.stopping.error,
             arm.fault,
         )
@@ -250,3 +258,34 @@ class ServoExecutor(Executor):
             status.state = State.HOLDING if shown.kept and shown.command else resting
             status.error = Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
             status.reason = shown.kept or (self.arm.first_violation if shown.violations else self.arm.first_touch)
+
+
+def numbers(message: Message, first: str, last: str) -> Array:
+    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one array."""
+    fields = message.record.dtype.fields
+    assert fields is not None
+    begin, end = fields[first][1], fields[last][1] + fields[last][0].itemsize
+    return np.frombuffer(message.raw[begin:end])
+
+
+@compiled
+def show(
+    status: Array,  # (5 joints + 3,): set, its fields from `position` to `grip_force`
+    state: Array,  # (3 joints,): set, its fields from `position` to `doubt`
+    begun: Array,  # (joints,), N m: set, see `ActuatorMonitor.torque`
+    estimate: Array,  # (3, joints), rad, rad/s, rad
+    wanted: Array,  # (2, joints) or more, rad, rad/s
+    torque: Array,  # (joints,), N m
+    opening: float,  # m
+    opening_velocity: float,  # m/s
+    grip_force: float,  # N
+) -> None:
+    """Fill in what of status and state changes in every cycle."""
+    joints = len(torque)
+    for j in range(joints):
+        for row in range(3):
+            state[row * joints + j] = estimate[row, j]
+        for row in range(2):
+            status[row * joints + j], status[(3 + row) * joints + j] = estimate[row, j], wanted[row, j]
+        status[2 * joints + j] = begun[j] = torque[j]
+    status[-3], status[-2], status[-1] = opening, opening_velocity, grip_force

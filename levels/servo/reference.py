@@ -16,7 +16,7 @@ from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 from rack.levels.robot.limits import Bounds, Limits
 from rack.levels.servo import curves
-from rack.levels.servo.curves import REST, Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
+from rack.levels.servo.curves import Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
 
 MAX_ACCELERATION = 2.0
 """Multiple of the acceleration limits that the curve between two set points may need: planned motion, interpolated,
@@ -43,13 +43,13 @@ class Reference:
     """Interpolates set points: `take` takes them, and tick by tick `at(tick)` gives the motion wanted at that tick."""
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
-        self._limits, self._tick_s = limits, tick_s
+        self._limits, self._tick_s, self._half_s = limits, tick_s, 0.5 * tick_s
         self._low, self._high = bounds.position.T.copy()
         self._fastest, self._hardest = bounds.velocity, MAX_ACCELERATION * limits.acceleration
         joints = len(limits.velocity)
-        self._motions = np.zeros((2, 3, joints))  # on the curve, and the difference
-        self._wanted = Motion(*self._motions[0])
-        self._interpolate, self._admit = interpolate.load(), admit.load()
+        self._motions = np.zeros((2, 3, joints))  # the one wanted, and its difference from the curve
+        self._wanted = Motion(self._motions[0])
+        self._interpolate, self._admit = set_motion.load(), admit.load()
         self._command: Message | None = None  # the newest `JOINT_SET_POINT`
         self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
@@ -83,10 +83,11 @@ class Reference:
 
     def at(self, tick: int) -> Motion:
         """Return the motion wanted at `tick`, by the set points taken; its acceleration is mid-cycle."""
-        if self._next is not None:
-            self._advance(tick)
-        if tick < self._offered != self._due:
-            self._receive(self._offered, tick)
+        if self._next is not None and (self.holding or tick >= self._due):
+            self._advance(self._next, tick)
+        offered, waiting = self._offered, self._next
+        if tick < offered != self._due and (waiting is None or offered != waiting.due):
+            self._receive(offered, tick)
         if not self.holding and tick >= self._due:
             last = self._motion(self._due)
             self.start(last.position, last.velocity, self._due)
@@ -117,8 +118,8 @@ class Reference:
 
     def _receive(self, due: int, tick: int) -> None:
         """Copy the set point offered. It waits until the one before it is due: some protocols deliver early."""
-        command, waiting = self._command, self._next
-        if command is None or (waiting is not None and due == waiting.due):
+        command = self._command
+        if command is None:
             return
         position, velocity = np.array(command.position), np.array(command.velocity)
         verdict = WRONG
@@ -127,13 +128,12 @@ class Reference:
         self.refused += verdict != WITHIN
         if verdict != WRONG:
             self._next = SetPoint(due, position, velocity)
-        self._advance(tick)
+        if self._next is not None and (self.holding or tick >= self._due):
+            self._advance(self._next, tick)
 
-    def _advance(self, tick: int) -> None:
-        """Begin the curve to the waiting set point when its time has come."""
-        if self._next is None or (not self.holding and tick < self._due):
-            return
-        (due, position, velocity), self._next = self._next, None
+    def _advance(self, to: SetPoint, tick: int) -> None:
+        """Begin the curve to the set point that waited: its time has come."""
+        (due, position, velocity), self._next = to, None
         if due <= tick:
             return
         begin = tick if self.holding else self._due
@@ -161,24 +161,15 @@ class Reference:
 
     def _motion(self, tick: int) -> Motion:
         """Return the motion at `tick`, valid until the next call; its acceleration is mid-cycle."""
-        curve, difference = self._curve, self._difference
-        time_s, half_s = (tick - self._from) * self._tick_s, 0.5 * self._tick_s
-        self._interpolate(curve.table, curve.duration_s, curve.ends_s, time_s, half_s, self._motions[0])
+        curve, difference, wanted = self._curve, self._difference, self._wanted
+        time_s, half_s = (tick - self._from) * self._tick_s, self._half_s
+        self._interpolate(curve.table, curve.duration_s, curve.ends_s, time_s, half_s, wanted.table)
         if difference is not None:
             time_s = (tick - self._differs_from) * self._tick_s
             lasts_s, ends_s = difference.duration_s, difference.ends_s
             self._interpolate(difference.table, lasts_s, ends_s, time_s, half_s, self._motions[1])
-            self._motions[0] += self._motions[1]
-        return self._wanted
-
-
-@compiled
-def interpolate(table: Array, duration_s: float, ends_s: float, time_s: float, half_s: float, motion: Array) -> None:
-    """Set position, velocity and, `half_s` later, acceleration, (3, joints), to those on a curve."""
-    set_motion(table, duration_s, ends_s, time_s + half_s, motion)
-    acceleration = motion[2].copy()
-    set_motion(table, duration_s, ends_s, time_s, motion)
-    motion[2] = acceleration
+            wanted.table += self._motions[1]
+        return wanted
 
 
 @compiled
@@ -198,6 +189,5 @@ def admit(position: Array, velocity: Array, low: Array, high: Array, fastest: Ar
 def preload() -> None:
     """Load the compiled functions of set points and curves."""
     curves.preload()
-    table, joints = np.zeros((REST + 1, 1)), np.zeros(1)
-    interpolate.load()(table, 1.0, 1.0, 0.0, 0.0, table[:3])
+    joints = np.zeros(1)
     admit.load()(joints, joints, joints, joints, joints)

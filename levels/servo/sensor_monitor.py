@@ -58,17 +58,19 @@ class SensorMonitor:
         encoders, bounds, home = cell.encoders, cell.bounds, cell.home
         self._coarse = not encoders.exact
         self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
-        self._fastest = BEYOND_SPEED * bounds.velocity
-        self._braking, self._tick_s, self._every = cell.limits.acceleration, tick_s, every
+        self._tick_s, self._every = tick_s, every
         joints = len(home)
-        self._table = np.zeros((15, joints))  # in the rows of `check`
+        self._table = np.zeros((19, joints))  # in the rows of `check`
         self._q, self._qd, *self._raw = self._table[:4]  # the sample, and the one before it
         # (joints,), rad: as sensed; estimated for joints whose sensor is suspect. (joints,), rad/s, likewise; unknown
         # ones are estimated as braked. (joints,), rad: largest error of `position`.
-        self.position, self.velocity, self.doubt = self._table[4:7]
+        self.position, self.velocity, self.doubt = self.estimate = self._table[4:7]
+        self.state = self._table[4:6]  # (2, joints): `position` and `velocity`
         self._room, self._speed_room, self._unshown = self._table[7:10]
         self._still, self._still_way, self._claimed = self._table[10:13]
-        self._way, self._allowed = self._table[13:]
+        self._way, self._allowed, self._braking, self._fastest = self._table[13:17]
+        self._fits, self._unchanged = self._table[17:]
+        self._braking[:], self._fastest[:] = cell.limits.acceleration, BEYOND_SPEED * bounds.velocity
         self._room[:], self._speed_room[:] = FIT_RAD + 2.0 * encoders.off, encoders.speed_off
         self._unshown[:] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
         self.position[:] = self._raw[0][:] = home
@@ -77,13 +79,10 @@ class SensorMonitor:
         self.drivable = True  # velocities are known, so the arm could still be driven
         self.blamed = (-1, 0.0, 0.0)  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
         self.findings: list[Finding] = []  # new ones, one per episode; the reader clears it
-        self._marks = np.zeros((2, joints), dtype=bool)  # fits; the last sample trusted showed the position before it
-        self._fits, self._unchanged = self._marks
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
         self._sent = self._everyone  # its set point moves, or may have moved
-        self._nothing = np.zeros(joints)
-        self._check = partial(check.load(), self._table, self._marks, self._coarse)
+        self._check = partial(check.load(), self._table, self._coarse)
         self._tick: int | None = None
         self._streak = 0  # good samples in a row
         self._rung: set[Alarm] = set()  # alarms raised in this episode
@@ -93,52 +92,46 @@ class SensorMonitor:
         self.position[:], self.velocity[:], self.doubt[:] = state.position, state.velocity, state.doubt
         self._tick = state.tick
 
-    def remember(self, state: Message) -> None:
-        """Fill in the estimate for `recall`."""
-        state.position, state.velocity, state.doubt = self.position, self.velocity, self.doubt
-
     def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
         """Check a sample at `tick`, and add faults to `findings`, once per episode.
 
-        `wanted` are the velocities, (joints,), rad/s, at which the arm was driven; None: it was not. `struck`:
-        something has touched the arm since the last cycle.
+        `wanted` is the motion that the arm was driven to follow, rad, rad/s, ... by row; None: it was not driven.
+        `struck`: something has touched the arm since the last cycle.
         """
-        passed = tick - self._tick if self._tick is not None else self._every
+        q, qd, _, _, sampled = sensed
+        passed = self._every if self._tick is None else tick - self._tick
         self._tick, passed_s = tick, passed * self._tick_s
-        self.fresh = sensed.tick == tick
+        self.fresh = sampled == tick
         if not self.fresh:
-            self._estimate_blind(passed_s, tick - sensed.tick)
+            self._estimate_blind(passed_s, tick - sampled)
             return
-        q, qd = self._q, self._qd
-        q[...], qd[...] = sensed.position, sensed.velocity
-        fastest = STRUCK_SPEED * self._fastest if struck else self._fastest
-        further = self._nothing
-        if struck or passed > self._every:
-            # Driven for a while, then braked: in between it was faster than at both ends.
-            between = 4.0 * self._every * self._tick_s * self._braking * (passed > self._every)
-            further = passed_s * (between + fastest * struck)
-        driven_at = self._nothing if wanted is None else wanted
-        verdict = self._check(driven_at, further, passed_s, wanted is not None, self.faulty)
+        # Driven for a while, then braked: in between it was faster than at both ends.
+        braked_s = 4.0 * self._every * self._tick_s if passed > self._every else 0.0
+        blow = STRUCK_SPEED if struck else 0.0
+        driven, motion = wanted is not None, self.state if wanted is None else wanted
+        verdict = self._check(q, qd, motion, passed_s, braked_s, blow, driven, self.faulty)
         if verdict == TAKEN:
             return
         if verdict == GOOD:
             self._take(self._allowed)
             return
-        self._sent = self._everyone if wanted is None else wanted != 0.0
+        self._sent = self._everyone if wanted is None else wanted[1] != 0.0
+        fits = self._fits != 0.0
         if self.faulty:
-            self._fits |= np.abs(q - self.position - self._way) <= self._allowed + self.doubt
-        self._doubtful(self._fits & (np.abs(qd) <= fastest), passed_s)
+            fits |= np.abs(self._q - self.position - self._way) <= self._allowed + self.doubt
+        fastest = blow * self._fastest if struck else self._fastest
+        self._doubtful(fits & (np.abs(self._qd) <= fastest), passed_s)
 
     def _take(self, room: Array) -> None:
         """Trust the sample; report a joint that this moves by more than `room`, rad."""
         q, way = self._q, self._way
-        np.equal(q, self._raw[0], out=self._unchanged)
+        self._unchanged[:] = q == self._raw[0]
         if self.doubt.any():
             off = q - self.position - way
             for joint in np.flatnonzero(np.abs(off) > room):
                 self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
             # A sensor that does not change proves nothing: it may be stuck.
-            self.doubt[~self._unchanged] = 0.0
+            self.doubt[self._unchanged == 0.0] = 0.0
         self._table[4:6] = self._table[2:4] = self._table[:2]
 
     def _claim(self, unchanged: Mask, passed_s: float) -> None:
@@ -170,7 +163,7 @@ class SensorMonitor:
         self._unproven &= unchanged
         if begins:
             # A sensor that showed no change may have been stuck while its joint crept: it may be off by that distance.
-            np.maximum(self.doubt, np.where(self._unchanged, STUCK_RAD, PLAUSIBLE_RAD), out=self.doubt)
+            np.maximum(self.doubt, np.where(self._unchanged != 0.0, STUCK_RAD, PLAUSIBLE_RAD), out=self.doubt)
             # One that shows no change now, although its joint was driven, may have been stuck for longer.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
@@ -252,12 +245,14 @@ class SensorMonitor:
 
 @compiled
 def check(
-    table: Array,  # (15, joints): rows as below
-    marks: Mask,  # (2, joints): set where positions agree with velocities; if taken, where they are as before
+    table: Array,  # (19, joints): rows as below
     coarse: bool,
-    wanted: Array,  # (joints,), rad/s: velocities at which the arm was driven
-    further: Array,  # (joints,), rad: more room, in unusual cycles
+    sensed: Array,  # (joints,), rad
+    sensed_velocity: Array,  # (joints,), rad/s
+    wanted: Array,  # (2, joints) or more, rad, rad/s: the motion that the arm was driven to follow
     passed_s: float,
+    braked_s: float,  # time for which it may have braked, in unusual cycles
+    blow: float,  # multiple of the fastest velocity that something may have given it
     driven: bool,
     faulty: bool,
 ) -> int:
@@ -269,17 +264,24 @@ def check(
     # sample does not change, rad.
     still, still_way, claimed = table[10], table[11], table[12]
     way, allowed = table[13], table[14]  # set: motion since the last sample, and room for its errors, rad
-    good, in_doubt, at_rest = not faulty, False, driven and bool(np.any(qd == velocity))
+    braking, fastest = table[15], table[16]  # rad/s2, rad/s
+    fits, unchanged = table[17], table[18]  # set to 0 or 1: agrees with velocities; if taken, is as before
+    good, in_doubt, at_rest = not faulty, False, False
+    for j in range(len(q)):
+        q[j], qd[j] = sensed[j], sensed_velocity[j]
+        at_rest = at_rest or (driven and qd[j] == velocity[j])
     for j in range(len(q)):
         change = qd[j] - velocity[j]
         way[j] = (0.5 * passed_s) * (qd[j] + velocity[j])
-        allowed[j] = room[j] + passed_s * (abs(change) + speed_room[j]) + further[j]
-        marks[0, j] = abs(q[j] - position[j] - way[j]) <= allowed[j]  # never true for NaN
+        further = passed_s * (braked_s * braking[j] + blow * fastest[j])
+        allowed[j] = room[j] + passed_s * (abs(change) + speed_room[j]) + further
+        fitting = abs(q[j] - position[j] - way[j]) <= allowed[j]  # never true for NaN
+        fits[j] = 1.0 if fitting else 0.0
         same = q[j] == last_q[j]
-        unmoved = at_rest and change == 0.0 and same and wanted[j] != 0.0
+        unmoved = at_rest and change == 0.0 and same and wanted[1, j] != 0.0
         still[j] = still[j] + 1.0 if unmoved else 0.0
-        still_way[j] = still_way[j] + passed_s * wanted[j] if unmoved else 0.0
-        good = good and marks[0, j] and not (still[j] >= STILL_CYCLES and abs(still_way[j]) >= unshown[j])
+        still_way[j] = still_way[j] + passed_s * wanted[1, j] if unmoved else 0.0
+        good = good and fitting and not (still[j] >= STILL_CYCLES and abs(still_way[j]) >= unshown[j])
         if coarse:  # an exact sensor that is stuck shows it in the next sample
             least = max(abs(qd[j]) - speed_room[j], 0.0)
             claimed[j] = claimed[j] + passed_s * least if same and qd[j] == last_qd[j] else 0.0
@@ -287,13 +289,14 @@ def check(
         in_doubt = in_doubt or doubt[j] != 0.0
     if not good or in_doubt:
         return GOOD if good else DOUBTFUL
-    marks[1] = q == last_q
-    table[2:4] = table[:2]
-    table[4:6] = table[:2]
+    for j in range(len(q)):
+        unchanged[j] = 1.0 if q[j] == last_q[j] else 0.0
+        last_q[j] = position[j] = q[j]
+        last_qd[j] = velocity[j] = qd[j]
     return TAKEN
 
 
 def preload() -> None:
     """Load this module's compiled functions."""
     joints = np.zeros(1)
-    check.load()(np.zeros((15, 1)), np.zeros((2, 1), dtype=bool), False, joints, joints, 0.0, False, False)
+    check.load()(np.zeros((19, 1)), False, joints, joints, np.zeros((2, 1)), 0.0, 0.0, 0.0, False, False)

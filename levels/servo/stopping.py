@@ -110,6 +110,10 @@ class Stopping:
         self._tick = tick
         if self.error:
             return Reaction.BRAKE
+        sound = self.refused is None and self._retry_at is None and self._struck_until is None
+        if sound and not (sensors.faulty or demand):
+            self._kept, self.reason = max(self._kept - passed, 0) if self._kept else 0, ""
+            return Reaction.NONE
         reaction, cause = self._weigh(sensors, tick)
         if cause is None:
             self._kept = max(self._kept - passed, 0)

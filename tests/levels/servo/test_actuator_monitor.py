@@ -189,7 +189,8 @@ def test_a_dead_motor_is_found_where_dry_friction_changes_sign_and_hides_it() ->
 
 
 CELL = cell("puma560")
-REST = np.zeros(6)
+RESTING = np.zeros((2, 6))
+REST = RESTING[0]
 HELD_BY_FRICTION = math.tanh(2.0) * CELL.model.dof_frictionloss[CELL.dof]
 """Torques that dry friction takes at rest, N m."""
 
@@ -200,7 +201,7 @@ class Bench:
     def __init__(self) -> None:
         self.monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)
         self.terms = Dynamics(CELL).terms(CELL.home, REST)
-        self.monitor.look((REST, REST), self.terms, REST, False)
+        self.monitor.look(RESTING, RESTING, self.terms, False)
 
     def leave(self, cycles: int, holds: bool = False, **left: float) -> list[Finding]:
         """Leave these torques over, N m, by joint from `j1` on, for some cycles; return what is found."""
@@ -210,8 +211,9 @@ class Bench:
         found = []
         for _ in range(cycles):
             taken = np.where(over, np.copysign(HELD_BY_FRICTION, over), 0.0)
-            self.monitor.begin(self.terms.bias + over + taken)
-            found.append(self.monitor.look((REST, REST), self.terms, REST, holds))
+            self.monitor.torque[:] = self.terms.bias + over + taken
+            self.monitor.begin()
+            found.append(self.monitor.look(RESTING, RESTING, self.terms, holds))
         return [finding for finding in found if finding is not None]
 
 

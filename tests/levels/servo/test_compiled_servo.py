@@ -9,12 +9,12 @@ import pytest
 
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
-from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, reference, sensor_monitor
+from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, executor, reference, sensor_monitor
 from tests.levels.arms import config
 from tests.levels.servo.rig import Course, ServoRig
 
 JOINTS = 7
-MODULES = (curves, reference, sensor_monitor, actuator_monitor, control)
+MODULES = (curves, reference, sensor_monitor, actuator_monitor, control, executor)
 FUNCTIONS = {name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)}
 
 
@@ -32,17 +32,9 @@ def sample_of(seed: int, error: float) -> tuple[Any, ...]:
     last, rules = estimate[:2].copy(), np.full((3, JOINTS), 1e-4)
     last[0, seed % JOINTS] = sample[0, seed % JOINTS]
     motionless = np.abs(noise(seed + 3, 3, JOINTS)) * np.array([[9.0], [1e-3], [1e-5]])
-    table = np.concatenate((sample, last, estimate, rules, motionless, np.zeros((2, JOINTS))))
-    return (
-        table,
-        np.zeros((2, JOINTS), dtype=bool),
-        seed % 2 == 0,
-        noise(seed + 4),
-        np.zeros(JOINTS),
-        passed_s,
-        seed % 5 > 0,
-        seed % 7 == 0,
-    )
+    table = np.concatenate((noise(seed, 2, JOINTS), last, estimate, rules, motionless, np.ones((6, JOINTS))))
+    unusual = (0.01, 5.0) if seed % 11 == 0 else (0.0, 0.0)
+    return table, seed % 2 == 0, *sample, noise(seed + 4, 2, JOINTS), passed_s, *unusual, seed % 5 > 0, seed % 7 == 0
 
 
 def table(seed: int) -> Array:
@@ -53,21 +45,28 @@ def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
     """Return the arguments of `left_over`."""
     before, inertia = noise(seed, 3, JOINTS), noise(seed + 1, 2, JOINTS, JOINTS)
     table = np.concatenate((before, rules * np.abs(noise(seed + 2, 5, JOINTS)), np.zeros((5, JOINTS)), inertia[0]))
-    return table, 0.0025, float(following), *noise(seed + 3, 3, JOINTS), inertia[1], noise(seed + 4)
+    return (
+        table,
+        200.0,
+        float(following),
+        noise(seed + 3, 3, JOINTS),
+        noise(seed + 5, 2, JOINTS),
+        inertia[1],
+        noise(seed),
+    )
 
 
 def wanted_of(seed: int, limit: float) -> tuple[Any, ...]:
     """Return the arguments of `set_torque`; one seed has a bias that is NaN."""
     inertia, bias = noise(seed, JOINTS, JOINTS), noise(seed + 1) * (np.nan if seed == 9 else 1.0)
-    constants = 3600.0, 120.0, np.abs(noise(seed + 2)), np.full(JOINTS, limit)
-    return *constants, *noise(seed + 3, 5, JOINTS), inertia, bias, np.zeros(JOINTS)
+    constants = np.outer((3600.0, 120.0, abs(noise(seed + 2)[0]), limit, 0.0), np.ones(JOINTS))
+    return constants, noise(seed + 3, 3, JOINTS), noise(seed + 4, 2, JOINTS), inertia, bias
 
 
 CASES: dict[str, list[tuple[Any, ...]]] = {
-    "set_motion": [(table(1), 0.02, ends_s, 0.013, noise(2, 3, JOINTS)) for ends_s in (0.01, np.inf)],
+    "set_motion": [(table(1), 0.02, ends_s, 0.013, 0.00125, noise(2, 3, JOINTS)) for ends_s in (0.01, 0.0135, np.inf)],
     "set_bridge": [(table(3), 0.02, 0.02, 0.013, noise(4), noise(5), 0.02, table(6))],
     "is_within": [(table(7), 0.02, size * np.ones(JOINTS)) for size in (1e3, 1e5)],
-    "interpolate": [(table(8), 0.02, 0.02, time_s, 0.00125, noise(9, 3, JOINTS)) for time_s in (0.013, 0.019, 0.02)],
     "admit": [
         (noise(k), noise(k + 1), -size, size, size) for k, size in ((1, np.ones(JOINTS)), (3, np.full(JOINTS, 9.0)))
     ]
@@ -77,6 +76,9 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         motion_of(k, following, size) for k in range(20) for following, size in ((0.02, 1), (9, 1), (9, 1e6))
     ],
     "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
+    "show": [
+        (noise(1, 5 * JOINTS + 3), noise(2, 3 * JOINTS), noise(5), *noise(3, 2, 3, JOINTS), noise(4), 0.1, 0.2, 0.3)
+    ],
 }
 VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2}
 """Kinds of verdicts that the cases reach; else: None."""
