@@ -1,4 +1,4 @@
-"""A silent clock, as found by the tasks that wait for it: one that is merely late is no fault, one that stands is."""
+"""A silent clock, as found by the tasks that wait for it: being late is no fault, having stopped is one."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class Fit:
     @property
     def words(self) -> str:
         """The line in words."""
-        return f"{self.board_us:.1f} us a board, {self.base_us:.1f} us besides (R2 {self.r2:.4f})"
+        return f"{self.board_us:.1f} us a board plus {self.base_us:.1f} us (R2 {self.r2:.4f})"
 
 
 @dataclass(frozen=True)
