@@ -85,8 +85,12 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         # The clock kills itself: its successor finds the entry struck.
         entry.acted(tick, time.monotonic_ns())
         os.kill(os.getpid(), signal.SIGKILL)
-    elif rack.send(entry, tick, task, signal.SIGKILL):
-        rack.driver.await_state(task, lambda: task.lost_tick >= 0)
+        return
+    # The crate marks the task, then counts the loss: only then is it seen by all duties of this tick.
+    words = rack.segment.words
+    before = words[System.LOSSES]
+    if rack.send(entry, tick, task, signal.SIGKILL):
+        rack.driver.await_state(task, lambda: task.lost_tick >= 0 and words[System.LOSSES] != before)
 
 
 def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:

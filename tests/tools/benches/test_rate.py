@@ -61,11 +61,11 @@ def test_a_rack_is_run_at_every_rate(tmp_path: Path, monkeypatch: pytest.MonkeyP
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = measure(str(path), (800, 400), Runs(0.3, 1, True), Progress())
+    found = measure(str(path), (800, 400), Runs(0.8, 1, True), Progress())
     assert [one.rate_hz for one in found.figures] == [400, 800]
     assert found.board == "wave"
     for one in found.figures:
-        assert 0 < one.cycles <= 0.3 * one.rate_hz
+        assert 0 < one.cycles <= 0.8 * one.rate_hz
         assert (one.late, one.failure) == (None, "")
         assert one.processor_us > 0
     assert isinstance(found.absent, Absent)
