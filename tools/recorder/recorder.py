@@ -18,6 +18,7 @@ from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import System
+from rack.boards.config.layout import KEPT_S
 from rack.tools.runs.cores import UNMEASURED, CoreMeter
 from rack.tools.runs.spool import Frame, RunFiles, Spool
 
@@ -101,6 +102,10 @@ class SafeSink:
             self._tell(f"run.rrd ends here: {' '.join(str(error).split()) or type(error).__name__}")
 
 
+RISKED_PART = 4
+"""Part of the rings, one in so many, that lockstep may be ahead of the spool's file."""
+
+
 class Recorder:
     """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the same rows.
 
@@ -125,7 +130,9 @@ class Recorder:
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         self._is_follower = follower == os.getpid() or not is_alive(follower)
-        self._report_progress(self._words[System.TICK])
+        self._safe_tick = self._words[System.TICK]  # all rows up to here are in the spool's file
+        self._most_at_risk = round(KEPT_S * 1e9 / layout.clock_ns) // RISKED_PART
+        self._report_progress(self._safe_tick)
 
     def __enter__(self) -> Self:
         return self
@@ -142,12 +149,15 @@ class Recorder:
             self._files.add(Frame(name, rows, lost))
             if self._view is not None:
                 self._view.add(name, rows)
-        self._spool.flush()
+        # A recorder that is killed loses what is not in its file: lockstep must not run so far ahead of that.
+        is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
+        if self._spool.flush(now=is_late):
+            self._safe_tick = tick
         if self._cores is not None:
             self._cores.look()
         if self._view is not None:
             self._view.advance(tick, self._files.lost)
-        self._report_progress(tick)
+        self._report_progress(self._safe_tick)
 
     def _report_progress(self, tick: int) -> None:
         """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost after a delay."""

@@ -140,14 +140,15 @@ class Spool:
             self._waiting[ring].append(rows)
         self._lost[ring] += lost
 
-    def flush(self, now: bool = False) -> None:
-        """Write what waits, when it is due or `now`. Raises `OSError` when the disk is full."""
+    def flush(self, now: bool = False) -> bool:
+        """Write what waits, when it is due or `now`; return whether it did. Raises `OSError` when the disk is full."""
         if not now and time.monotonic() < self._flush_at:
-            return
+            return False
         self._flush_at = time.monotonic() + FLUSH_S
         waiting = b"".join(self._packed())
         while waiting:
             waiting = waiting[self._file.write(waiting) :]
+        return True
 
     def _packed(self) -> Iterator[bytes]:
         for ring, place in self._rings.items():
