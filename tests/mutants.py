@@ -71,7 +71,7 @@ MUTANTS = (
         "claim",
         "masquerade",
         (
-            ("backplane/mailbox/mailbox.py", "slots.is_lawful(self._signature)", "True"),
+            ("backplane/mailbox/mailbox.py", "self.slots.is_lawful(self._signature)", "True"),
             ("boards/run/ports.py", "if writer.intruder:", "if False:"),
         ),
     ),
