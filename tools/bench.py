@@ -204,7 +204,9 @@ def response(
 
 @bench.command()
 def clock(
-    rate: Annotated[list[int] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
+    rate: Annotated[
+        list[int] | None, typer.Option(metavar="HZ", min=1, max=10_000, help="rate; may be given several times")
+    ] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 2.0,
     rounds: Rounds = 3,
     share: Share = False,
@@ -229,7 +231,9 @@ def clock(
 @bench.command()
 def rate(
     config: Config = "nasrem",
-    rate: Annotated[list[float] | None, typer.Option(metavar="HZ", help="rate; may be given several times")] = None,
+    rate: Annotated[
+        list[float] | None, typer.Option(metavar="HZ", min=1, max=10_000, help="rate; may be given several times")
+    ] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one run")] = 15.0,
     rounds: Rounds = 2,
     share: Share = False,
