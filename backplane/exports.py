@@ -1,4 +1,4 @@
-"""What a package exports, imported on first use: who needs one name need not wait for the libraries of all others."""
+"""Exports of a package, imported on first use: a user of one name does not wait for the libraries of the others."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ _FILES: list[tuple[int, int]] = []
 
 
 def note_used_files() -> None:
-    """Note which pages of files this process has used: a fork forgets that, and its memory is touched by it."""
+    """Note the pages of files that this process uses, for `touch_memory`: a fork does not inherit their mapping."""
     _FILES[:] = [stretch for _, rights, pages in _mappings() if rights[:2] == "r-" for stretch in pages]
 
 
@@ -61,7 +61,7 @@ def touch_memory() -> None:
     reserve = ctypes.create_string_buffer(RESERVE)
     del reserve
     for span, rights, used in _mappings():
-        # What is shared with other processes is the segment.
+        # "rw-s" is the segment: all of it.
         for first, last in [span] if rights == "rw-s" else used if rights[1] == "w" else ():
             _libc.madvise(first, last - first, _POPULATE_WRITE)
     for first, last in _FILES:

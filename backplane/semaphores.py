@@ -118,7 +118,7 @@ def wake_semaphore(rack: str, task: str) -> Semaphore:
 
 
 def done_semaphore(rack: str, task: str) -> Semaphore:
-    """Return the open semaphore on which lockstep waits for a task's reports, or for that of its loss."""
+    """Return the open semaphore on which lockstep waits for a task's reports, or for the crate to report its loss."""
     return _opened(_name(rack, "done", task))
 
 

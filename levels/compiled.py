@@ -57,7 +57,7 @@ def _jit(function: Any) -> Any:
 
 @cache
 def _use_cache() -> None:
-    """Let numba keep its code in a folder of these sources; remove that of their earlier states."""
+    """Make numba cache its code in a folder for the present sources; remove the folders of earlier ones."""
     import numba
 
     levels = Path(__file__).parent

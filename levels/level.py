@@ -175,7 +175,7 @@ class Executor(ABC):
 
     @classmethod
     def preload(cls) -> None:
-        """Load what every process of the level needs, as compiled code, once: the crate calls this before it forks."""
+        """Load what every process of the level needs, such as compiled code. Called once, before the crate forks."""
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""
@@ -210,7 +210,7 @@ class Planner(ABC):
 
     @classmethod
     def preload(cls) -> None:
-        """Load what every process of the level needs, as compiled code, once: the crate calls this before it forks."""
+        """Load what every process of the level needs, such as compiled code. Called once, before the crate forks."""
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""

@@ -1,4 +1,4 @@
-"""The answers of `rack list`, `rack status` and `rack report`: apart from their options, which take longer to parse."""
+"""Answers of `rack list`, `rack status` and `rack report`, apart from their options: parsing those takes longer."""
 
 from __future__ import annotations
 

@@ -29,6 +29,10 @@ Against = Annotated[
 Share = Annotated[
     bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
 ]
+Rates = Annotated[
+    list[float] | None,
+    typer.Option("--rate", metavar="HZ", min=1, max=10_000, help="rate; may be given several times"),
+]
 Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
 
 
@@ -204,9 +208,7 @@ def response(
 
 @bench.command()
 def clock(
-    rate: Annotated[
-        list[int] | None, typer.Option(metavar="HZ", min=1, max=10_000, help="rate; may be given several times")
-    ] = None,
+    rate: Rates = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 2.0,
     rounds: Rounds = 3,
     share: Share = False,
@@ -231,9 +233,7 @@ def clock(
 @bench.command()
 def rate(
     config: Config = "nasrem",
-    rate: Annotated[
-        list[float] | None, typer.Option(metavar="HZ", min=1, max=10_000, help="rate; may be given several times")
-    ] = None,
+    rate: Rates = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one run")] = 15.0,
     rounds: Rounds = 2,
     share: Share = False,

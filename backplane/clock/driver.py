@@ -30,9 +30,9 @@ _TICK, _TICK_NS, _STOP_TICK, _STOP_REQUEST = (
     int(word) for word in (System.TICK, System.TICK_NS, System.STOP_TICK, System.STOP_REQUEST)
 )
 LEAD_NS = 300_000
-"""Time by which the clock begins a tick ahead of its grid point: for its own wake-up and the work of a tick."""
+"""How far ahead of its grid point the clock begins a tick: room for its own wake-up and for the work of a tick."""
 LEAD_PART = 3
-"""At most this part of a tick: it is a third."""
+"""The clock is ahead by at most one part in so many of a tick."""
 
 Ended = Callable[[int], int | None]
 """Called before every tick; returns the tick at which the run stops, once that is known."""
@@ -158,7 +158,7 @@ class RealtimeDriver(ClockDriver):
         beat = max(1, int(CHECK_S * 1e9) // self._period_ns)
         for task in self.tasks:
             if task.sleeps:
-                # From here on there is a grid to sleep by.
+                # The grid to sleep by exists now.
                 task.wake()
         last = self.first_tick - 1
         # The grid begins a little after the clock's start, so that tick 0 has its grid point too.

@@ -98,16 +98,16 @@ class LockstepDriver(ClockDriver):
         """Wait until `condition` holds, which the task's reports make true; False when the launcher is gone."""
         wait = task.done.wait
         while not condition():
-            # Its bound is set now and then: a wait that ends too early looks around once too often.
+            # The bound may be that of an earlier wait: a timeout that comes early costs one look around, no more.
             if wait() and not self._look_around(task):
                 return False
         return True
 
     def _look_around(self, task: ReleasedTask) -> bool:
-        """Check, after a wait without a report, what time must not wait for; False when the launcher is gone."""
+        """Check for a stopped task after a wait without a report; False when the run must end."""
         if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
-        # By a signal.
+        # A signal may have stopped it: time must not wait for it.
         task.check_stopped()
         task.done.bind(time.monotonic_ns() + int(CHECK_S * 1e9))
         return True

@@ -51,7 +51,7 @@ class ReleasedTask:
         self.done = done_semaphore(segment.rack, spec.name)
 
     def is_free(self, release: int) -> bool:
-        """Say whether the task can take a release; it can not while it works on a plan, or is lost."""
+        """Say whether the task can take a release; it cannot while it works on a plan or is lost."""
         block = self.block
         return block[_DEADLINE] <= release and not block[_LOST]
 
@@ -71,10 +71,6 @@ class ReleasedTask:
         self._done = done
         block[_DEADLINE] = self.deadline = release + every
         block[_RELEASED] = release
-
-    def is_idle(self) -> bool:
-        """Say whether the newest release is finished."""
-        return self.block[_DONE] == self.block[_RELEASED]
 
     def is_settled(self) -> bool:
         """Say whether it has finished, or will not: there is nothing to wait for."""

@@ -1,4 +1,4 @@
-"""A silent clock, as found by the tasks that wait for it: being late is no fault, having stopped is one."""
+"""Detection of a stopped clock, by the tasks that wait for it. A late clock is not at fault."""
 
 from __future__ import annotations
 

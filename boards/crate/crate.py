@@ -98,7 +98,7 @@ class Crate:
                 self._kill(name)
 
     def _preload(self, wanted: Preload) -> None:
-        """Load what boards share with the crate. What the Rack finds by itself, mistakes in the config, it reports."""
+        """Load what boards share with the crate. Mistakes in the config are left for the Rack to report."""
         sys.path[:] = wanted.path
         for reference in wanted.classes:
             if reference not in self._preloaded and not self._is_preloaded(reference):

@@ -1,6 +1,6 @@
-"""What the Rack and its crate send each other: requests to the crate, and its answers.
+"""Messages between the Rack and its crate: requests, and the crate's answers.
 
-Nothing is imported for them: the first request is sent before the libraries that read a config are there.
+This module imports nothing heavy: the first request is sent before the libraries that read a config are loaded.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CellConfig:
-    """What the compiled cell depends on."""
+    """Inputs of the compiled cell."""
 
     robot: RobotConfig
     scene: SceneConfig

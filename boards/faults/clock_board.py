@@ -86,7 +86,7 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         entry.acted(tick, time.monotonic_ns())
         os.kill(os.getpid(), signal.SIGKILL)
         return
-    # The crate marks the task, then counts the loss: only then is it seen by all duties of this tick.
+    # The crate marks the task lost, then counts the loss. The system controller acts on the count: wait for both.
     words = rack.segment.words
     before = words[System.LOSSES]
     if rack.send(entry, tick, task, signal.SIGKILL):

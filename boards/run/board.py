@@ -25,7 +25,8 @@ from rack.levels.level import Executor, Planner
 SELF_TEST_FAILED = 3
 """Exit status of a board whose start-up test failed."""
 FAST_NS = 10_000_000
-"""Longest cycle that page faults can spoil: all take some milliseconds, touching the memory a tenth of a second."""
+"""Longest cycle for which memory is touched in advance: that takes a tenth of a second, and longer cycles have time for
+page faults."""
 
 
 def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:

@@ -40,7 +40,7 @@ class SimulatedArm(Arm):
         self._state = self._steps.seen[-1, 0], self._steps.seen[-1, 1]  # (joints,): true positions and velocities
         self._refresh()
         self._addresses = self._steps.model, self._steps.data
-        # They give single numbers in a third of the time of an array's.
+        # Memory views: single numbers in a third of the time that arrays take.
         self._qpos: memoryview[float] = memoryview(d.qpos)
         self._qvel: memoryview[float] = memoryview(d.qvel)
         self._ctrl: memoryview[float] = memoryview(d.ctrl)
@@ -93,7 +93,7 @@ class SimulatedArm(Arm):
         return Sensed(position, velocity, self._qpos[at], self._qvel[dof], self.tick)
 
     def _refresh(self) -> None:
-        """Take positions and velocities of the joints from MuJoCo's state: it was set by other than a step."""
+        """Take positions and velocities of the joints from MuJoCo's state, after it was set other than by a step."""
         position, velocity = self._state
         position[:], velocity[:] = self._data.qpos[self.cell.qpos], self._data.qvel[self.cell.dof]
 
@@ -202,7 +202,7 @@ class SimulatedArm(Arm):
             self.struck -= 1
 
     def _look_closer(self, made: int) -> None:
-        """Finish a tick of which step `made` is not as it should be; on a fault, restore the state before the tick."""
+        """Finish a tick in which step `made` failed a check; on a fault, restore the state before the tick."""
         touches, self._contacts.struck = self._contacts.count, self.contact
         self._contacts.look(self._data)
         while made < len(self._steps.seen):

@@ -46,11 +46,7 @@ class ActuatorMonitor:
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
         model, dof, joints = cell.model, cell.dof, len(cell.dof)
-        self._limits, self._following, self._fastest = (
-            cell.bounds.torque,
-            following,
-            URGENT_SPEED_PART * cell.bounds.velocity,
-        )
+        self._limits, self._fastest = cell.bounds.torque, URGENT_SPEED_PART * cell.bounds.velocity
         self._table = np.zeros((13 + joints, joints))  # in the rows of `left_over`
         # `torque`, (joints,), N m: given in the cycle that begins; the level fills it in.
         self.torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
@@ -152,7 +148,7 @@ def left_over(
     inertia: Array,  # (joints, joints), kg m2: now
     bias: Array,  # (joints,), N m: now
 ) -> int:
-    """Compare the torques that a motion took with those commanded, keep what is now for then; return the verdict."""
+    """Compare the torques that a motion took with those commanded; keep the present state for the next cycle."""
     velocity_before, bias_before, torque = table[0], table[1], table[2]  # rad/s, N m, N m: at the cycle's beginning
     inertia_before = table[13:]  # kg m2
     dry, early = table[3], table[4]  # friction, N m; time constant of the simulated one, s

@@ -31,7 +31,7 @@ SCENES = Output(SCENE, cycles=8)
 
 
 class SteadyStatus(NamedTuple):
-    """What of a status seldom changes."""
+    """The fields of a status that seldom change."""
 
     command: int
     holding: bool
@@ -218,7 +218,7 @@ class ServoExecutor(Executor):
         self._brake()
 
     def _report(self, write: Ports, sensed: Sensed, reaction: Reaction) -> None:
-        """Fill the status, and the estimate in the state; what seldom changes only when it does."""
+        """Fill the status, and the estimate in the state; the steady fields only when they change."""
         arm, status = self.arm, write.status
         if self._numbers is None:
             moving, kept = numbers(status, "position", "grip_force"), numbers(write.state, "position", "doubt")
@@ -246,7 +246,7 @@ class ServoExecutor(Executor):
             self._show(status, self._shown)
 
     def _show(self, status: Message, shown: SteadyStatus) -> None:
-        """Fill in what seldom changes."""
+        """Fill the steady fields."""
         status.echo, status.holding, status.stopped, status.braked = shown[:4]
         status.demand, status.clipped, status.touches, status.violations, status.pushed = shown[4:9]
         if shown.fault:
@@ -280,7 +280,7 @@ def show(
     opening_velocity: float,  # m/s
     grip_force: float,  # N
 ) -> None:
-    """Fill in what of status and state changes in every cycle."""
+    """Fill the fields of status and state that change in every cycle."""
     joints = len(torque)
     for j in range(joints):
         for row in range(3):

@@ -38,7 +38,7 @@ class TaskPlanner(Planner):
 
     @classmethod
     def preload(cls) -> None:
-        """Load what plans motions: OMPL takes a while, which no board of this level need spend again."""
+        """Load the motion planner: OMPL is slow to import, so the boards inherit it."""
         from rack.levels.planning import motion_planner
 
         motion_planner.preload()

@@ -32,6 +32,15 @@ def use(memory: bytearray | memoryview) -> None:
         memory[at] = memory[at]
 
 
+def holds_in_a_child(condition: Callable[[], bool]) -> bool:
+    """Return what a forked process finds."""
+    child = fork(condition)
+    try:
+        return exit_status(child) == 0
+    finally:
+        kill(child)
+
+
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("touched", [True, False])
 def test_a_forked_process_copies_no_page_later_once_it_has_touched_them(touched: bool) -> None:
@@ -45,11 +54,7 @@ def test_a_forked_process_copies_no_page_later_once_it_has_touched_them(touched:
         # Huge pages, where the system uses them, are copied in one piece.
         return found < FEW if touched else found >= PAGES // 512
 
-    child = fork(board)
-    try:
-        assert exit_status(child) == 0
-    finally:
-        kill(child)
+    assert holds_in_a_child(board)
 
 
 @pytest.mark.filterwarnings(FORKS)
@@ -62,11 +67,7 @@ def test_the_whole_segment_is_mapped_once_touched(make_bus: MakeBus) -> None:
         touch_memory()
         return faults(lambda: use(mapped.bytes)) < FEW < pages // 16
 
-    child = fork(board)
-    try:
-        assert exit_status(child) == 0
-    finally:
-        kill(child)
+    assert holds_in_a_child(board)
 
 
 @pytest.mark.filterwarnings(FORKS)
@@ -76,8 +77,4 @@ def test_memory_given_back_stays_with_the_process() -> None:
         # Above the C library's bounds for a mapping of its own, and for a top of the heap worth giving back.
         return faults(lambda: [use(bytearray(1 << 20)) for _ in range(20)]) < FEW
 
-    child = fork(board)
-    try:
-        assert exit_status(child) == 0
-    finally:
-        kill(child)
+    assert holds_in_a_child(board)

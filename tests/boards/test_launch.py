@@ -81,19 +81,27 @@ def test_a_level_that_cannot_be_preloaded_fails_the_launch_in_one_line(config: M
     assert reason == "'wave_levels:Unpreloadable' cannot be preloaded: OSError: no room for compiled code"
 
 
+def fifo(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the FIFO that a `SlowlyPreloaded` level waits for."""
+    path = folder / "may-load"
+    os.mkfifo(path)
+    monkeypatch.setenv("WAVE_MAY_LOAD", str(path))
+    return path
+
+
 def test_a_launch_reports_what_it_waits_for(
     config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rack.boards.crate.patience.PATIENCE_S", 0.1)
-    monkeypatch.setenv("WAVE_MAY_LOAD", str(tmp_path / "may-load"))
+    gate = fifo(tmp_path, monkeypatch)
     waits: list[str] = []
 
     def let_it_load(event: Event) -> None:
-        if event.kind == "waiting" and "SlowlyPreloaded" in event.text:
+        if event.kind == "waiting" and "SlowlyPreloaded" in event.text and not waits:
             waits.append(event.text)
-            (tmp_path / "may-load").touch()
+            os.close(os.open(gate, os.O_WRONLY))
 
-    # Without the report the file never comes into being, and the launch never ends.
+    # Without the report nobody opens the FIFO, and the launch never ends.
     with Rack(config("board.watch.executor=wave_levels:SlowlyPreloaded", text=PLAIN), let_it_load):
         assert waits[0].startswith("preloading 'wave_levels:SlowlyPreloaded'")
 
@@ -102,7 +110,7 @@ def test_a_preload_that_does_not_end_is_named(
     config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
-    monkeypatch.setenv("WAVE_MAY_LOAD", str(tmp_path / "never"))
+    fifo(tmp_path, monkeypatch)
     reason = refusal(Rack(config("board.watch.executor=wave_levels:SlowlyPreloaded", text=PLAIN)))
     assert reason.startswith("preloading 'wave_levels:SlowlyPreloaded'")
     assert reason.endswith("not done within 2 s")

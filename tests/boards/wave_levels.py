@@ -181,10 +181,9 @@ class Unpreloadable(Watch):
 
 
 class SlowlyPreloaded(Watch):
-    """A level that is preloaded once the file of the environment variable WAVE_MAY_LOAD exists."""
+    """A level that is preloaded once another process opens the FIFO named by the variable WAVE_MAY_LOAD."""
 
     @classmethod
     def preload(cls) -> None:
-        """Wait for the file."""
-        while not os.path.exists(os.environ["WAVE_MAY_LOAD"]):  # noqa: PTH110
-            time.sleep(0.01)
+        """Wait for the other process."""
+        os.close(os.open(os.environ["WAVE_MAY_LOAD"], os.O_RDONLY))

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from rack.tools.benches.comparison import Absent
+from rack.tools.benches.cyclictest import BEYOND, MissesBeyond
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import decimal, table
 
 RATE_HZ = 400
-BEYOND = 0.001
-"""Share of missed cycles, beyond those of the machine, up to which a chain counts as held."""
 RACK, OTHER, PEER, SPREAD = "#4477aa", "#ee6677", "#222222", "#bbccdd"
 
 
@@ -44,7 +43,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class ChainFigures:
+class ChainFigures(MissesBeyond):
     """All runs of one chain. Costs are us a tick, of all boards; responses are counts of messages by cycles."""
 
     boards: int
@@ -55,16 +54,6 @@ class ChainFigures:
     responses: dict[int, int]
     lockstep_responses: dict[int, int]
     lockstep_us: dict[str, float]  # by tree; median of the runs
-
-    @property
-    def beyond(self) -> float:
-        """Share missed beyond what the machine itself breaks."""
-        return self.missed - (self.late or 0.0)
-
-    @property
-    def held(self) -> bool:
-        """Whether the chain holds its rate."""
-        return self.beyond <= BEYOND
 
     @property
     def exact(self) -> bool:

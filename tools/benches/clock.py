@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import get_args
 
@@ -28,7 +28,7 @@ LAUNCH_S = 1.5
 Contestants = dict[str, Callable[[WakeGrid], np.ndarray]]
 
 
-def measure(rates_hz: tuple[int, ...], runs: Runs, progress: Progress) -> Comparison:
+def measure(rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Comparison:
     """Return the lateness of every contestant at each rate, us."""
     contestants, absent = _contestants(runs.share)
     cores, is_fifo = sorted(os.sched_getaffinity(0)), permits_fifo()
@@ -36,7 +36,7 @@ def measure(rates_hz: tuple[int, ...], runs: Runs, progress: Progress) -> Compar
     progress.total(turn_s * runs.rounds * len(rates_hz) * len(contestants))
     samples = []
     for rate_hz in rates_hz:
-        progress.begin(f"{rate_hz} Hz")
+        progress.begin(f"{rate_hz:g} Hz")
         wakes = max(1, round(runs.seconds * rate_hz))
         grid = WakeGrid((cores[-1],), round(1e9 / rate_hz), wakes, PRIORITY if is_fifo else 0)
         turns = {who: partial(_attempt, one, grid) for who, one in contestants.items()}
@@ -44,14 +44,14 @@ def measure(rates_hz: tuple[int, ...], runs: Runs, progress: Progress) -> Compar
             reasons = [late for late in found if isinstance(late, str)]
             late_us = np.concatenate([[], *(late for late in found if not isinstance(late, str))])
             if len(late_us):
-                samples.append(Sample(f"{rate_hz} Hz", who, tuple(late_us.tolist()), "us"))
+                samples.append(Sample(f"{rate_hz:g} Hz", who, tuple(late_us.tolist()), "us"))
             if reasons:
-                absent.append(Absent(f"{who} at {rate_hz} Hz, {len(reasons)} of {runs.rounds} rounds", reasons[0]))
+                absent.append(Absent(f"{who} at {rate_hz:g} Hz, {len(reasons)} of {runs.rounds} rounds", reasons[0]))
         progress.end(turn_s * runs.rounds * len(contestants), "done", ())
     refused = "" if is_fifo else "; SCHED_FIFO is refused, so all run under ordinary scheduling"
     own_grid = f"; {LINUXCNC}: after its earliest run" if LINUXCNC in contestants else ""
     title = f"lateness: from grid point to start, on core {cores[-1]}{own_grid}{refused}"
-    return Comparison("clock", title, tuple(samples), {f"{rate} Hz": CYCLICTEST for rate in rates_hz}, tuple(absent))
+    return Comparison("clock", title, tuple(samples), {f"{rate:g} Hz": CYCLICTEST for rate in rates_hz}, tuple(absent))
 
 
 def _attempt(contestant: Callable[[WakeGrid], np.ndarray], grid: WakeGrid) -> np.ndarray | str:

@@ -98,6 +98,27 @@ def _lateness_us(thread: dict[str, object]) -> Iterator[float]:
     yield from [float(str(thread["max"]))] * beyond
 
 
+BEYOND = 0.001
+"""Share of missed cycles, beyond those of the machine, up to which a rate counts as held."""
+
+
+class MissesBeyond:
+    """Base of figures whose misses are judged by those of `cyclictest` in the same minutes; all are shares."""
+
+    missed: float
+    late: float | None  # of cyclictest's wakes, by a cycle or more; None: it is absent
+
+    @property
+    def beyond(self) -> float:
+        """Share missed beyond what the machine itself breaks."""
+        return self.missed - (self.late or 0.0)
+
+    @property
+    def held(self) -> bool:
+        """Whether the rate is held."""
+        return self.beyond <= BEYOND
+
+
 def overdue(late_us: np.ndarray, period_ns: int) -> float:
     """Return the share of grid points at which the sleeper was late by a cycle or more, those it skipped included."""
     passed = np.floor(late_us * 1e3 / period_ns)

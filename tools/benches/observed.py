@@ -32,7 +32,7 @@ class Runs(NamedTuple):
 
 
 class CycleCount(NamedTuple):
-    """CycleCount of a task that ended too late or never took place, of all that were due."""
+    """Cycles of a task: how many were missed or skipped, and how many were due."""
 
     missed: int
     due: int

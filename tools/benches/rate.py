@@ -20,7 +20,15 @@ from rack.boards.config import RackConfig, load
 from rack.boards.config.layout import obtained_core
 from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
 from rack.tools.benches.comparison import Absent, turns
-from rack.tools.benches.cyclictest import CYCLICTEST, WakeGrid, absent_cyclictest, cyclictest, overdue
+from rack.tools.benches.cyclictest import (
+    BEYOND,
+    CYCLICTEST,
+    MissesBeyond,
+    WakeGrid,
+    absent_cyclictest,
+    cyclictest,
+    overdue,
+)
 from rack.tools.benches.observed import Observed, Runs, missed_share, observe
 from rack.tools.console.answer import Failure
 from rack.tools.console.pictures import paths_of, picture
@@ -30,8 +38,6 @@ from rack.tools.console.tables import decimal, figure, table
 RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
 STEP_MS = 0.5
 """Longest time step of the simulated arm, that of the bundled racks."""
-BEYOND = 0.001
-"""Share of missed cycles, beyond those of the machine, up to which a rate counts as held."""
 LAUNCH_S = 3.0
 RACK, PEER = "#4477aa", "#222222"
 Late = np.ndarray | None
@@ -62,7 +68,7 @@ def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
 
 
 @dataclass(frozen=True)
-class RateFigures:
+class RateFigures(MissesBeyond):
     """All runs at one rate. Shares are of the fastest board's cycles; `late` is that of `cyclictest`'s wakes."""
 
     rate_hz: float
@@ -74,14 +80,9 @@ class RateFigures:
     failure: str  # why a run ended early; empty: none did
 
     @property
-    def beyond(self) -> float:
-        """Share missed beyond what the machine itself breaks."""
-        return self.missed - (self.late or 0.0)
-
-    @property
     def held(self) -> bool:
         """Whether the rack holds this rate."""
-        return not self.failure and self.beyond <= BEYOND
+        return not self.failure and super().held
 
     @property
     def verdict(self) -> str:

@@ -103,7 +103,7 @@ class SafeSink:
 
 
 RISKED_PART = 4
-"""Part of the rings, one in so many, that lockstep may be ahead of the spool's file."""
+"""Lockstep may be ahead of the spool's file by one part in so many of the rings."""
 
 
 class Recorder:
@@ -130,7 +130,9 @@ class Recorder:
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         self._is_follower = follower == os.getpid() or not is_alive(follower)
-        self._safe_tick = self._words[System.TICK]  # all rows up to here are in the spool's file
+        # All rows up to here are in the spool's file; a recorder that continues another still has to read those after.
+        continues = any(self._files.taken.values())
+        self._safe_tick = self._words[System.FOLLOWER_TICK if continues else System.TICK]
         self._most_at_risk = round(KEPT_S * 1e9 / layout.clock_ns) // RISKED_PART
         self._report_progress(self._safe_tick)
 
@@ -149,7 +151,7 @@ class Recorder:
             self._files.add(Frame(name, rows, lost))
             if self._view is not None:
                 self._view.add(name, rows)
-        # A recorder that is killed loses what is not in its file: lockstep must not run so far ahead of that.
+        # A killed recorder loses the rows that are not in its file: lockstep must not run far ahead of it.
         is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
         if self._spool.flush(now=is_late):
             self._safe_tick = tick

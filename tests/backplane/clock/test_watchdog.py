@@ -133,7 +133,7 @@ def test_a_lost_task_is_due_again_when_it_has_rejoined(make_bus: MakeBus) -> Non
     task.block[Block.STATE] = TaskState.READY
     assert task.is_ready
     task.rejoin()
-    assert (task.lost_tick, task.missed, task.is_idle()) == (-1, 0, True)
+    assert (task.lost_tick, task.missed, task.is_settled()) == (-1, 0, True)
     assert task.is_free(3)
 
 
