@@ -8,6 +8,14 @@ from dataclasses import dataclass, field
 from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
+Source = str | Mapping[str, str]
+"""What a port reads: a mailbox, or mailboxes by board."""
+
+
+def mailboxes_of(source: Source) -> tuple[str, ...]:
+    """Return the mailboxes of a port."""
+    return (source,) if isinstance(source, str) else tuple(source.values())
+
 
 @dataclass(frozen=True)
 class BusTimes:
@@ -21,7 +29,7 @@ class BusTimes:
 
 @dataclass(frozen=True)
 class TaskWiring:
-    """One task: its class `target`, as "package.module:Class", and the mailbox of each port.
+    """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
     task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config.
@@ -29,7 +37,7 @@ class TaskWiring:
 
     task: str
     target: str
-    inputs: Mapping[str, str]
+    inputs: Mapping[str, Source]
     outputs: Mapping[str, str]
     context: LevelContext
     critical_priority: int = 0

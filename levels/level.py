@@ -75,13 +75,15 @@ class Input(NamedTuple):
     source: str
     """A mailbox ("world.model"), or relative to the level: "above.command", "below.status", "own.plan". A config may
     wire the port elsewhere."""
+    many: bool = False
+    """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order, in place of one."""
 
 
 class Output(NamedTuple):
     """A port that a level does not write in every cycle."""
 
     type: MessageType
-    cycles: int
+    cycles: int = 1
     """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, so that readers released then
     find it fresh. If that cycle is missed, the message is missing too."""
 
@@ -133,7 +135,8 @@ class LevelContext:
     scene: SceneConfig
     task: Mapping[str, Any]  # `[task]`
     sizes: Mapping[str, int]  # symbolic sizes of messages by name
-    below: Pace | None  # pace of the level below; None: there is none
+    above: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level above, by name
+    below: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level below, by name
     params: Mapping[str, Any] = field(default_factory=dict)  # `[board.<name>.params]`, as given
 
     @property
@@ -176,6 +179,16 @@ class Executor(ABC):
     @classmethod
     def preload(cls) -> None:
         """Load what every process of the level needs, such as compiled code. Called once, before the crate forks."""
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield key of `[board.<name>]`, value and reason of each disagreement with the neighbours, before the launch.
+
+        The parameters of all boards concerned are valid, each by itself.
+        """
+        return ()
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""

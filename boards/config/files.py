@@ -64,8 +64,12 @@ def with_faults(tables: Tables, name_or_path: str | Path) -> Tables:
 
 
 def names(folder: Path = CONFIGS) -> list[str]:
-    """Return the names of the bundled racks, or of the configs in another folder."""
-    return sorted(path.stem for path in folder.glob("*.toml"))
+    """Return the names of the bundled racks, or of the configs in another folder.
+
+    A config is `<name>.toml`, or `<name>/<name>.toml`, next to its page.
+    """
+    found = [*folder.glob("*.toml"), *(path for path in folder.glob("*/*.toml") if path.stem == path.parent.name)]
+    return sorted(path.stem for path in found)
 
 
 def file_at(path: Path) -> Path | None:
@@ -96,7 +100,7 @@ def portable(model: Path) -> str:
 def _path(name_or_path: str | Path, place: str, folder: Path) -> Path:
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
-    found = file_at(Path(text) if is_path else folder / f"{text}.toml")
+    found = file_at(Path(text)) if is_path else _named(text, folder)
     if found is None:
         raise ConfigError([Mistake(place, text, f"no such file; by name: {', '.join(names(folder))}; or a path")])
     return found
@@ -143,7 +147,7 @@ def _bases(extends: Any, path: Path) -> list[Path]:
     place = f"{path.name}: extends"
     if not isinstance(extends, list) or not all(isinstance(item, str) for item in extends):
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
-    found = {item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) for item in extends}
+    found = {item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item) for item in extends}
     lost = [
         Mistake(place, item, f"no such file next to {path.name} or among the bundled configs: {', '.join(names())}")
         for item, base in found.items()
@@ -152,6 +156,11 @@ def _bases(extends: Any, path: Path) -> list[Path]:
     if lost:
         raise ConfigError(lost)
     return [base for base in found.values() if base is not None]
+
+
+def _named(name: str, folder: Path = CONFIGS) -> Path | None:
+    """Return the config of that name in a folder."""
+    return file_at(folder / f"{name}.toml") or file_at(folder / name / f"{name}.toml")
 
 
 def _find(reference: str, folder: Path) -> Path | None:

@@ -97,8 +97,8 @@ class Wiring:
 
     def _check_reads(self, ports: TaskPorts) -> None:
         key = "reads" if ports.place.role == "executor" else "planner_reads"
-        for port, mailbox in ports.reads.items():
-            place, wanted = f"board.{ports.place.board}.{key}.{port}", ports.inputs[port]
+        for port, mailbox in ports.sources:
+            place, wanted = f"board.{ports.place.board}.{key}.{port}", ports.inputs[port].type
             if not self._is_known(mailbox):
                 why = f"no task writes it; mailboxes: {self._names()}"
                 self.mistakes.append(Mistake(place, mailbox, why))
@@ -214,7 +214,7 @@ class Wiring:
         )
 
     def _readers(self, mailbox: str) -> tuple[str, ...]:
-        return tuple(ports.task for ports in self.tasks if mailbox in ports.reads.values())
+        return tuple(ports.task for ports in self.tasks if any(mailbox == box for _, box in ports.sources))
 
     def _protocol(self, mailbox: str) -> Protocol:
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)

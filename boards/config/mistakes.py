@@ -10,6 +10,7 @@ import difflib
 import re
 from collections import Counter
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -131,28 +132,25 @@ def _board(name: str, board: BoardConfig, known: list[str]) -> Iterator[Mistake]
         why = f"invalid name for a board; permitted: a-z, 0-9 and _, at most 31, except {', '.join(RESERVED)}"
         yield Mistake(place, None, why)
     others = ", ".join(other for other in known if other != name) or "none"
-    for key, other in (("above", board.above), ("below", board.below)):
-        if other is not None and (other == name or other not in known):
-            yield Mistake(f"{place}.{key}", other, f"no other board has this name; boards: {others}")
+    for key, neighbours in (("above", board.above), ("below", board.below)):
+        for other in neighbours:
+            if other == name or other not in known:
+                yield Mistake(f"{place}.{key}", other, f"no other board has this name; boards: {others}")
+        yield from _repeated(f"{place}.{key}", neighbours)
     yield from _planner(place, board)
 
 
 def _circles(config: RackConfig) -> Iterator[Mistake]:
     """Find circles among levels: a walk from level to level would not end."""
     for key, end in (("below", "lowest"), ("above", "highest")):
-        links = {name: getattr(board, key) for name, board in config.board.items()}
-        seen: set[str] = set()
-        for name in links:
-            walk: list[str] = []
-            at: str | None = name
-            while at in links and at not in seen:
-                seen.add(at)
-                walk.append(at)
-                at = links[at]
-            circle = walk[walk.index(at) :] if at in walk else []
-            if len(circle) > 1:
-                why = f"the levels form a circle, {' -> '.join([*circle, circle[0]])}; the {end} level has no {key}"
-                yield Mistake(f"board.{circle[-1]}.{key}", circle[0], why)
+        links = {name: [n for n in getattr(board, key) if n != name] for name, board in config.board.items()}
+        try:
+            TopologicalSorter(links).prepare()
+        except CycleError as error:
+            # It lists a circle from the last of its members to the first.
+            circle = error.args[1][::-1]
+            why = f"the levels form a circle, {' -> '.join(circle)}; the {end} level has no {key}"
+            yield Mistake(f"board.{circle[-2]}.{key}", circle[-1], why)
 
 
 def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:

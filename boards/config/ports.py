@@ -14,6 +14,7 @@ from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
 from rack.boards.config.schema import RackConfig, TaskPlace
 from rack.boards.errors import Mistake
+from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.level import Executor, Input, Output, Planner
 
 
@@ -21,21 +22,26 @@ from rack.levels.level import Executor, Input, Output, Planner
 class TaskPorts:
     """A task's class, and the mailbox of each port.
 
-    `reads` and `writes` map ports to mailboxes, `inputs` to message types, `outputs` to types and the cycles from
-    message to message.
+    `reads` holds a mailbox by port or, for a port that reads many, a dict of mailboxes by board; `writes` a mailbox by
+    port, `inputs` and `outputs` the declarations of the ports.
     """
 
     place: TaskPlace
     kind: type[Executor] | type[Planner]
-    inputs: Mapping[str, MessageType]
+    inputs: Mapping[str, Input]
     outputs: Mapping[str, Output]
-    reads: Mapping[str, str]
+    reads: Mapping[str, Source]
     writes: Mapping[str, str]
 
     @property
     def task(self) -> str:
         """Name of the task."""
         return self.place.name
+
+    @property
+    def sources(self) -> list[tuple[str, str]]:
+        """Port and mailbox of everything that the task reads."""
+        return [(port, mailbox) for port, source in self.reads.items() for mailbox in mailboxes_of(source)]
 
 
 def all_ports(config: RackConfig, mistakes: list[Mistake]) -> list[TaskPorts]:
@@ -60,7 +66,7 @@ def _wired(config: RackConfig, place: TaskPlace, mistakes: list[Mistake]) -> Tas
     return TaskPorts(
         place=place,
         kind=kind,
-        inputs={port: entry.type for port, entry in kind.inputs.items()},
+        inputs=kind.inputs,
         outputs=outputs,
         reads=dict(_sources(config, place, kind.inputs, mistakes)),
         writes={port: f"{place.board}.{port}" for port in outputs},
@@ -71,31 +77,33 @@ def _class(wanted: str, role: Role) -> tuple[type[Executor] | type[Planner], Map
     if role == "executor":
         executor = find_class(wanted, Executor)
         given = executor.outputs.items()
-        return executor, {port: kind if isinstance(kind, Output) else Output(kind, 1) for port, kind in given}
+        return executor, {port: kind if isinstance(kind, Output) else Output(kind) for port, kind in given}
     planner = find_class(wanted, Planner)
     if not isinstance(getattr(planner, "output", None), MessageType):
         raise LookupError("the class has no 'output', the message type of its plan")
-    return planner, {"plan": Output(planner.output, 1)}
+    return planner, {"plan": Output(planner.output)}
 
 
 def _sources(
     config: RackConfig, place: TaskPlace, inputs: Mapping[str, Input], mistakes: list[Mistake]
-) -> Iterator[tuple[str, str]]:
-    """Yield port and mailbox for every port that has a mailbox."""
+) -> Iterator[tuple[str, Source]]:
+    """Yield port and mailbox, or mailboxes by board, for every port that has one."""
     name, role, table = place.board, place.role, config.board[place.board]
     key, wired = ("reads", table.reads) if role == "executor" else ("planner_reads", table.planner_reads)
-    neighbours = {"own": name, "above": table.above, "below": table.below}
+    neighbours = {"own": (name,), "above": table.above, "below": table.below}
     for port in [p for p in wired if p not in inputs]:
         why = f"the {role} has no such port; ports: {', '.join(inputs) or 'none'}"
-        mistakes.append(Mistake(f"board.{name}.{key}.{port}", wired[port], why))
+        mistakes.append(Mistake(f"board.{name}.{key}.{port}", list(wired[port]), why))
     for port, entry in inputs.items():
         start, _, rest = entry.source.partition(".")
-        neighbour = neighbours.get(start, start)
-        if port in wired:
-            yield port, wired[port]
-        elif neighbour is not None:
-            # A neighbour that does not exist is reported by the rules.
-            if start not in ("above", "below") or neighbour in config.board.keys() - {name}:
-                yield port, f"{neighbour}.{rest}"
-        else:
+        boards = neighbours.get(start, (start,))
+        found = wired.get(port, tuple(f"{board}.{rest}" for board in boards))
+        at, given = (f"{key}.{port}", list(found)) if port in wired else (start, list(boards))
+        if not found:
             mistakes.append(Mistake(f"board.{name}.{start}", None, f"missing; port '{port}' of the {role} needs it"))
+        elif not entry.many and len(found) > 1:
+            why = f"port '{port}' of the {role} reads one mailbox, not {len(found)}"
+            mistakes.append(Mistake(f"board.{name}.{at}", given, why))
+        elif port in wired or start not in ("above", "below") or {*boards} <= config.board.keys() - {name}:
+            # A neighbour that does not exist is reported by the rules.
+            yield port, {box.partition(".")[0]: box for box in found} if entry.many else found[0]

@@ -29,11 +29,11 @@ from rack.boards.config.ports import TaskPorts, reference
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import Tables, parse
-from rack.boards.errors import ConfigError, LaunchError
+from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
-from rack.levels.level import LevelContext, Pace
+from rack.levels.level import Executor, LevelContext, Pace
 from rack.levels.tables import RobotConfig, Table
 
 LINGER_S = 0.5
@@ -182,10 +182,21 @@ class _Examined:
             self.mistakes += self._wiring.check_sizes(self._sizes)
         if not self.mistakes and not broken:
             self._layout = self._wiring.layout(self._sizes)
-            self.mistakes += too_large(self._layout)
+            self.mistakes += [*too_large(self._layout), *self._misfits()]
         boards = frozenset(place.removeprefix("board.") for place in broken if place.startswith("board."))
         self.mistakes += fault_mistakes(faults, config, None if self.mistakes else self._layout, boards)
         self.mistakes += command_mistakes(commands, config, boards)
+
+    def _misfits(self) -> Iterator[Mistake]:
+        """Yield what levels find wrong with their neighbours."""
+        contexts = {name: self._context(name) for name in self._config.board}
+        for ports in self._wiring.tasks:
+            if issubclass(ports.kind, Executor):
+                name = ports.place.board
+                near = self._config.board[name]
+                above, below = ([contexts[other] for other in others] for others in (near.above, near.below))
+                for key, value, why in ports.kind.misfits(contexts[name], above, below):
+                    yield Mistake(f"board.{name}.{key}", value, why)
 
     def resolved(self) -> Resolved:
         """Return everything derived from a config without mistakes."""
@@ -214,7 +225,7 @@ class _Examined:
 
     def _context(self, name: str) -> LevelContext:
         config, board = self._config, self._config.board[name]
-        below = board.below
+        paces = {name: Pace(config.every(name), other.within_cycles) for name, other in config.board.items()}
         return LevelContext(
             board=name,
             every=config.every(name),
@@ -226,7 +237,8 @@ class _Examined:
             scene=config.scene,
             task=config.task,
             sizes=self._sizes,
-            below=Pace(config.every(below), config.board[below].within_cycles) if below is not None else None,
+            above={other: paces[other] for other in board.above},
+            below={other: paces[other] for other in board.below},
             params=board.params,
         )
 

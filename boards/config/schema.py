@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, StringConstraints
+from pydantic import BeforeValidator, Field, StringConstraints
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Protocol, Role, Wake
@@ -30,9 +30,17 @@ Mode = Literal["realtime", "lockstep"]
 OnNoRealtime = Literal["refuse", "warn"]
 OnLoss = Literal["hold", "stop", "brake"]
 
+
+def _listed(value: Any) -> Any:
+    """Return a single name as a list of one."""
+    return (value,) if isinstance(value, str) else value
+
+
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
+Neighbours = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_listed)]
 Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
@@ -147,8 +155,8 @@ class BoardConfig(Table):
     )
     priority: Priority = Field(0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling")
     wake: Wake | None = Field(None, description="how this board waits for its next cycle; default: clock.wake")
-    above: str | None = Field(None, description="board of the level above, whose commands this level reads")
-    below: str | None = Field(None, description="board of the level below, whose status this level reads")
+    above: Neighbours = Field((), description="board of the level above, whose commands this level reads; or a list")
+    below: Neighbours = Field((), description="board of the level below, whose status this level reads; or a list")
     executor: ClassName = Field(description="class of the executor, package.module:Class")
     planner: ClassName | None = Field(None, description="class of the planner, package.module:Class")
     coupling: Coupling = Field(
@@ -158,8 +166,10 @@ class BoardConfig(Table):
     planner_slot: Slot | None = Field(None, description="slot of a loosely coupled planner")
     planner_core: Core | None = Field(None, description="core of a loosely coupled planner; default: the board's")
     planner_priority: Priority = Field(0, description="SCHED_FIFO priority of the planner; 0: ordinary scheduling")
-    reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the executor; overrides the level's own")
-    planner_reads: dict[str, MailboxName] = Field({}, description="mailbox by port of the planner, likewise")
+    reads: dict[str, Sources] = Field(
+        {}, description="mailbox by port of the executor, or a list; overrides the level's own"
+    )
+    planner_reads: dict[str, Sources] = Field({}, description="mailbox by port of the planner, likewise")
     params: dict[str, Any] = Field({}, description="parameters of the level, declared by its class")
     budget: BudgetConfig | None = Field(None, description="worst-case processor times, for the timing model")
     transfer: TransferConfig = Field(TransferConfig(), description="emulation of a slower bus for this board")

@@ -62,9 +62,7 @@ class Supervision:
 
 def _rank(config: RackConfig, board: str, is_planner: bool) -> tuple[int, bool]:
     """Return the number of levels below a board, including the clock."""
-    depth, below = 1, config.board[board].below
-    while below is not None:
-        depth, below = depth + 1, config.board[below].below
+    depth = 1 + max((_rank(config, below, False)[0] for below in config.board[board].below), default=0)
     return depth, is_planner
 
 

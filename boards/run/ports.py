@@ -2,34 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rack.backplane.fault_table import Entry, FaultEntry
-from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
 from rack.boards.faults.messages import FaultyWriter
+from rack.boards.wiring import Source
 from rack.levels.level import Ports, Reading, Verdict
+
+Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
+"""One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
 
 
 class InputPorts:
-    """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port."""
+    """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port.
 
-    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, plan: str = "") -> None:
-        """Read `mailboxes` by port; `plan` is the mailbox that holds the task's own plan."""
+    `readers` holds the reader of each port that reads one mailbox.
+    """
+
+    def __init__(self, segment: Segment, sources: Mapping[str, Source], alarms: AlarmWriter, plan: str = "") -> None:
+        """Read `sources` by port; `plan` is the mailbox that holds the task's own plan."""
         self.task = ReadingTask()
-        found = {port: watched(segment, name, alarms, self.task) for port, name in mailboxes.items()}
-        self.readers = {port: one.reader for port, one in found.items()}
-        self.values = Ports(**{port: Reading(r.message, Verdict.NONE) for port, r in self.readers.items()})
-        self._by_port = self.values.__dict__
-        self._plan = [(port, one.read) for port, one in found.items() if mailboxes[port] == plan]
-        self._rest = [(port, one.read) for port, one in found.items() if mailboxes[port] != plan]
+        self.values = Ports()
+        self.readers: dict[str, Reader] = {}
+        # Where each reading goes: the ports themselves, or the dict of a port that reads many mailboxes.
+        self._plan: list[Line] = []
+        self._rest: list[Line] = []
+        self._readers: list[Reader] = []
+        for port, source in sources.items():
+            if isinstance(source, str):
+                self.readers[port] = self._add(segment, self.values.__dict__, port, source, alarms, plan)
+            else:
+                by_board: dict[str, Reading] = {}
+                setattr(self.values, port, by_board)
+                for board, mailbox in source.items():
+                    self._add(segment, by_board, board, mailbox, alarms, plan)
         self.reads_plan = bool(self._plan)
-        self._statistics = [reader.statistics for reader in self.readers.values()]
+        self._statistics = [reader.statistics for reader in self._readers]
         self._counted = self._traffic
+
+    def _add(
+        self, segment: Segment, values: dict[str, Reading], key: str, mailbox: str, alarms: AlarmWriter, plan: str
+    ) -> Reader:
+        found = watched(segment, mailbox, alarms, self.task)
+        values[key] = Reading(found.reader.message, Verdict.NONE)
+        (self._plan if mailbox == plan else self._rest).append((values, key, found.read))
+        self._readers.append(found.reader)
+        return found.reader
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
@@ -39,14 +63,13 @@ class InputPorts:
 
     def exchange(self, tick: int) -> None:
         """Transfer the plan over the bus, as of `tick`."""
-        for port, read in self._plan:
-            self._by_port[port] = read(tick)
+        for values, key, read in self._plan:
+            values[key] = read(tick)
 
     def read_command_and_status(self, tick: int) -> None:
         """Read every other mailbox as of `tick`: commands, statuses, world model."""
-        values = self._by_port
-        for port, read in self._rest:
-            values[port] = read(tick)
+        for values, key, read in self._rest:
+            values[key] = read(tick)
 
     @property
     def bus_errors(self) -> int:
@@ -65,9 +88,8 @@ class InputPorts:
 
     @property
     def _traffic(self) -> tuple[int, int]:
-        readers = self.readers.values()
-        accesses = sum(reader.accesses for reader in readers)
-        return accesses, sum(reader.transfers * reader.spec.size for reader in readers)
+        accesses = sum(reader.accesses for reader in self._readers)
+        return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
 
 class OutputPorts:

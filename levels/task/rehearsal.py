@@ -70,10 +70,11 @@ class PipelinePeriods(NamedTuple):
 
 def pipeline_periods(context: LevelContext) -> PipelinePeriods:
     """Return the periods of a task level. Raises `LevelError` if it has no level below."""
-    if context.below is None:
+    if not context.below:
         raise LevelError(f"level '{context.board}' has no level below; it needs one to carry out its moves")
-    below_s = context.below.every * context.tick_s
-    return PipelinePeriods(context.period_s, below_s, below_s * context.below.within_cycles)
+    (below,) = context.below.values()
+    below_s = below.every * context.tick_s
+    return PipelinePeriods(context.period_s, below_s, below_s * below.within_cycles)
 
 
 def finish_times(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -23,8 +23,8 @@ class BoardTiming:
     """
 
     name: str
-    above: str | None
-    below: str | None
+    above: tuple[str, ...]
+    below: tuple[str, ...]
     coupling: Coupling
     every: int
     within_cycles: int
@@ -132,14 +132,16 @@ class RackTiming:
     @cached_property
     def chains(self) -> tuple[tuple[str, ...], ...]:
         """Every chain of boards from a highest to a lowest; a rack with a board per joint has one for every joint."""
-        lowest = [board.name for board in self.boards.values() if board.above is not None and board.below is None]
-        return tuple(self._chain(name) for name in lowest)
+        lowest = [board.name for board in self.boards.values() if board.above and not board.below]
+        return tuple(chain for name in lowest for chain in self._chains((name,)))
 
-    def _chain(self, lowest: str) -> tuple[str, ...]:
-        chain = [lowest]
-        while (above := self.boards[chain[0]].above) is not None and above not in chain:
-            chain.insert(0, above)
-        return tuple(chain)
+    def _chains(self, part: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        """Yield every chain that ends with `part`."""
+        above = self.boards[part[0]].above
+        if not above:
+            yield part
+        for name in above:
+            yield from self._chains((name, *part))
 
     @property
     def hierarchy(self) -> tuple[str, ...]:

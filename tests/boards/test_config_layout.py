@@ -13,6 +13,7 @@ from rack.boards.config import load, resolve, shared_out, wire
 from rack.boards.config import resolved as resolved
 from rack.boards.config.layout import field_specs, obtained_core
 from rack.boards.config.mistakes import disagreements
+from rack.levels.level import Pace
 from rack.levels.messages import TASK_COMMAND, TASK_PLAN
 
 SIZES = {"joints": 6, "bodies": 3, "state": 120}
@@ -94,8 +95,8 @@ def test_missing_cores_are_replaced_and_reported(small: Path, monkeypatch: pytes
 def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
     upper, lower, _ = (task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks)
     assert (lower.board, lower.every, lower.within_cycles, lower.clock_ns, lower.seed) == ("lower", 1, 4, 2_500_000, 5)
-    assert lower.below is None
-    assert upper.below == (1, 4)
+    assert (lower.above, lower.below) == ({"upper": Pace(8, 1)}, {})
+    assert upper.below == {"lower": Pace(1, 4)}
     assert lower.params == {"gain": 2}
 
 

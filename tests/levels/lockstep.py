@@ -118,8 +118,8 @@ class Lockstep:
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
             for port, kind in board.executor.outputs.items():
-                kind, cycles = kind if isinstance(kind, Output) else (kind, 1)
-                self.boxes[f"{board.name}.{port}"] = Box(kind, self.sizes, cycles * board.every)
+                output = kind if isinstance(kind, Output) else Output(kind)
+                self.boxes[f"{board.name}.{port}"] = Box(output.type, self.sizes, output.cycles * board.every)
             if board.planner is not None:
                 self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
             self.boxes[f"{board.name}.operator"] = Box(OPERATOR_COMMAND, self.sizes)
@@ -134,7 +134,8 @@ class Lockstep:
                 scene=scene,
                 task=task or {},
                 sizes=self.sizes,
-                below=paces.get(b.below),
+                above={b.above: paces[b.above]} if b.above in paces else {},
+                below={b.below: paces[b.below]} if b.below in paces else {},
                 params=b.params,
             )
             for b in boards

@@ -63,8 +63,8 @@ def board(config: RackConfig, name: str, params: Mapping[str, Any]) -> BoardSpec
         executor=named(table.executor),
         planner=named(table.planner) if table.planner is not None else None,
         within_cycles=table.within_cycles,
-        above=table.above or "",
-        below=table.below or "",
+        above="".join(table.above),
+        below="".join(table.below),
         params={**table.params, **params},
     )
 

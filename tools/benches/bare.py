@@ -20,7 +20,7 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.boards.classes import find_class
-from rack.boards.wiring import TaskWiring
+from rack.boards.wiring import TaskWiring, mailboxes_of
 from rack.levels.level import Executor, Planner, Ports, Reading, Verdict
 
 
@@ -89,7 +89,8 @@ class BareTask:
     def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post], ticks: int) -> None:
         self.spec = layout.task(wiring.task)
         self._ticks = ticks
-        self._readers = [(port, PostReader(posts[name]).read) for port, name in wiring.inputs.items()]
+        sources = [(port, name) for port, source in wiring.inputs.items() for name in mailboxes_of(source)]
+        self._readers = [(port, PostReader(posts[name]).read) for port, name in sources]
         self._values = Ports(**{port: read(-1) for port, read in self._readers})
         self._posts = [posts[name] for name in wiring.outputs.values()]
         self._messages = Ports(**{port: posts[name].message for port, name in wiring.outputs.items()})

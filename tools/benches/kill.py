@@ -39,9 +39,9 @@ class Killing:
         config = load(name, [f"name=bench-kill-{os.getpid()}", "supervision.restarts=10000"])
         servo = min(config.board, key=config.every)
         above = config.board[servo].above
-        if config.robot is None or above is None:
+        if config.robot is None or not above:
             raise Failure(f"{name}: no arm whose brakes could engage", 2)
-        self.boards = servo, above
+        self.boards = servo, above[0]
         self._config = config
         self._random = Random(kills)
 

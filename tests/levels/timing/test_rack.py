@@ -13,8 +13,8 @@ MS = 1_000_000
 CLOCK = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, ())
 FIGURE_3 = BoardTiming(
     name="level",
-    above=None,
-    below=None,
+    above=(),
+    below=(),
     coupling="tight",
     every=3,
     within_cycles=3,
@@ -32,8 +32,9 @@ def rack(*boards: BoardTiming, goal_ns: float | None = None) -> RackTiming:
     return RackTiming(False, 1.0, 2 * MS, CLOCK, {board.name: board for board in boards}, 0, 0.2, goal_ns)
 
 
-def board(name: str, every: int, above: str | None = None, below: str | None = None) -> BoardTiming:
-    return replace(FIGURE_3, name=name, every=every, above=above, below=below, budget=None)
+def board(name: str, every: int, above: str = "", below: str = "") -> BoardTiming:
+    above_, below_ = tuple(above.split()), tuple(below.split())
+    return replace(FIGURE_3, name=name, every=every, above=above_, below=below_, budget=None)
 
 
 def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:

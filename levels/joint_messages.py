@@ -1,0 +1,75 @@
+"""The messages between a trajectory level, the boards that servo joints, and the board of the arm.
+
+Every vector has all joints of the arm; a board of some joints fills and obeys its own. Symbolic sizes as in
+`rack.levels.messages`.
+"""
+
+from __future__ import annotations
+
+from rack.backplane.message import Field, command, status
+from rack.backplane.words import Demand
+from rack.levels.operator import ANSWER, RESTS_ON
+
+JOINT_REFERENCE = command(
+    "joint_reference",
+    1,
+    RESTS_ON,
+    Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point, hold"),
+    Field("position", "f8", "rad", "joint positions", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    Field("acceleration", "f8", "rad/s2", "joint accelerations", ("joints",)),
+    Field("inertia", "f8", "kg m2", "diagonal of the joint-space inertia there", ("joints",)),
+    Field("load", "f8", "N m", "torques of gravity and motion there, without acceleration", ("joints",)),
+    Field("opening", "f8", "m", "gripper joint position to go to"),
+    Field("force", "f8", "N", "largest gripper force"),
+)
+"""From the trajectory level to all boards that servo joints; these interpolate between its set points."""
+
+JOINT_TORQUE = command(
+    "joint_torque",
+    1,
+    RESTS_ON,
+    Field("torque", "f8", "N m", "of the board's own joints; others 0", ("joints",)),
+    Field("target", "f8", "rad", "where the board wants its own joints in this cycle", ("joints",)),
+    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
+    Field("grip_force", "f8", "N", "of the gripper, from the board that drives it"),
+)
+"""From a board that servoes joints to the board of the arm; id rises with every cycle."""
+
+JOINT_STATUS = status(
+    "joint_status",
+    1,
+    *ANSWER,
+    Field("position", "f8", "rad", "joint positions, from the arm's status", ("joints",)),
+    Field("target", "f8", "rad", "set point of the board's own joints in this cycle; others 0", ("joints",)),
+    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
+    Field("torque", "f8", "N m", "of the board's own joints; others 0", ("joints",)),
+    Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
+    Field("holding", "u1", "1", "1: no fresh set point, the joints ramp to rest and stay"),
+    Field("stopped", "u1", "1", "1: set points are not followed: an operator, or the arm is braked"),
+    Field("due", "i8", "tick", "newest set point taken over; 0: none"),
+)
+"""From a board that servoes joints to the trajectory level."""
+
+ARM_STATUS = status(
+    "arm_status",
+    1,
+    *ANSWER,
+    Field("position", "f8", "rad", "joint positions, measured; estimated for suspect sensors", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
+    Field("torque", "f8", "N m", "torque given to the arm in this cycle, after the limit gate", ("joints",)),
+    Field("target", "f8", "rad", "where the boards above want the joints", ("joints",)),
+    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
+    Field("opening", "f8", "m", "gripper joint position, measured"),
+    Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
+    Field("grip_force", "f8", "N", "force given to the gripper"),
+    Field("holding", "u1", "1", "1: the arm does not move by set points"),
+    Field("stopped", "u1", "1", "1: torques of the boards above are not followed"),
+    Field("braked", "u1", "1", "1: the brakes are engaged"),
+    Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
+    Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque"),
+    Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
+    Field("violations", "u4", "1", "substeps in which the arm drove a position, velocity or torque beyond its limit"),
+    Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
+)
+"""From the board of the arm to those that servo joints; a servo level's status without set points of its own."""

@@ -1,0 +1,71 @@
+"""Motion requests, which a planning level or a program queues, and the status of the level that does them."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from rack.backplane.message import Field, command, status
+from rack.levels.operator import ANSWER, RESTS_ON
+
+REQUESTS = 32
+"""Motion requests that a queue holds."""
+ENDED = 8
+"""Ended requests that a status lists."""
+
+
+class MotionKind(IntEnum):
+    """Kinds of motion requests."""
+
+    NONE = 0
+    JOINTS = 1  # a straight line in joint space, to joint positions
+    POSE = 2  # a straight line of the tool, to a pose
+    STAY = 3  # stay at the goal before it for `segment`
+    CANCEL = 4  # end the request under way and drop all queued before this one; the arm ramps to rest
+    GRIP = 5  # bring the gripper to `opening` with at most `force`, at rest
+
+
+class Ending(IntEnum):
+    """How a request ended."""
+
+    NONE = 0
+    DONE = 1
+    CANCELLED = 2
+    REFUSED = 3  # see the status' reason
+    FAILED = 4  # given up on the way
+
+
+MOTION_REQUEST = command(
+    "motion_request",
+    1,
+    RESTS_ON,
+    Field("kind", "u1", MotionKind, "what to do"),
+    Field("joints", "f8", "rad", "goal of JOINTS", ("joints",)),
+    Field("position", "f8", "m", "goal of POSE: tool position, in the frame of `body`", (3,)),
+    Field("quaternion", "f8", "1", "goal of POSE: tool orientation, in the frame of `body`", (4,)),
+    Field("body", "i2", "1", "row of the body in the world model in whose frame the goal is; -1: the world"),
+    Field(
+        "live", "u1", "1", "1: the goal follows the body; 0: its frame is copied when the request begins"
+    ),
+    Field("acceleration", "f8", "s", "half the time of the blend into this request"),
+    Field("segment", "f8", "s", "time for the request; 0: from the speed limits; too short: stretched"),
+    Field("opening", "f8", "m", "gripper joint position to go to, for GRIP"),
+    Field("force", "f8", "N", "largest gripper force, for GRIP"),
+)
+"""`id` numbers requests, rising by one from 1 in the order of the queue."""
+
+MOTION_STATUS = status(
+    "motion_status",
+    1,
+    *ANSWER,
+    Field("taken", "u4", "1", "newest request taken from the queue; 0: none yet"),
+    Field("current", "u4", "1", "request under way; 0: none"),
+    Field("done", "u4", "1", "newest request ended, however; 0: none yet"),
+    Field("ended", "u4", "1", "ids of the last requests ended, newest first; 0: none", (ENDED,)),
+    Field("endings", "u1", Ending, "how they ended", (ENDED,)),
+    Field("progress", "f8", "1", "part of the current request's time that has passed, 0 to 1"),
+    Field("resting", "u1", "1", "1: commanded velocity is zero"),
+    Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities commanded last", ("joints",)),
+    Field("tool", "f8", "m", "tool position commanded last", (3,)),
+    Field("astray", "f8", "m", "distance of that from a live goal, once reached; 0: there is none"),
+)
