@@ -24,7 +24,7 @@ class MotionKind(IntEnum):
     GRIP = 5  # bring the gripper to `opening` with at most `force`, at rest
 
 
-class Ending(IntEnum):
+class Outcome(IntEnum):
     """How a request ended."""
 
     NONE = 0
@@ -43,9 +43,7 @@ MOTION_REQUEST = command(
     Field("position", "f8", "m", "goal of POSE: tool position, in the frame of `body`", (3,)),
     Field("quaternion", "f8", "1", "goal of POSE: tool orientation, in the frame of `body`", (4,)),
     Field("body", "i2", "1", "row of the body in the world model in whose frame the goal is; -1: the world"),
-    Field(
-        "live", "u1", "1", "1: the goal follows the body; 0: its frame is copied when the request begins"
-    ),
+    Field("live", "u1", "1", "1: the goal follows the body; 0: its frame is copied when the request begins"),
     Field("acceleration", "f8", "s", "half the time of the blend into this request"),
     Field("segment", "f8", "s", "time for the request; 0: from the speed limits; too short: stretched"),
     Field("opening", "f8", "m", "gripper joint position to go to, for GRIP"),
@@ -61,7 +59,7 @@ MOTION_STATUS = status(
     Field("current", "u4", "1", "request under way; 0: none"),
     Field("done", "u4", "1", "newest request ended, however; 0: none yet"),
     Field("ended", "u4", "1", "ids of the last requests ended, newest first; 0: none", (ENDED,)),
-    Field("endings", "u1", Ending, "how they ended", (ENDED,)),
+    Field("outcomes", "u1", Outcome, "how they ended", (ENDED,)),
     Field("progress", "f8", "1", "part of the current request's time that has passed, 0 to 1"),
     Field("resting", "u1", "1", "1: commanded velocity is zero"),
     Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
