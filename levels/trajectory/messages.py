@@ -24,7 +24,7 @@ class MotionKind(IntEnum):
     GRIP = 5  # bring the gripper to `opening` with at most `force`, at rest
 
 
-class Outcome(IntEnum):
+class RequestEnd(IntEnum):
     """How a request ended."""
 
     NONE = 0
@@ -59,7 +59,7 @@ MOTION_STATUS = status(
     Field("current", "u4", "1", "request under way; 0: none"),
     Field("done", "u4", "1", "newest request ended, however; 0: none yet"),
     Field("ended", "u4", "1", "ids of the last requests ended, newest first; 0: none", (ENDED,)),
-    Field("outcomes", "u1", Outcome, "how they ended", (ENDED,)),
+    Field("ends", "u1", RequestEnd, "how they ended", (ENDED,)),
     Field("progress", "f8", "1", "part of the current request's time that has passed, 0 to 1"),
     Field("resting", "u1", "1", "1: commanded velocity is zero"),
     Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
