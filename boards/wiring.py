@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rack.backplane.words import Demand
@@ -10,6 +10,10 @@ from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
 """What a port reads: a mailbox, or mailboxes by board."""
+
+
+Entries = Mapping[str, Sequence[tuple[int, bytes]]]
+"""What a bus adapter wrote in a recorded run, by port: ticks and messages, oldest first."""
 
 
 def mailboxes_of(source: Source) -> tuple[str, ...]:
@@ -32,7 +36,8 @@ class TaskWiring:
     """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
-    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config.
+    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config. `entries`: for a bus adapter
+    in a replay.
     """
 
     task: str
@@ -43,7 +48,20 @@ class TaskWiring:
     critical_priority: int = 0
     guards_clock: bool = False
     fails_self_test: bool = False
+    entries: Entries | None = None
     transfer: BusTimes = field(default_factory=BusTimes)
+
+
+@dataclass(frozen=True)
+class HostWiring:
+    """One host board: the class of its program and the mailbox of each port. External: a prompt runs it, not the rack."""
+
+    board: str
+    target: str
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]
+    context: LevelContext
+    is_external: bool = False
 
 
 @dataclass(frozen=True)

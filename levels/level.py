@@ -53,7 +53,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
@@ -65,7 +65,7 @@ from rack.levels.operator import Commands
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 
 __all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
-__all__ += ["Ports", "Program", "Reading", "Verdict"]
+__all__ += ["MadePorts", "Ports", "Program", "Reading", "Verdict"]
 
 
 class Input(NamedTuple):
@@ -90,6 +90,13 @@ class Output(NamedTuple):
     def is_due(self, tick: int, every: int) -> bool:
         """Return whether the cycle released at `tick`, one of those every `every` ticks, writes it."""
         return (tick + every) % (self.cycles * every) == 0
+
+
+class MadePorts(NamedTuple):
+    """Ports that a config makes, in addition to those that a class declares."""
+
+    inputs: Mapping[str, Input] = MappingProxyType({})
+    outputs: Mapping[str, Output] = MappingProxyType({})
 
 
 class Ports(SimpleNamespace):
@@ -189,6 +196,14 @@ class Executor(ABC):
         The parameters of all boards concerned are valid, each by itself.
         """
         return ()
+
+    @classmethod
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+        """Return the ports that `params` makes; `types` holds the mailboxes that classes declare.
+
+        It leaves out what has mistakes: those are reported where they belong.
+        """
+        return MadePorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""

@@ -16,12 +16,15 @@ from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, Protocol, Task
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
 from rack.boards.config.mistakes import mistakes_of
-from rack.boards.config.ports import TaskPorts, all_ports
+from rack.boards.config.ports import TaskPorts, all_ports, table_of
 from rack.boards.config.schema import RackConfig, TaskPlace
+from rack.boards.config.sides import Sides, key_of
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
 from rack.levels.operator import OPERATOR_COMMAND
 
+HOST_DEPTH = 64
+"""Slots of a host board's mailbox."""
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox; commands are rare."""
 MAX_SEGMENT_BYTES = 2**30
@@ -58,18 +61,23 @@ class Wiring:
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
         self.config = config
         self.mistakes: list[Mistake] = []
-        self.tasks = all_ports(config, self.mistakes)
-        found = {ports.task for ports in self.tasks}
+        self._ports = all_ports(config, self.mistakes)
+        self.tasks = [ports for ports in self._ports if ports.place.role != "host"]
+        self.hosts = [ports for ports in self._ports if ports.place.role == "host"]
+        self.sides = Sides(self._ports)
+        places = [*config.tasks(), *config.hosts()]
+        found = {ports.task for ports in self._ports}
         # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
-        self._unknown = {place.board for place in config.tasks() if place.name not in found}
-        self._unknown |= {place.removeprefix("board.") for place in broken}
+        self._unknown = {place.board for place in places if place.name not in found}
+        self._unknown |= {place.removeprefix("board.").removeprefix("host.") for place in broken}
         self._writers: dict[str, tuple[TaskPorts, Output]] = {}
-        for ports in self.tasks:
+        for ports in self._ports:
             self._add_writer(ports)
         self._operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
         self._check_operated()
-        for ports in self.tasks:
+        for ports in self._ports:
             self._check_reads(ports)
+        self.mistakes += self.sides.mistakes()
         self._check_rest()
         self._check_params()
         if not broken & {"robot", "scene", "task"}:
@@ -96,9 +104,8 @@ class Wiring:
                 self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", "lock", why))
 
     def _check_reads(self, ports: TaskPorts) -> None:
-        key = "reads" if ports.place.role == "executor" else "planner_reads"
         for port, mailbox in ports.sources:
-            place, wanted = f"board.{ports.place.board}.{key}.{port}", ports.inputs[port].type
+            place, wanted = f"{table_of(ports.place)}.{key_of(ports)}.{port}", ports.inputs[port].type
             if not self._is_known(mailbox):
                 why = f"no task writes it; mailboxes: {self._names()}"
                 self.mistakes.append(Mistake(place, mailbox, why))
@@ -117,17 +124,18 @@ class Wiring:
 
     def _check_params(self) -> None:
         """Check each board's parameters against the declarations of its executor's and planner's classes."""
-        kinds = [(ports.place.board, ports.kind.params) for ports in self.tasks if ports.kind.params is not None]
-        for board, kind in dict.fromkeys(kinds):
-            params = self.config.board[board].params
+        kinds = [(table_of(ports.place), ports.kind.params) for ports in self._ports if ports.kind.params is not None]
+        for table, kind in dict.fromkeys(kinds):
+            tables, _, board = table.partition(".")
+            params = getattr(self.config, tables)[board].params
             try:
                 kind.model_validate(params)
             except ValidationError as error:
-                self.mistakes += mistakes_of(error, kind, params, f"board.{board}.params")
+                self.mistakes += mistakes_of(error, kind, params, f"{table}.params")
 
     def _check_programs(self) -> None:
         """Check `[task]` against the programs declared by the levels' classes."""
-        for kind in dict.fromkeys(ports.kind.program for ports in self.tasks if ports.kind.program is not None):
+        for kind in dict.fromkeys(ports.kind.program for ports in self._ports if ports.kind.program is not None):
             try:
                 program = kind.model_validate(self.config.task)
             except ValidationError as error:
@@ -158,9 +166,14 @@ class Wiring:
     def layout(self, sizes: Mapping[str, int]) -> Layout:
         """Return the layout of a config without mistakes."""
         tasks = tuple(self._task(ports) for ports in self.tasks)
-        by_name = {task.name: task for task in tasks}
+        hosts = tuple(_host(ports.place) for ports in self.hosts)
+        by_name = {task.name: task for task in tasks + hosts}
         mailboxes = []
         for name, (ports, output) in self._writers.items():
+            if name in self.sides.from_host:
+                ring = partial(MailboxSpec, writer=ports.task, every=1, delay=0, depth=HOST_DEPTH)
+                mailboxes.append(self._mailbox(name, output.type, sizes, ring))
+                continue
             writer = by_name[ports.task]
             every = writer.every * output.cycles
             delay = writer.every * writer.within_cycles
@@ -173,7 +186,7 @@ class Wiring:
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
         mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self._operated.items()]
-        return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes))
+        return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes), hosts)
 
     def _task(self, ports: TaskPorts) -> TaskSpec:
         place, every = ports.place, self.config.every(ports.place.board)
@@ -214,12 +227,20 @@ class Wiring:
         )
 
     def _readers(self, mailbox: str) -> tuple[str, ...]:
-        return tuple(ports.task for ports in self.tasks if any(mailbox == box for _, box in ports.sources))
+        return tuple(ports.task for ports in self._ports if any(mailbox == box for _, box in ports.sources))
 
     def _protocol(self, mailbox: str) -> Protocol:
+        if mailbox in self.sides.of_host:
+            # Host boards read the newest message at once, whatever the protocol.
+            return "double-buffer" if mailbox in self.sides.from_host else "time-slice"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
         # A lock would make the clock wait for readers.
         return "double-buffer" if protocol == "lock" and mailbox in self._operated else protocol
+
+
+def _host(place: TaskPlace) -> TaskSpec:
+    """Return the record of a host board: it has no rate, and leaves no trace."""
+    return TaskSpec(place.name, place.board, place.role, place.slot, place.core, 0, 1, 1, 0)
 
 
 def too_large(layout: Layout) -> Iterable[Mistake]:

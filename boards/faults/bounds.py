@@ -50,7 +50,7 @@ class BoundCase:
     @cached_property
     def board(self) -> str:
         """The task that the fault strikes; "clock" for the clock."""
-        return CLOCK if self.injection.task < 0 else self.layout.tasks[self.injection.task].name
+        return CLOCK if self.injection.task < 0 else self.layout.processes[self.injection.task].name
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:

@@ -186,5 +186,5 @@ def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: A
     """Return the clock driver for the run's mode."""
     if not wiring.lockstep:
         return RealtimeDriver(segment, ended, alarms)
-    at_once = any(mailbox.protocol != "time-slice" for mailbox in segment.layout.mailboxes)
+    at_once = any(mailbox.protocol != "time-slice" for mailbox in segment.layout.timed)
     return LockstepDriver(segment, ended, at_once, wiring.history, alarms)
