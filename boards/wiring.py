@@ -36,8 +36,8 @@ class TaskWiring:
     """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
-    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config. `entries`: for a bus adapter
-    in a replay.
+    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config. `entries`: for a bus
+    adapter in a replay.
     """
 
     task: str
@@ -54,7 +54,7 @@ class TaskWiring:
 
 @dataclass(frozen=True)
 class HostWiring:
-    """One host board: the class of its program and the mailbox of each port. External: a prompt runs it, not the rack."""
+    """One host board: its program's class, and the mailbox of each port. External: a prompt runs it, not the rack."""
 
     board: str
     target: str

@@ -13,9 +13,9 @@ The author writes `run`:
             while bus.read("motion").value.done < bus.sent("requests"):
                 bus.wait(1.0)
 
-The program is over when `run` returns. An exception ends the process, which is restarted by the rack's policy with a new
-object; serials of messages go on. In a live run, messages enter at ticks that depend on the program's timing: a replay
-with the recorded entries repeats it.
+The program is over when `run` returns. An exception ends the process, which is restarted by the rack's policy with a
+new object; serials of messages go on. Messages enter at ticks that depend on the program's timing; a replay with the
+recorded entries repeats a run.
 """
 
 from __future__ import annotations

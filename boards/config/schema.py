@@ -189,7 +189,7 @@ class BoardConfig(Table):
 
 
 class HostConfig(Table):
-    """`[host.<name>]`: one board of the host side. It has no slot, rate or real-time priority: see `rack.levels.host_program`."""
+    """`[host.<name>]`: one board of the host side, without slot, rate and priority: see `rack.levels.host_program`."""
 
     program: ClassName = Field(description="class of the program, package.module:Class")
     external: bool = Field(False, description="the rack does not start it: it is run by 'rack prompt'")

@@ -46,9 +46,8 @@ class Sides:
             return ""
         side = "real-time" if mailbox not in self.of_host else "host"
         if (source := self._sources.get(mailbox)) is not None:
-            same = "host" if is_host else "real-time"
-            writer = source.partition(".")[0]
-            return f"a bus adapter joins two sides; '{writer}', which writes '{source}', and '{name}' are on the {same} side"
+            writer, same = source.partition(".")[0], "host" if is_host else "real-time"
+            return f"a bus adapter joins the two sides; '{writer}' and '{name}' are both on the {same} side"
         return f"it is on the {side} side; {PASS_IT}"
 
 

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import traceback
+from pathlib import Path
 from types import FrameType
 
 from rack.backplane.segment import Segment
@@ -47,7 +48,8 @@ def _leave(number: int, frame: FrameType | None) -> None:
 def _failed(board: str, error: BaseException) -> int:
     """Print an exception as one line: it becomes an event of the run."""
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({os.path.basename(frames[-1].filename)}, line {frames[-1].lineno})" if frames else ""
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
+    # The crate passes on what boards print.
     print(f"host board '{board}': {text}{place}", file=sys.stderr, flush=True)
     return FAILED
