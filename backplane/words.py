@@ -114,8 +114,8 @@ class Box(IntEnum):
     CLAIM = 3  # no value: the writer holds the kernel's lock on this address
     OWNER = 4  # the same for the critical section of protocol lock; value: its owner's process id, 0: none
     CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
-    TAKEN = 6  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
-    REFUSED = 7  # in a host board's mailbox: messages that its writer could not send, since too many waited
+    REFUSED = 6  # of a queue: messages refused because it was full
+    TAKEN = 7  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
 
 
 class Slot(IntEnum):

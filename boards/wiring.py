@@ -36,8 +36,8 @@ class TaskWiring:
     """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
-    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config. `entries`: for a bus
-    adapter in a replay.
+    task is one of the fastest and watches the clock. `sent`: the ports whose messages the level sends itself.
+    `fails_self_test`: a fault in the config. `entries`: for a bus adapter in a replay.
     """
 
     task: str
@@ -47,6 +47,7 @@ class TaskWiring:
     context: LevelContext
     critical_priority: int = 0
     guards_clock: bool = False
+    sent: tuple[str, ...] = ()
     fails_self_test: bool = False
     entries: Entries | None = None
     transfer: BusTimes = field(default_factory=BusTimes)

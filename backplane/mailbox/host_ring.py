@@ -21,7 +21,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
 SPARE = 2
-"""Slots that a full ring leaves free: the one being written, and one for the adapter that copies meanwhile."""
+"""Slots more than messages may wait: the one being written, and one that the adapter copies meanwhile."""
 _HEAD, _TAKEN, _REFUSED = int(Box.HEAD), int(Box.TAKEN), int(Box.REFUSED)
 
 
@@ -35,7 +35,7 @@ class HostWriter(DoubleBufferWriter):
     @property
     def is_full(self) -> bool:
         """Whether as many messages wait as the ring holds."""
-        return self._box[_HEAD] - self._box[_TAKEN] >= self.spec.depth - SPARE
+        return self._box[_HEAD] - self._box[_TAKEN] >= self.spec.capacity
 
     def send(self, tick: int) -> bool:
         """Publish `message`, written at `tick`; return False, and count it, when the ring is full."""

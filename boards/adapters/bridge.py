@@ -61,7 +61,8 @@ class Bridge(Executor):
         entries = BridgeParams.entries_of(params)
         known = {port: entry for port, entry in entries.items() if entry.source in types}
         inputs = {port: Input(types[entry.source], entry.source) for port, entry in known.items()}
-        outputs = {port: Output(types[entry.source]) for port, entry in known.items()}
+        # A message that is passed once must not be sampled; to host boards a bridge writes by itself.
+        outputs = {port: Output(types[entry.source], queued=entry.asynchronous) for port, entry in known.items()}
         return MadePorts(inputs, {**outputs, STATUS: Output(status_of(entries))})
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:

@@ -130,7 +130,7 @@ class Inward:
         """Take what waits, and check it."""
         ring, count, out = self._ring, self._count, getattr(write, self._port)
         if self._table.asynchronous:
-            for _ in range(min(ring.waiting, self._table.most)):
+            for _ in range(min(ring.waiting, self._table.most, out.room())):
                 if (message := ring.take()) is not None:
                     out.copy_from(message)
                     out.send()
