@@ -94,7 +94,7 @@ class Crate:
             case PowerOn(name, ClockWiring() as clock):
                 self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
             case PowerOn(name, HostWiring() as host):
-                self._fork(name, lambda segment: run_host_board(segment, host))
+                self._fork(name, lambda segment: run_host_board(segment, host, self._attention))
             case PowerOn(name, HogWiring(entry)):
                 self._fork(name, lambda segment: hog(segment, entry))
             case PowerOff(name):
@@ -166,6 +166,7 @@ class Crate:
             block = self._segment.block(name)
             if self._is_host(name) and block[Block.STATE] == TaskState.ENDED:
                 # Its program is done; a task ends with the run alone.
+                block[Block.PID] = 0
                 return tick
             if block[Block.STATE] != TaskState.FAILED:
                 block[Block.STATE] = TaskState.ABSENT

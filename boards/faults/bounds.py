@@ -65,6 +65,11 @@ class BoundCase:
         return self.board != CLOCK and self.layout.task(self.board).role == "planner"
 
     @property
+    def is_host(self) -> bool:
+        """Whether it strikes a host board, which has no cycle."""
+        return self.board != CLOCK and self.layout.task(self.board).role == "host"
+
+    @property
     def cycle(self) -> int:
         """The task's cycle, in ticks."""
         return cycle_ticks(self.layout, self.board)
@@ -112,8 +117,9 @@ class Bound:
 
 
 def cycles(count: int) -> Bound:
-    """Return a bound of `count` cycles of the task; 0 is the cycle in which the fault strikes."""
-    return Bound(_counted(count, "cycle") if count else "the same cycle", lambda case: count * case.cycle)
+    """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host board has none."""
+    text = _counted(count, "cycle") if count else "the same cycle"
+    return Bound(text, lambda case: None if case.is_host else count * case.cycle)
 
 
 def clock_ticks(count: int) -> Bound:

@@ -20,15 +20,17 @@ FAILED = 1
 """Exit status of a host board whose program raised an exception."""
 
 
-def run_host_board(segment: Segment, wiring: HostWiring) -> int:
+def run_host_board(segment: Segment, wiring: HostWiring, attention: int) -> int:
     """Run a host board's program; return the exit status of its process.
 
-    The process leads a session of its own: the crate ends with it whatever it has started.
+    The process leads a session of its own: the crate ends with it whatever it has started. `attention` is an eventfd on
+    which the Rack waits.
     """
     os.setsid()
     # The crate ignores it. A program that is ended leaves its `with` and `finally` blocks, as at sys.exit.
     signal.signal(signal.SIGTERM, _leave)
     bus = HostBus(segment, wiring)
+    os.eventfd_write(attention, 1)
     try:
         # Imported here, not in the crate: a program may import anything, and the crate must stay single-threaded.
         find_class(wiring.target, HostProgram)(wiring.context).run(bus)

@@ -32,7 +32,7 @@ class HostRow:
 
 @dataclass(frozen=True)
 class EntryRow:
-    """One entry of a bus adapter: its counts, and the age of its newest message, ms of simulated time; None: none yet."""
+    """One entry of a bus adapter: its counts, and the age of its newest message, simulated ms; None: none yet."""
 
     entry: str
     source: str

@@ -67,7 +67,7 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work. `hosts` are the boards of the host side, `entries` what passes to and from it.
+    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them.
     """
 
     rack: str
