@@ -1,7 +1,7 @@
 """A program of the host side: no rate, no deadline, no real-time priority; it may block, import anything, and raise.
 
 A host board is a process of its own under ordinary scheduling. The clock does not release it and never waits for it.
-It reaches the levels only through a bus adapter (`rack.boards.adapters.bridge`), which exchanges at a rate of its own.
+It reaches the levels only through a bus adapter (`rack.boards.adapters.bus_adapter`), which exchanges at its own rate.
 The author writes `run`:
 
     class Stroll(HostProgram):

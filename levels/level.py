@@ -102,10 +102,11 @@ class Output(NamedTuple):
 
 
 class MadePorts(NamedTuple):
-    """Ports that a config makes, in addition to those that a class declares."""
+    """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some are unknown."""
 
     inputs: Mapping[str, Input] = MappingProxyType({})
     outputs: Mapping[str, Output] = MappingProxyType({})
+    is_whole: bool = True
 
 
 class Ports(SimpleNamespace):
@@ -213,10 +214,7 @@ class Executor(ABC):
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
-        """Return the ports that `params` makes; `types` holds the mailboxes that classes declare.
-
-        It leaves out what has mistakes: those are reported where they belong.
-        """
+        """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that classes declare."""
         return MadePorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:

@@ -25,7 +25,7 @@ RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clea
 """Names that the status of a bridge needs for itself."""
 
 ENTRY = MessageType(
-    "bridge_entry",
+    "adapter_entry",
     1,
     (
         Field("passed", "u4", "1", "messages passed to the other side"),
@@ -62,7 +62,7 @@ class EntryConfig(Table):
         return cycle % self.every == self.phase
 
 
-class BridgeParams(Table):
+class AdapterParams(Table):
     """`[board.<bridge>.params]`."""
 
     entries: dict[str, EntryConfig] = Key({}, alias="pass", description="mailboxes to pass, by port of the bridge")
@@ -83,7 +83,7 @@ class BridgeParams(Table):
 
 
 @dataclass
-class Count:
+class EntryCount:
     """The counts of one entry: the fields of `ENTRY`. `written`: tick at which the newest message was written."""
 
     passed: int = 0
@@ -102,7 +102,7 @@ class Count:
         self.written = NEVER if age == NEVER else tick - age
 
     def passes(self, tick: int, written: int) -> None:
-        """Count a message."""
+        """EntryCount a message."""
         self.passed += 1
         self.arrived, self.written = tick, written
 
@@ -112,7 +112,7 @@ class Count:
         record[...] = (self.passed, self.refused, self.overtaken, self.full, self.waiting, self.arrived, age)
 
 
-class Entry(Protocol):
+class Crossing(Protocol):
     """One entry, at work."""
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
@@ -122,7 +122,7 @@ class Entry(Protocol):
 class Inward:
     """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read by ticks."""
 
-    def __init__(self, segment: Segment, port: str, table: EntryConfig, count: Count) -> None:
+    def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._ring, self._port, self._table, self._count = HostReader(segment, table.source), port, table, count
         self._refused, self._overtaken = count.refused, count.overtaken
 
@@ -145,7 +145,7 @@ class Inward:
 class Outward:
     """Out of real time: from a level's mailbox, read by ticks, to one that host boards read; it wakes them."""
 
-    def __init__(self, segment: Segment, own: str, port: str, table: EntryConfig, count: Count) -> None:
+    def __init__(self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._writer, self._port, self._table, self._count = open_writer(segment, own), port, table, count
         self._wake = [wake_semaphore(segment.rack, reader) for reader in self._writer.spec.readers]
 

@@ -69,7 +69,7 @@ class Wiring:
         self.hosts = [ports for ports in self._ports if ports.place.role == "host"]
         self.sides = Sides(self._ports)
         places = [*config.tasks(), *config.hosts()]
-        found = {ports.task for ports in self._ports}
+        found = {ports.task for ports in self._ports if ports.is_whole}
         # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
         self._unknown = {place.board for place in places if place.name not in found}
         self._unknown |= {place.removeprefix("board.").removeprefix("host.") for place in broken}
@@ -80,9 +80,9 @@ class Wiring:
         self._check_operated()
         for ports in self._ports:
             self._check_reads(ports)
-        self.mistakes += self.sides.mistakes()
         self._check_rest()
-        self.mistakes += queue_mistakes(self)
+        crossing = list(self.sides.mistakes(self._unknown))
+        self.mistakes += crossing or queue_mistakes(self)
         self._check_params()
         if not broken & {"robot", "scene", "task"}:
             self._check_programs()
@@ -115,7 +115,7 @@ class Wiring:
             if not self.is_known(mailbox):
                 why = f"no task writes it; mailboxes: {self.names()}"
                 self.mistakes.append(Mistake(place, mailbox, why))
-            elif (found := self._kind(mailbox)) is not None and found != wanted:
+            elif ports.is_whole and (found := self._kind(mailbox)) is not None and found != wanted:
                 why = f"carries {found.name} {found.version}; the port needs {wanted.name} {wanted.version}"
                 self.mistakes.append(Mistake(place, mailbox, why))
 

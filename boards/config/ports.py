@@ -24,7 +24,7 @@ class TaskPorts:
     """The class of a task or host board, and the mailbox of each port.
 
     `reads` holds a mailbox by port or, for a port that reads many, a dict of mailboxes by board; `writes` a mailbox by
-    port, `inputs` and `outputs` the declarations of the ports.
+    port, `inputs` and `outputs` the declarations of the ports; not `is_whole` if mistakes keep some unknown.
     """
 
     place: TaskPlace
@@ -33,6 +33,7 @@ class TaskPorts:
     outputs: Mapping[str, Output]
     reads: Mapping[str, Source]
     writes: Mapping[str, str]
+    is_whole: bool = True
 
     @property
     def task(self) -> str:
@@ -65,6 +66,7 @@ def _with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, M
         outputs={**ports.outputs, **made.outputs},
         reads={**ports.reads, **{port: entry.source for port, entry in made.inputs.items()}},
         writes={**ports.writes, **{port: f"{board}.{port}" for port in made.outputs}},
+        is_whole=made.is_whole,
     )
 
 

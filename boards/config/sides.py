@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 
-from rack.boards.adapters.bridge import Bridge
+from rack.boards.adapters.bus_adapter import BusAdapter
 from rack.boards.config.ports import TaskPorts, table_of
 from rack.boards.errors import Mistake
 
@@ -20,7 +20,7 @@ class Sides:
         self._sources = {
             f"{task.place.board}.{port}": source
             for task in ports
-            if issubclass(task.kind, Bridge)
+            if issubclass(task.kind, BusAdapter)
             for port, source in task.sources
         }
         self.to_host = {box for box, source in self._sources.items() if source not in self.from_host}
@@ -30,17 +30,17 @@ class Sides:
         """The mailboxes of the host side."""
         return self.from_host | self.to_host
 
-    def mistakes(self) -> Iterator[Mistake]:
-        """Yield a mistake for every port that reads a mailbox of the other side."""
+    def mistakes(self, unknown: Container[str]) -> Iterator[Mistake]:
+        """Yield a mistake for every port that reads a mailbox of the other side; not of boards in `unknown`."""
         for task in self._ports:
             for port, mailbox in task.sources:
-                if why := self._reason(task, mailbox):
+                if mailbox.partition(".")[0] not in unknown and (why := self._reason(task, mailbox)):
                     yield Mistake(f"{table_of(task.place)}.{key_of(task)}.{port}", mailbox, why)
 
     def _reason(self, task: TaskPorts, mailbox: str) -> str:
         """Return why a task or host board must not read a mailbox; empty if it may."""
         is_host, name = task.place.role == "host", task.place.board
-        if issubclass(task.kind, Bridge):
+        if issubclass(task.kind, BusAdapter):
             return "it is on the host side already" if mailbox in self.to_host else ""
         if is_host == (mailbox in self.of_host):
             return ""
@@ -53,6 +53,6 @@ class Sides:
 
 def key_of(task: TaskPorts) -> str:
     """Return the key of a board under which its ports are wired."""
-    if issubclass(task.kind, Bridge):
+    if issubclass(task.kind, BusAdapter):
         return "params.pass"
     return "planner_reads" if task.place.role == "planner" else "reads"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 import traceback
 from pathlib import Path
 from types import FrameType
 
+from rack.backplane.errors import MailboxError
 from rack.backplane.segment import Segment
 from rack.boards.classes import find_class
 from rack.boards.errors import LONGEST_REASON, one_line
@@ -16,6 +18,9 @@ from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
 
+RELEASED_S = 2.0
+"""Longest wait for the end of what the board's process before this one has forked."""
+LOOK_S = 0.01
 FAILED = 1
 """Exit status of a host board whose program raised an exception."""
 
@@ -29,7 +34,7 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int) -> int:
     os.setsid()
     # The crate ignores it. A program that is ended leaves its `with` and `finally` blocks, as at sys.exit.
     signal.signal(signal.SIGTERM, _leave)
-    bus = HostBus(segment, wiring)
+    bus = _opened(segment, wiring)
     os.eventfd_write(attention, 1)
     try:
         # Imported here, not in the crate: a program may import anything, and the crate must stay single-threaded.
@@ -41,6 +46,18 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int) -> int:
         return _failed(wiring.board, error)
     bus.finish()
     return 0
+
+
+def _opened(segment: Segment, wiring: HostWiring) -> HostBus:
+    """Open the bus. What the process before this one has forked is being killed, and may hold the board meanwhile."""
+    deadline = time.monotonic() + RELEASED_S
+    while True:
+        try:
+            return HostBus(segment, wiring)
+        except MailboxError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(LOOK_S)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.clock.wake import CHECK_S
@@ -20,6 +20,7 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards.wiring import HostWiring
 
 COMMAND_ID = "id"
+_Port = TypeVar("_Port")
 
 
 class HostBus:
@@ -30,7 +31,13 @@ class HostBus:
         self.block = segment.block(wiring.board)
         self._claim = _claim(segment, wiring.board)
         self._inlets = {port: HostInlet(segment, mailbox) for port, mailbox in wiring.inputs.items()}
-        self._writers = {port: HostWriter(segment, mailbox) for port, mailbox in wiring.outputs.items()}
+        self._writers: dict[str, HostWriter] = {}
+        try:
+            for port, mailbox in wiring.outputs.items():
+                self._writers[port] = HostWriter(segment, mailbox)
+        except MailboxError:
+            self.close()
+            raise
         self._semaphore = wake_semaphore(segment.rack, wiring.board)
         self.block[Block.PID] = os.getpid()
         self.block[Block.LOST] = 0
@@ -93,11 +100,6 @@ class HostBus:
         self._claim.close()
 
 
-def is_open(segment: Segment, board: str) -> bool:
-    """Say whether a process has opened the bus of a host board."""
-    return ByteLock.is_taken(segment, _claim_address(segment, board))
-
-
 class HostInlet:
     """Reads a mailbox of a bus adapter at any time: the newest whole message, and the unread ones before it."""
 
@@ -136,7 +138,7 @@ def _claim_address(segment: Segment, board: str) -> int:
     return segment.map.blocks[board] + 8 * Block.PID
 
 
-def _of(ports: dict[str, Any], port: str) -> Any:
+def _of(ports: Mapping[str, _Port], port: str) -> _Port:
     if port not in ports:
         raise AttributeError(f"no port '{port}'; ports: {', '.join(sorted(ports)) or 'none'}")
     return ports[port]

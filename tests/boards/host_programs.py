@@ -89,17 +89,6 @@ class Deaf(Host):
                 continue
 
 
-class Raising(Host):
-    """Sends one number, then raises."""
-
-    def run(self, bus: Bus) -> None:
-        """Fail once that has been added."""
-        bus.send("numbers", value=1.0)
-        while bus.read("sum").value.last < bus.sent("numbers"):
-            bus.wait(1.0)
-        raise ValueError("no more\nnumbers")
-
-
 class Improper(Host):
     """Sends what no number may hold, then a proper one."""
 
@@ -112,9 +101,48 @@ class Improper(Host):
             bus.wait(1.0)
 
 
+class Silent(Host):
+    """Blocks for ever, without a word."""
+
+    def run(self, bus: Bus) -> None:
+        """Wait for what never comes."""
+        time.sleep(3600)
+
+
+class Ending(Host):
+    """Is done at once."""
+
+    def run(self, bus: Bus) -> None:
+        """Do nothing."""
+
+
+class Failing(Host):
+    """Fails at once."""
+
+    def run(self, bus: Bus) -> None:
+        """Raise an exception of two lines."""
+        raise ValueError("no\nnumbers")
+
+
 class Console(Host):
     """A board for prompts."""
 
     def names(self, bus: Bus) -> dict[str, object]:
         """Offer a function that sends a number."""
         return {"number": lambda value: bus.send("numbers", value=value)}
+
+
+class Repeater(Executor):
+    """A level that reads what is for host boards."""
+
+    inputs = {"sum": Input(SUM, "below.sum")}
+    outputs = {"status": SUM}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Repeat it."""
+
+
+class Listener(HostProgram):
+    """A program that reads what is for levels."""
+
+    inputs = {"numbers": Input(NUMBER, "below.numbers")}

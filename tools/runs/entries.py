@@ -9,8 +9,8 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
-from rack.boards.adapters.bridge import STATUS, Bridge
-from rack.boards.adapters.entries import BridgeParams, EntryConfig
+from rack.boards.adapters.bus_adapter import STATUS, BusAdapter
+from rack.boards.adapters.entries import AdapterParams, EntryConfig
 from rack.boards.classes import find_class
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
@@ -46,8 +46,8 @@ def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
 
 def _bridges(config: RackConfig) -> Iterator[tuple[str, dict[str, EntryConfig]]]:
     for name, board in config.board.items():
-        if issubclass(find_class(board.executor, Executor), Bridge):
-            yield name, BridgeParams.entries_of(board.params)
+        if issubclass(find_class(board.executor, Executor), BusAdapter):
+            yield name, AdapterParams.entries_of(board.params)
 
 
 def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording) -> None:

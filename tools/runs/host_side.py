@@ -12,7 +12,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Box, TaskState
 
-BRIDGE_STATUS = "bridge_status"
+ADAPTER_STATUS = "adapter_status"
 """Message type of the status of a bus adapter: a group of counts for each entry."""
 AWAY = "away"
 """State of a host board that no process runs: an external one, or one that is being restarted."""
@@ -86,7 +86,7 @@ def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
 
 def entries_of(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
     """Yield status mailbox, name and source of every entry of a rack's bus adapters; `config` is TOML text."""
-    boxes = [box.name for box in layout.mailboxes if box.message == BRIDGE_STATUS]
+    boxes = [box.name for box in layout.mailboxes if box.message == ADAPTER_STATUS]
     boards = tomllib.loads(config)["board"] if boxes else {}
     for box in boxes:
         for entry, table in boards[box.partition(".")[0]].get("params", {}).get("pass", {}).items():

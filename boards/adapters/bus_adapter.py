@@ -26,12 +26,12 @@ from rack.backplane.words import Block, TaskState
 from rack.boards.adapters.entries import (
     ENTRY,
     NEVER,
-    BridgeParams,
-    Count,
-    Entry,
+    AdapterParams,
     EntryConfig,
+    EntryCount,
     Inward,
     Outward,
+    Crossing,
     Replayed,
     Rows,
 )
@@ -41,16 +41,16 @@ from rack.levels.tables import read_params
 STATUS = "status"
 
 
-class Bridge(Executor):
+class BusAdapter(Executor):
     """Passes mailboxes between the two sides. Its status is done when the programs of all its host boards are."""
 
-    params = BridgeParams
+    params = AdapterParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._tables = read_params(BridgeParams, context.params).entries
-        self._counts = {port: Count() for port in self._tables}
-        self._entries: list[tuple[EntryConfig, Entry]] = []
+        self._tables = read_params(AdapterParams, context.params).entries
+        self._counts = {port: EntryCount() for port in self._tables}
+        self._entries: list[tuple[EntryConfig, Crossing]] = []
         self._hosts: dict[str, memoryview] = {}
         self._before: dict[str, bytes] = {}
         self._statuses: Replayed | None = None
@@ -58,12 +58,13 @@ class Bridge(Executor):
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
         """Return a port to read and one to write for each entry, and the status."""
-        entries = BridgeParams.entries_of(params)
+        entries = AdapterParams.entries_of(params)
         known = {port: entry for port, entry in entries.items() if entry.source in types}
-        inputs = {port: Input(types[entry.source], entry.source) for port, entry in known.items()}
+        inputs = {port: Input(types.get(entry.source, ENTRY), entry.source) for port, entry in entries.items()}
         # A message that is passed once must not be sampled; to host boards a bridge writes by itself.
         outputs = {port: Output(types[entry.source], queued=entry.asynchronous) for port, entry in known.items()}
-        return MadePorts(inputs, {**outputs, STATUS: Output(status_of(entries))})
+        is_whole = bool(entries) and known == entries
+        return MadePorts(inputs, {**outputs, STATUS: Output(status_of(entries))}, is_whole)
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
         """Open the host side; in a replay, take over what the recorded run wrote, by port, instead."""
@@ -74,7 +75,7 @@ class Bridge(Executor):
             # What the process before this one has written, if the bridge is restarted.
             own = open_observer(segment, f"{self.context.board}.{port}")
             before, writer = own.peek(), layout.mailbox(table.source).writer
-            entry: Entry
+            entry: Crossing
             if writer not in hosts:
                 entry = Outward(segment, own.spec.name, port, table, self._counts[port])
             else:
@@ -127,4 +128,4 @@ class Bridge(Executor):
 
 def status_of(entries: Mapping[str, EntryConfig]) -> MessageType:
     """Return the type of a bridge's status: one group of counts for each entry."""
-    return status("bridge_status", 1, *(Field(port, ENTRY, "1", f"entry {port}") for port in entries))
+    return status("adapter_status", 1, *(Field(port, ENTRY, "1", f"entry {port}") for port in entries))
