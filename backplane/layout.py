@@ -40,7 +40,8 @@ class MailboxSpec:
     """One mailbox: its writer and readers, its message, its protocol.
 
     `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
-    become visible at multiples of `every`. `depth` is the number of slots, a power of two.
+    become visible at multiples of `every`. `depth` is the number of slots, a power of two. `rests_on` names the
+    mailboxes on whose information its messages rest, all read by its writer.
     """
 
     name: str
@@ -54,6 +55,7 @@ class MailboxSpec:
     version: int
     size: int
     fields: tuple[FieldSpec, ...]
+    rests_on: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

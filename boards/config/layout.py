@@ -168,7 +168,8 @@ class Wiring:
             readers = [by_name[reader] for reader in self._readers(name)]
             slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
             depth = depth_for(max(slowest + delay, self._kept_ticks), every)
-            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth)
+            rests_on = ports.rests_on(name.partition(".")[2])
+            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, rests_on=rests_on)
             mailboxes.append(self._mailbox(name, output.type, sizes, spec))
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)

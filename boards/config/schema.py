@@ -32,8 +32,10 @@ OnLoss = Literal["hold", "stop", "brake"]
 
 
 def _listed(value: Any) -> Any:
-    """Return a single name as a list of one."""
-    return (value,) if isinstance(value, str) else value
+    """Return a name or a list of names as a tuple."""
+    if isinstance(value, str):
+        return (value,)
+    return tuple(value) if isinstance(value, list) else value
 
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
@@ -263,6 +265,12 @@ class RackConfig(Table):
         if config.every is not None:
             return config.every
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
+
+    def links(self) -> Iterator[tuple[str, str]]:
+        """Yield board above and board below of every two neighbours, whichever of them names the other."""
+        listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
+        listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
+        yield from (link for link in dict.fromkeys(listed) if {*link} <= self.board.keys() and link[0] != link[1])
 
     def tasks(self) -> Iterator[TaskPlace]:
         """Yield every task in order: each board's executor, then its planner."""

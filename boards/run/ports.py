@@ -22,7 +22,7 @@ Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
 class InputPorts:
     """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port.
 
-    `readers` holds the reader of each port that reads one mailbox.
+    `readers` holds the reader of each mailbox.
     """
 
     def __init__(self, segment: Segment, sources: Mapping[str, Source], alarms: AlarmWriter, plan: str = "") -> None:
@@ -36,7 +36,7 @@ class InputPorts:
         self._readers: list[Reader] = []
         for port, source in sources.items():
             if isinstance(source, str):
-                self.readers[port] = self._add(segment, self.values.__dict__, port, source, alarms, plan)
+                self._add(segment, self.values.__dict__, port, source, alarms, plan)
             else:
                 by_board: dict[str, Reading] = {}
                 setattr(self.values, port, by_board)
@@ -48,12 +48,12 @@ class InputPorts:
 
     def _add(
         self, segment: Segment, values: dict[str, Reading], key: str, mailbox: str, alarms: AlarmWriter, plan: str
-    ) -> Reader:
+    ) -> None:
         found = watched(segment, mailbox, alarms, self.task)
         values[key] = Reading(found.reader.message, Verdict.NONE)
         (self._plan if mailbox == plan else self._rest).append((values, key, found.read))
         self._readers.append(found.reader)
-        return found.reader
+        self.readers[mailbox] = found.reader
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
@@ -92,17 +92,35 @@ class InputPorts:
         return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
 
+class OldestOf:
+    """The basis of what rests on several mailboxes: the oldest of those that hold a message. As of a `Reader`."""
+
+    def __init__(self, readers: Sequence[Reader]) -> None:
+        self._readers = readers
+
+    @property
+    def serial(self) -> int:
+        """Serial of one of the messages; 0: there is none."""
+        return max([reader.serial for reader in self._readers])
+
+    @property
+    def basis(self) -> int:
+        """Tick of the oldest information that the last good messages rest on."""
+        return min([reader.basis for reader in self._readers if reader.serial])
+
+
 class OutputPorts:
     """The mailboxes that a task writes; `messages` holds the outgoing message of each port.
 
     Each message carries the tick of the oldest information that it rests on. A command inherits the tick of the command
-    that it follows, a status that of the status below. So the system's response time can be measured.
+    that it follows, a status that of the status below: see `Output.rests_on`. So the system's response time can be
+    measured.
     """
 
     def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, inputs: InputPorts) -> None:
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
         self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
-        self._rests_on = {port: inputs.readers.get(port) for port in mailboxes}
+        self._rests_on = {port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()}
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
         self._faulty: dict[str, FaultyWriter] = {}
@@ -192,3 +210,9 @@ class OutputPorts:
     def _traffic(self) -> tuple[int, int]:
         writers = self.writers.values()
         return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)
+
+
+def _basis(mailboxes: Sequence[str], readers: Mapping[str, Reader]) -> Reader | OldestOf | None:
+    """Return what gives the basis of a message that rests on these mailboxes; None: it rests on nothing read."""
+    found = [readers[name] for name in mailboxes]
+    return OldestOf(found) if len(found) > 1 else next(iter(found), None)
