@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.mailbox.queue import is_position
 from rack.levels.timing.equations import response_ticks, system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import RackTiming
 
@@ -89,12 +90,13 @@ class CommandPath:
 def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that take information from board to board, each resting on the one before.
 
-    Where the way is broken, they are those of its end: of the longest part that arrives at the last board.
+    Where the way is broken, they are those of its end: of the longest part that arrives at the last board. A queue
+    breaks it: how long its messages wait there is for their writer to decide.
     """
     if len(boards) < 2:
         return ()
-    read = {box.name for box in layout.mailboxes if boards[-1] in box.readers}
-    return _along(layout, boards[:-1], read)
+    sampled = [box for box in layout.mailboxes if box.protocol != "queue" and not is_position(box)]
+    return _along(layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers})
 
 
 def _along(layout: Layout, boards: Sequence[str], taken: Collection[str]) -> tuple[MailboxSpec, ...]:

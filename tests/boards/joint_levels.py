@@ -1,101 +1,57 @@
-"""Levels for tests of boards with several neighbours: a board a joint between one level above and one below.
-
-Each joint takes its own part of the vector that the level above commands, and the level below adds the parts up.
-"""
+"""A level above boards that servo joints: it moves every joint smoothly to and fro."""
 
 from __future__ import annotations
 
-from pydantic import Field as Key
+import math
 
-from rack.backplane.message import Field, State, command, status
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Operation, Orders
-from rack.levels.tables import Table, read_params
+import numpy as np
 
-JOINTS = 3
-PATH = command("test_path", 1, RESTS_ON, Field("position", "f8", "1", "of every joint", (JOINTS,)))
-PART = command("test_part", 1, RESTS_ON, Field("position", "f8", "1", "of this board's joint; others 0", (JOINTS,)))
-SEEN = status(
-    "test_seen", 1, *ANSWER, Field("position", "f8", "1", "", (JOINTS,)), Field("lost", "u1", "1", "", (JOINTS,))
-)
+from rack.backplane.message import State
+from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.messages import PRIMITIVE_STATUS
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Dynamics
 
-
-class PathLevel(Executor):
-    """Commands all joints at once; reads a status of each."""
-
-    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "joints": Input(SEEN, "below.status", many=True)}
-    outputs = {"command": PATH, "status": Output(SEEN, rests_on="joints")}
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
-
-    def self_test(self) -> None:
-        """Begin without orders."""
-        self.orders = Orders(self.commands)
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Move on, unless held; show what the joints report, and which of them are lost."""
-        self.orders.take(read.operator)
-        if self.orders.standing is not Operation.HOLD:
-            write.command.position[:] = [tick, 2 * tick, 3 * tick]
-        write.command.operator = self.orders.rests_on(0)
-        for at, joint in enumerate(read.joints.values()):
-            write.status.position[at] = joint.value.position[at]
-            write.status.lost[at] = joint.is_lost
-        self.orders.done()
-        self.orders.report(write.status)
-        write.status.state = State.EXECUTING
+AWAY_RAD = 0.15
+"""How far every joint moves away from home."""
+PERIOD_S = 1.2
+"""Time to move away and back."""
 
 
-class JointParams(Table):
-    """`[board.<joint>.params]`."""
+class Swing(Executor):
+    """Moves all joints away from home and back, while no board below says that it is stopped; else it stays there."""
 
-    joint: int = Key(ge=0, lt=JOINTS, description="row of the joint in the vector")
-
-
-class JointLevel(Executor):
-    """Takes its joint's part of the command; shows what the level below has made of it."""
-
-    inputs = {"command": Input(PATH, "above.command"), "below": Input(SEEN, "below.status")}
-    outputs = {"part": Output(PART, rests_on="command"), "status": Output(SEEN, rests_on="below")}
-    params = JointParams
+    inputs = {"statuses": Input(JOINT_STATUS, "below.status", many=True)}
+    outputs = {"command": JOINT_REFERENCE, "status": PRIMITIVE_STATUS}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._joint = read_params(JointParams, context.params).joint
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self._home, self._dynamics = cell.home, Dynamics(cell)
+        self._begun: int | None = None  # tick at which the present motion began
+        self._from = cell.home.copy()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Pass the part on, and the status back."""
-        write.part.position[self._joint] = read.command.value.position[self._joint]
-        write.part.operator = read.command.value.operator
-        write.status.position[:] = read.below.value.position
-        write.status.operator = read.below.value.operator
-        write.status.state = State.EXECUTING
-
-
-class ArmLevel(Executor):
-    """Adds the parts of all joints up."""
-
-    inputs = {"parts": Input(PART, "above.part", many=True)}
-    outputs = {"status": SEEN}
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Show the whole vector, and which of its boards are lost."""
-        parts = list(read.parts.values())
-        write.status.position[:] = sum(part.value.position for part in parts)
-        write.status.lost[:] = [part.is_lost for part in parts]
-        write.status.operator = min(part.value.operator for part in parts)
-        write.status.state = State.EXECUTING
-
-
-class Misled(JointLevel):
-    """Names an input that it does not have."""
-
-    outputs = {**JointLevel.outputs, "part": Output(PART, rests_on="comand")}
-
-
-class Lone(Executor):
-    """A board without neighbours."""
-
-    outputs = {"status": SEEN}
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Report nothing."""
+        """Write the set point due two cycles later."""
+        command, status, due = write.command, write.status, tick + 2 * self.context.every
+        statuses = [reading.value for reading in read.statuses.values() if reading.is_there]
+        held = len(statuses) < len(read.statuses) or any(one.stopped for one in statuses)
+        held = held or any(reading.is_lost for reading in read.statuses.values())
+        status.state = State.HOLDING if held else State.EXECUTING
+        status.reason = "a board below has stopped" if held else ""
+        if held:
+            self._begun, command.due = None, 0
+            return
+        if self._begun is None:
+            self._begun, self._from = due, statuses[0].position.copy()
+        phase = 2.0 * math.pi * (due - self._begun) * self.context.tick_s / PERIOD_S
+        rate = 2.0 * math.pi / PERIOD_S
+        command.id += 1
+        command.due = due
+        command.position = self._from + AWAY_RAD * 0.5 * (1.0 - math.cos(phase))
+        command.velocity = np.full(len(self._home), AWAY_RAD * 0.5 * rate * math.sin(phase))
+        command.acceleration = np.full(len(self._home), AWAY_RAD * 0.5 * rate**2 * math.cos(phase))
+        inertia, bias = self._dynamics.terms(command.position, command.velocity)
+        command.inertia, command.load = np.diagonal(inertia), bias
+        command.opening, command.force = 0.04, 20.0

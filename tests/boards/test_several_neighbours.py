@@ -15,8 +15,8 @@ from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.system_response import command_paths, mailboxes_along
 from tests.boards.conftest import MakeConfig
-from tests.boards.joint_racks import JOINTED
 from tests.boards.messages import Written
+from tests.boards.vector_racks import JOINTED
 
 SECONDS, TICKS = 0.5, 200
 
@@ -76,7 +76,7 @@ def test_a_reader_of_many_sees_which_of_them_is_lost(jointed: MakeConfig) -> Non
 
 
 def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(jointed: MakeConfig) -> None:
-    config = jointed("board.watch={ slot = 10, rate_hz = 400, executor = 'joint_levels:Lone' }")
+    config = jointed("board.watch={ slot = 10, rate_hz = 400, executor = 'vector_levels:Lone' }")
     supervision = Supervision(config, wire(config))
     lost = ["path", "watch", "joint2", "arm", "clock"]
     assert supervision.in_order(lost)[0] == "clock"
@@ -131,7 +131,7 @@ WRONG = {
         "port 'command' of the executor reads one mailbox, not 2",
     ),
     "rests on no input": (
-        "board.joint1.executor=joint_levels:Misled",
+        "board.joint1.executor=vector_levels:Misled",
         "its output 'part' rests on 'comand'; inputs: command, below",
     ),
 }

@@ -21,7 +21,7 @@ from rack.tools.runs.recording import Recording
 from rack.tools.timing.operator_response import response_of
 from rack.tools.viewer.reading import read
 from tests.boards.commanded_racks import commands
-from tests.boards.joint_racks import JOINTED, NAMES
+from tests.boards.vector_racks import JOINTED, NAMES
 from tests.tools.command_line import rack
 
 TOGETHER = "path > joint1 ... joint3 > arm"

@@ -22,6 +22,7 @@ from rack.backplane.message import Message
 from rack.boards.classes import find_class
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner, Ports, Reading, Verdict
+from rack.tools.console.answer import Failure
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,12 @@ class BareTask:
 
 
 def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:
-    """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it."""
+    """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it.
+
+    Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes there is none.
+    """
+    if queues := [spec.name for spec in layout.mailboxes if spec.capacity]:
+        raise Failure(f"{', '.join(queues)}: a queue; only racks without any run without mailboxes")
     posts = {spec.name: Post(spec) for spec in layout.mailboxes}
     tasks = [BareTask(layout, wiring, posts, ticks) for wiring in wirings]
     try:

@@ -11,7 +11,7 @@ JOINTED = f"""{CLOCK}
 slot = 2
 rate_hz = 50
 below = {_LISTED}
-executor = "joint_levels:PathLevel"
+executor = "vector_levels:PathLevel"
 budget = {{ read_ms = 0.1, process_ms = 0.5, write_ms = 0.1 }}
 """ + "".join(
     f"""
@@ -21,7 +21,7 @@ core = {at % 2}
 rate_hz = 400
 above = "path"
 below = "arm"
-executor = "joint_levels:JointLevel"
+executor = "vector_levels:JointLevel"
 params = {{ joint = {at} }}
 budget = {{ read_ms = 0.05, process_ms = 0.2, write_ms = 0.05 }}
 """
@@ -33,6 +33,6 @@ slot = 9
 core = 1
 rate_hz = 400
 above = {_LISTED}
-executor = "joint_levels:ArmLevel"
+executor = "vector_levels:ArmLevel"
 budget = {{ read_ms = 0.1, process_ms = 0.3, write_ms = 0.05 }}
 """
