@@ -16,12 +16,13 @@ from rack.levels.compiled import compiled
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
-from rack.levels.tables import GripperConfig, Positive, Table
+from rack.levels.servo.modification import ModifiableParams
+from rack.levels.tables import GripperConfig, Positive
 
 Reacting = Literal["hold", "stop", "brake"]
 
 
-class ServoParams(Table):
+class ServoParams(ModifiableParams):
     """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
 
     bandwidth: Positive = Field(60.0, le=400.0, description="natural frequency of the error in every joint, rad/s")

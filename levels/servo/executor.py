@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,10 +16,13 @@ from rack.levels.level import Demand, Executor, Fault, Finding, Input, LevelCont
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import actuator_monitor, control, reference, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams
 from rack.levels.servo.curves import Motion
+from rack.levels.servo.modification import misfits_of, names_of
+from rack.levels.servo.modified_law import ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.servo.sensor_monitor import SensorMonitor
@@ -45,6 +48,7 @@ class SteadyStatus(NamedTuple):
     kept: str  # why the arm does not follow its set points
     error: Error  # latched
     fault: str  # of the arm
+    modified: str  # by which control modifications
 
 
 class ServoExecutor(Executor):
@@ -63,7 +67,12 @@ class ServoExecutor(Executor):
     }
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENES}
     faults = STEPS
-    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
+    commands = {
+        Operation.HOLD: (),
+        Operation.RESUME: (),
+        Operation.SETPOINT: (Goal.JOINTS,),
+        Operation.MODIFY: (Goal.ON, Goal.OFF),
+    }
     params = ServoParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -79,7 +88,9 @@ class ServoExecutor(Executor):
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
         self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
-        self.operator = OperatorControl(self.commands, context.robot.joints, cell.limits.position)
+        self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
+        modify = self._modified.obey
+        self.operator = OperatorControl(self.commands, context.robot.joints, cell.limits.position, modify)
         self._brakes = BrakeLog(self.arm, every)
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self._wanted = np.zeros((2, len(cell.home)))  # the motion wanted in the last cycle begins with: rad, rad/s
@@ -90,6 +101,18 @@ class ServoExecutor(Executor):
         self._shown: SteadyStatus | None = None  # in the last status
         self._started = False  # the first cycle has begun
         self._abandoned = False  # set points were abandoned in the last cycle: the arm was braked
+
+    @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return the names of its control modifications."""
+        return names_of(params)
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield control modifications that do not suit the law."""
+        return misfits_of(context)
 
     @classmethod
     def preload(cls) -> None:
@@ -172,6 +195,7 @@ class ServoExecutor(Executor):
         """Brake, and abandon the set points."""
         self.arm.brake()
         self.motors.drop()
+        self._modified.interrupt()
         self._wanted = self.sensors.state
         self._abandoned = True
 
@@ -185,13 +209,21 @@ class ServoExecutor(Executor):
             return self._brake()
         if reaction is Reaction.STOP and (self._abandoned or not wanted.velocity.any()):
             return self._brake()
-        torque = loop.torque(wanted, sensors.state, terms)
+        torque = self._torque(wanted, terms, tick)
         grip_force = 0.0 if self._grip is None else self._grip.force(sensed.opening, sensed.opening_velocity)
         refused = self._link.drive(torque, grip_force)
         if refused is not None:
             return self._refuse(refused, tick)
         self._wanted, self._abandoned, self.stopping.refused = wanted.table, False, None
         return self.motors.begin()
+
+    def _torque(self, wanted: Motion, terms: Terms, tick: int) -> Array:
+        """Return the torques, (joints,), N m, for the wanted motion."""
+        loop, state, modified = self._loop, self.sensors.state, self._modified
+        if not modified.exists:
+            return loop.torque(wanted, state, terms)
+        inertia = np.diagonal(terms.inertia)
+        return modified.torque(lambda w, s: loop.torque(w, s, terms), wanted, state, inertia, terms.bias, tick)
 
     def _next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
         """Return the wanted motion; after braking it begins where the arm is."""
@@ -240,6 +272,7 @@ class ServoExecutor(Executor):
             self.stopping.reason or (self.operator.reason if self.operator.stands else ""),
             self.stopping.error,
             arm.fault,
+            self._modified.reason,
         )
         if shown != self._shown:
             self._shown = SteadyStatus(*shown)
@@ -257,7 +290,8 @@ class ServoExecutor(Executor):
             resting = State.IDLE if shown.holding else State.EXECUTING
             status.state = State.HOLDING if shown.kept and shown.command else resting
             status.error = Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
-            status.reason = shown.kept or (self.arm.first_violation if shown.violations else self.arm.first_touch)
+            broken = self.arm.first_violation if shown.violations else self.arm.first_touch
+            status.reason = shown.kept or broken or shown.modified
 
 
 def numbers(message: Message, first: str, last: str) -> Array:

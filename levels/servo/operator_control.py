@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,11 +21,13 @@ class OperatorControl:
     the arm on its path. A restarted board has lost these places: the level above then continues from where the arm is.
     """
 
-    def __init__(self, commands: Commands, joints: Sequence[str], ranges: Array) -> None:
-        """Permit set points within `ranges` (joints, 2), rad."""
+    def __init__(
+        self, commands: Commands, joints: Sequence[str], ranges: Array, modify: Callable[[Message], str]
+    ) -> None:
+        """Permit set points within `ranges` (joints, 2), rad; `modify` obeys a MODIFY, or returns why not."""
         self.orders = Orders(commands)
         self.stands = False  # the level follows the operator, not the level above
-        self._joints, self._ranges = joints, ranges
+        self._joints, self._ranges, self._modify = joints, ranges, modify
         self._goal: Array | None = None  # (joints,), rad
         self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
 
@@ -48,8 +50,11 @@ class OperatorControl:
         return f"{what} by the operator; `resume` releases it"
 
     def _judge(self, command: Message) -> None:
-        """Take the goal of a set point, or refuse it."""
-        if self.orders.standing is Operation.SETPOINT:
+        """Take the goal of a set point, or refuse it; modify the law."""
+        if command.what == Operation.MODIFY:
+            if why := self._modify(command):
+                self.orders.refuse(why)
+        elif self.orders.standing is Operation.SETPOINT:
             try:
                 self._goal = joints_of(command, self._joints, self._ranges)
             except ValueError as error:
