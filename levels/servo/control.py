@@ -17,16 +17,21 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.modification import ModifiableParams
-from rack.levels.tables import GripperConfig, Positive
+from rack.levels.tables import GripperConfig, Positive, Table
 
 Reacting = Literal["hold", "stop", "brake"]
 
 
-class ServoParams(ModifiableParams):
-    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
+class LoopGains(Table):
+    """Gains of the joint loop."""
 
     bandwidth: Positive = Field(60.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
     damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
+
+
+class ArmParams(Table):
+    """The arm that a board drives, and its reactions to faults of sensors and motors."""
+
     following: Positive = Field(
         0.02, description="distance of a joint from its set point at which a motor counts as failed, rad"
     )
@@ -50,6 +55,10 @@ class ServoParams(ModifiableParams):
     def _is_an_arm(cls, reference: str) -> str:
         find_arm(reference)
         return reference
+
+
+class ServoParams(ArmParams, LoopGains, ModifiableParams):
+    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
 
 
 class ComputedTorque:

@@ -13,6 +13,7 @@ law goes on without it, and the torque goes over to it in the same way.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,16 @@ from rack.levels.servo.modification import Hook, LawContext, LawSample, Modifiab
 
 Law = Callable[[Motion, Array], Array]
 """Returns torques, (joints,), N m, for a wanted motion at a state, (2, joints), rad, rad/s."""
+
+
+class LawInputs(NamedTuple):
+    """What a law is given in one sample. Vectors are (joints,); see `LawSample`."""
+
+    motion: Motion  # wanted
+    state: Array  # (2, joints): rad, rad/s
+    inertia: Array  # kg m2
+    load: Array  # N m
+    tick: int
 
 
 class Modified:
@@ -96,12 +107,9 @@ class ModifiedLaw:
         """Forget the last torque: the arm was braked."""
         self._is_driving = False
 
-    def torque(self, law: Law, motion: Motion, state: Array, inertia: Array, load: Array, tick: int) -> Array:
-        """Return the torques, (joints,), N m, of `law` as modified. Valid until the next call.
-
-        `state`, `inertia` and `load` are as in `LawSample`.
-        """
-        torque = self._modified(law, motion, state, inertia, load, tick) if self._in else law(motion, state)
+    def torque(self, law: Law, given: LawInputs) -> Array:
+        """Return the torques, (joints,), N m, of `law` as modified. Valid until the next call."""
+        torque, tick = self._modified(law, given) if self._in else law(given.motion, given.state), given.tick
         if self._switched:
             self._switched = False
             self._since = tick if self._is_driving else None
@@ -112,10 +120,10 @@ class ModifiedLaw:
         self._is_driving = True
         return self._last
 
-    def _modified(self, law: Law, motion: Motion, state: Array, inertia: Array, load: Array, tick: int) -> Array:
+    def _modified(self, law: Law, given: LawInputs) -> Array:
         sample = self._sample
-        sample.tick, sample.inertia, sample.load = tick, inertia, load
-        sample.seen[:3], sample.seen[3:], sample.torque[:] = motion.table, state, np.nan
+        sample.tick, sample.inertia, sample.load = given.tick, given.inertia, given.load
+        sample.seen[:3], sample.seen[3:], sample.torque[:] = given.motion.table, given.state, np.nan
         seen, torque = self._kept
         for one in self._before:
             self._act(one, sample.seen, seen)
