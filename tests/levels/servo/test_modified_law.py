@@ -18,7 +18,7 @@ from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.servo.common_modifications import DeadZone, JointPd, Notch
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.modification import Hook, LawContext, LawSample, ModifiableParams, Modification
-from rack.levels.servo.modified_law import ModifiedLaw
+from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from tests.levels.arms import cell, config
 
 TICK_NS = 1_000_000
@@ -130,7 +130,7 @@ class Bench:
         for _ in range(samples):
             motion = Motion(np.zeros((3, JOINTS)))
             motion.position[:] = wanted(self.tick)
-            found.append(self.law.torque(self._law, motion, STATE, INERTIA, LOAD, self.tick)[2])
+            found.append(self.law.torque(self._law, LawInputs(motion, STATE, INERTIA, LOAD, self.tick))[2])
             self.tick += 1
         return np.array(found)
 
