@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, StringConstraints
 
 from rack.backplane.clock.system_clock import ticks_of
-from rack.backplane.layout import Protocol, Role, Wake
+from rack.backplane.layout import Protocol, Role, Sampled, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
@@ -49,6 +49,8 @@ Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
+UNREAD, MOST_UNREAD = 32, 4096
+"""Default and greatest depth of a queue, messages."""
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
@@ -126,8 +128,11 @@ class TransferConfig(Table):
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
-    default: Protocol = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
+    default: Sampled = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
     mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
+    depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
+        {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
+    )
 
 
 class SupervisionConfig(Table):
