@@ -131,10 +131,10 @@ class TrajectoryExecutor(Executor):
         agenda, motion, goal = self._agenda, self._motion, self._work.goal
         agenda.report(status)
         status.echo = agenda.taken
-        reason = self._reason_to_wait() if agenda.held else ""
+        reason = self._reason_to_wait() if agenda.held or agenda.missing else ""
         if agenda.error:
             status.state = State.ERROR
-        elif agenda.held:
+        elif agenda.held or reason:
             status.state = State.HOLDING if reason else State.EXECUTING
         else:
             status.state = State.DONE if agenda.done else State.IDLE
@@ -155,6 +155,8 @@ class TrajectoryExecutor(Executor):
             return self._boards.awaited
         if self._orders.standing is not Operation.NONE:
             return self._orders.keeps(self.context.board)
+        if self._agenda.missing:
+            return f"request {self._agenda.taken + 1} is missing: send all again from there, or a cancel"
         return "" if self._sight.knows or self._agenda.current is not None else "waiting for the world model"
 
     def _save(self, state: Message) -> None:

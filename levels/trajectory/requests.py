@@ -19,7 +19,7 @@ MOTIONS = (MotionKind.JOINTS, MotionKind.POSE)
 """Kinds that may be blended into each other."""
 
 
-class Request(NamedTuple):
+class MotionRequest(NamedTuple):
     """A copy of one `MOTION_REQUEST`; see there for units."""
 
     id: int
@@ -36,7 +36,7 @@ class Request(NamedTuple):
     record: np.ndarray  # the whole
 
     @classmethod
-    def of(cls, record: np.ndarray) -> Request:
+    def of(cls, record: np.ndarray) -> MotionRequest:
         """Return a copy of a request's record."""
         r = record.copy()
         goal = pose(r["position"], r["quaternion"])
@@ -72,25 +72,27 @@ class Request(NamedTuple):
 class Agenda:
     """Requests taken and not ended, oldest first, and how the last ones ended.
 
-    After an error all are dropped, and those that come are refused until a CANCEL.
+    After an error all are dropped, and those that come are refused until a CANCEL. While one is missing, those after it
+    are left: the sender sees by `taken` where to begin again, or sends a CANCEL.
     """
 
     def __init__(self) -> None:
-        self.held: list[Request] = []
+        self.held: list[MotionRequest] = []
         self.begun = False  # the first of them is under way
-        self.goal: Request | None = None  # at whose goal the arm is, or to which it goes
+        self.goal: MotionRequest | None = None  # at whose goal the arm is, or to which it goes
         self.taken = 0  # newest id taken
         self.rests_on = 0  # newest command of an operator on which a request taken rests
         self.error, self.reason = Error.NONE, ""
+        self.missing = False  # the request after `taken` was lost, with a board that died as it took it
         self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
 
     @property
-    def current(self) -> Request | None:
+    def current(self) -> MotionRequest | None:
         """The request under way."""
         return self.held[0] if self.begun else None
 
     @property
-    def next(self) -> Request | None:
+    def next(self) -> MotionRequest | None:
         """The request after that, or the first one."""
         at = int(self.begun)
         return self.held[at] if len(self.held) > at else None
@@ -110,13 +112,17 @@ class Agenda:
         cancelled = False
         if requests.is_new:
             for message in (*requests.earlier, requests.value):
-                cancelled |= self._take(Request.of(message.record))
+                cancelled |= self._take(MotionRequest.of(message.record))
         return cancelled
 
-    def _take(self, request: Request) -> bool:
-        # A planning level that was restarted may send a request again.
+    def _take(self, request: MotionRequest) -> bool:
+        # One sent again, by a planning level that was restarted or that misses it in the status, is not a new one.
         if request.id <= self.taken:
             return False
+        if request.kind != MotionKind.CANCEL and self.taken and request.id != self.taken + 1:
+            self.missing = True
+            return False
+        self.missing = False
         self.taken, self.rests_on = request.id, max(self.rests_on, request.operator)
         if request.kind == MotionKind.CANCEL:
             self._flush(RequestEnd.CANCELLED)
@@ -129,7 +135,7 @@ class Agenda:
             self.held.append(request)
         return False
 
-    def begin(self) -> Request:
+    def begin(self) -> MotionRequest:
         """Begin the next request; the one under way is done."""
         if self.begun:
             self.end(RequestEnd.DONE)
@@ -157,7 +163,7 @@ class Agenda:
             self._end(request, how)
         self.held, self.begun = [], False
 
-    def _end(self, request: Request, how: RequestEnd) -> None:
+    def _end(self, request: MotionRequest, how: RequestEnd) -> None:
         self._ended.appendleft((request.id, how))
 
     def report(self, status: Message) -> None:
@@ -179,9 +185,9 @@ class Agenda:
 
     def recall(self, state: Message, status: Message) -> None:
         """Continue from the last messages of a level that was restarted."""
-        self.held = [Request.of(record) for record in records(state)]
+        self.held = [MotionRequest.of(record) for record in records(state)]
         self.begun = bool(state.begun)
-        self.goal = Request.of(state.goal) if state.goal["id"] else None
+        self.goal = MotionRequest.of(state.goal) if state.goal["id"] else None
         self.taken, self.rests_on = status.taken, status.operator
         self.error, self.reason = Error(status.error), status.reason if status.error else ""
         ends = zip(status.ended.tolist(), status.ends.tolist(), strict=True)

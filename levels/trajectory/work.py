@@ -15,7 +15,7 @@ from rack.levels.trajectory.goal import ToolGoal, WorldSight
 from rack.levels.trajectory.legs import JointLeg, Leg, Times, ToolLeg, Unfit
 from rack.levels.trajectory.messages import MotionKind, RequestEnd
 from rack.levels.trajectory.motion import SampledMotion
-from rack.levels.trajectory.requests import Agenda, Request
+from rack.levels.trajectory.requests import Agenda, MotionRequest
 
 
 class TrajectoryParams(Table):
@@ -113,7 +113,7 @@ class RequestWork:
             under_way = current is not None and current.id == goal.id
             self._move(goal, 0.0, goal.segment * self._left if under_way else 0.0)
 
-    def _is_done(self, current: Request) -> bool:
+    def _is_done(self, current: MotionRequest) -> bool:
         if not self.motion.settled:
             return False
         if current.moves or current.kind == MotionKind.CANCEL:
@@ -121,10 +121,10 @@ class RequestWork:
         self.passed_s += self._tools.period_s
         return self.passed_s >= self._lasts_s(current)
 
-    def _lasts_s(self, request: Request) -> float:
+    def _lasts_s(self, request: MotionRequest) -> float:
         return request.segment or (self._tools.params.gripping if request.kind == MotionKind.GRIP else 0.0)
 
-    def _consider(self, request: Request) -> None:
+    def _consider(self, request: MotionRequest) -> None:
         """Begin `request` if its time has come: nothing is under way, or the leg under way is to be blended into it."""
         current, leg = self.agenda.current, self.motion.leg
         if not self._can_begin(request):
@@ -137,7 +137,7 @@ class RequestWork:
             if half_s is not None:
                 self._begin(request, half_s)
 
-    def _blend_s(self, leg: Leg, request: Request) -> float | None:
+    def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
         """Return half the time in which `leg` slows down, if now is the time to blend it into `request`."""
         law, passed_s = leg.law, self.motion.leg_s
         if passed_s > law.ends_s - 2.0 * law.leaving_s:
@@ -146,12 +146,12 @@ class RequestWork:
         half_s = min(wanted_s, law.segment_s - law.half_blend_s)
         law.leave_within(half_s)
         left_s = law.nominal_s - passed_s
-        return left_s if left_s <= half_s else None
+        return left_s if left_s < half_s + self._tools.period_s else None
 
-    def _can_begin(self, request: Request) -> bool:
+    def _can_begin(self, request: MotionRequest) -> bool:
         return not request.moves or request.body < 0 or self._tools.sight.knows
 
-    def _begin(self, request: Request, half_s: float) -> None:
+    def _begin(self, request: MotionRequest, half_s: float) -> None:
         self.agenda.begin()
         self.passed_s, self._left = 0.0, 1.0
         reason = request.misfit(self._tools.limits.position) or self._tools.sight.misfit(request.body)
@@ -163,7 +163,7 @@ class RequestWork:
         elif request.kind == MotionKind.GRIP:
             self.grip = request.opening, request.force
 
-    def _move(self, request: Request, half_s: float, segment_s: float) -> None:
+    def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
         """Begin the leg to the goal of `request`; the motion so far slows down over twice `half_s`."""
         params, limits = self._tools.params, self._tools.limits
         times = Times(segment_s, max(request.acceleration or params.acceleration, half_s))

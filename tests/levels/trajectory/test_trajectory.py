@@ -76,9 +76,10 @@ def test_a_copied_goal_stays_where_the_body_was() -> None:
 
 def test_a_body_that_outruns_the_arm_fails_the_request_and_the_arm_ramps_to_rest() -> None:
     rig = TrackingRig(speed=1.2)
+    rig.at = 3.0
     rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
     rig.request(MotionKind.STAY, segment=9.0)
-    rig.follow(4.0)
+    rig.follow(6.0)
     status = rig.write.status
     assert status.state == State.ERROR
     assert rig.ends()[2] == RequestEnd.FAILED
@@ -163,6 +164,20 @@ def test_a_request_sent_twice_is_done_once() -> None:
     rig.run(4.0)
     assert rig.ends() == {1: RequestEnd.DONE}
     assert rig.write.status.taken == 1
+
+
+def test_a_request_that_was_lost_is_missed_until_it_is_sent_again() -> None:
+    rig = TrajectoryRig()
+    for part in (0.1, 0.2, 0.3):
+        rig.joints([part, 0, 0, 0, 0, 0])
+    lost = rig.queue.pop(1)
+    later = rig.queue[-1]
+    status = rig.run(3.0)
+    assert (status.taken, status.done, status.state) == (1, 1, State.HOLDING)
+    assert status.reason == "request 2 is missing: send all again from there, or a cancel"
+    rig.queue += [lost, later]
+    status = rig.run(4.0)
+    assert (status.taken, status.done, status.state) == (3, 3, State.DONE)
 
 
 def test_more_than_the_level_holds_waits_in_the_queue() -> None:
