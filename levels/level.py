@@ -190,6 +190,11 @@ class Executor(ABC):
         """Load what every process of the level needs, such as compiled code. Called once, before the crate forks."""
 
     @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return what an operator's settings, and alarms of the level by number, name; `params` may be invalid."""
+        return ()
+
+    @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
