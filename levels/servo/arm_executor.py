@@ -34,7 +34,7 @@ class ArmExecutor(ArmDriver):
     """
 
     inputs = {
-        "torques": Input(JOINT_TORQUE, "above.torque", many=True),
+        "torques": Input(JOINT_TORQUE, "above.command", many=True),
         "before": Input(ARM_STATE, "own.state"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
@@ -90,7 +90,7 @@ class ArmExecutor(ArmDriver):
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return where the boards above want the arm; None: not all of them drive it."""
         if self.arm.braked and self._braked_at is None:
-            self._waiting = "cycles were missed: the arm has engaged its brakes by itself"
+            self._waiting = "braked until the boards above have seen it"
             return None
         if reaction is Reaction.STOP and self.abandoned:
             return None

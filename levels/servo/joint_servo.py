@@ -48,7 +48,7 @@ class JointServo(Executor):
         "status": Input(ARM_STATUS, "below.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"torque": JOINT_TORQUE, "status": JOINT_STATUS}
+    outputs = {"command": JOINT_TORQUE, "status": JOINT_STATUS}
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
     params = JointServoParams
 
@@ -116,7 +116,7 @@ class JointServo(Executor):
         tick_s = self.context.tick_s
         age_s = min(tick + every - sampled, self._oldest + every) * tick_s
         self._servo(self.loads.part(tick), every * tick_s, age_s, self._sample, wanted.table, *self._shown_numbers)
-        torque = write.torque
+        torque = write.command
         torque.sampled, torque.id = sampled, torque.id + 1
         if self._grip is not None:
             torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
@@ -126,7 +126,7 @@ class JointServo(Executor):
 
     def _meet(self, is_there: bool, arm: Message, write: Ports) -> bool:
         """Begin with the first status of the arm; return whether there is one."""
-        status, torque = write.status, write.torque
+        status, torque = write.status, write.command
         self._met = is_there
         if not is_there:
             torque.sampled = -1
@@ -151,7 +151,7 @@ class JointServo(Executor):
             self._offered = command
             if self._grip is not None:
                 self._grip.take(command)
-                write.torque.payload_mass, write.torque.payload_offset = command.payload_mass, command.payload_offset
+                write.command.payload_mass, write.command.payload_offset = command.payload_mass, command.payload_offset
 
     def _take_loads(self, arm: Message, tick: int, stopped: bool) -> None:
         """Take over inertia and load of the reference that is followed; compute them while none is."""
