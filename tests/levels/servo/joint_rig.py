@@ -28,12 +28,19 @@ APART = {f"servo_{joint}": {"joints": [joint], "gripper": joint == JOINTS[-1]} f
 class JointRig:
     """Runs the levels tick by tick, and keeps what the arm reports."""
 
-    def __init__(self, servos: Mapping[str, Mapping[str, Any]] = TOGETHER, every: int = 1, **arm: float | str) -> None:
+    def __init__(
+        self,
+        servos: Mapping[str, Mapping[str, Any]] = TOGETHER,
+        every: int = 1,
+        servo: type[JointServo] = JointServo,
+        **arm: float | str,
+    ) -> None:
+        """Start boards `servos`, by name with their parameters, every `every` ticks; `arm` are the arm's parameters."""
         robot, scene = config("puma560")
         names = tuple(servos)
         boards = [
             BoardSpec("arm", 1, ArmExecutor, above=names, params=arm),
-            *(BoardSpec(n, every, JointServo, above="swing", below="arm", params=p) for n, p in servos.items()),
+            *(BoardSpec(n, every, servo, above="swing", below="arm", params=p) for n, p in servos.items()),
             BoardSpec("swing", SWING_TICKS, Swing, below=names),
         ]
         self.rack = Lockstep(boards, robot.model_copy(update={"substeps": 2}), scene, clock_ns=CLOCK_NS)
