@@ -236,7 +236,14 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
 def layout_of(entry: dict[str, Any]) -> Layout:
     """Return a layout from the plain data that `dataclasses.asdict` makes of it."""
     boxes = [
-        MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": tuple(_field(f) for f in m["fields"])})
+        MailboxSpec(
+            **{
+                **m,
+                "readers": tuple(m["readers"]),
+                "fields": tuple(_field(f) for f in m["fields"]),
+                "rests_on": tuple(m.get("rests_on", ())),  # recordings of earlier versions lack it
+            }
+        )
         for m in entry["mailboxes"]
     ]
     tasks, hosts = (tuple(TaskSpec(**t) for t in entry[key]) for key in ("tasks", "hosts"))

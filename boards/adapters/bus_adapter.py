@@ -27,11 +27,11 @@ from rack.boards.adapters.entries import (
     ENTRY,
     NEVER,
     AdapterParams,
+    Crossing,
     EntryConfig,
     EntryCount,
     Inward,
     Outward,
-    Crossing,
     Replayed,
     Rows,
 )
