@@ -96,7 +96,8 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
     config: MakeConfig,
 ) -> None:
     text = others(hung="Silent", failed="Failing", finished="Ending", killed="Silent")
-    settings = ("board.bridge.ends_run=false", "host.program.program=host_programs:Silent", "host.failed.restarts=1")
+    settings = ("board.bridge.ends_run=false", "host.program.program=host_programs:Silent")
+    settings += ("host.failed={ restarts = 1, restarts_within_s = 1e6 }",)
     with Rack(config(*settings, text=text)) as rack:
         rack.start()
         block = rack.segment.block("killed")
