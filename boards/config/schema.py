@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, StringConstraints
 
 from rack.backplane.clock.system_clock import ticks_of
-from rack.backplane.layout import Protocol, Role, Wake
+from rack.backplane.layout import Protocol, Role, Sampled, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
@@ -49,6 +49,8 @@ Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
+UNREAD, MOST_UNREAD = 32, 4096
+"""Default and greatest depth of a queue, messages."""
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
@@ -126,8 +128,11 @@ class TransferConfig(Table):
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
-    default: Protocol = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
+    default: Sampled = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
     mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
+    depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
+        {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
+    )
 
 
 class SupervisionConfig(Table):
@@ -267,6 +272,12 @@ class RackConfig(Table):
         if config.every is not None:
             return config.every
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
+
+    def links(self) -> Iterator[tuple[str, str]]:
+        """Yield board above and board below of every two neighbours, whichever of them names the other."""
+        listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
+        listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
+        yield from (link for link in dict.fromkeys(listed) if {*link} <= self.board.keys() and link[0] != link[1])
 
     def tasks(self) -> Iterator[TaskPlace]:
         """Yield every task in order: each board's executor, then its planner."""
