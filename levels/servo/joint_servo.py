@@ -13,7 +13,7 @@ from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.joint_messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS, JOINT_TORQUE
-from rack.levels.level import Executor, Input, LevelContext, Ports, Verdict
+from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Verdict
 from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
@@ -51,7 +51,7 @@ class JointServo(Executor):
         "status": Input(ARM_STATUS, "below.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"torque": JOINT_TORQUE, "status": JOINT_STATUS}
+    outputs = {"torque": Output(JOINT_TORQUE, rests_on="command"), "status": JOINT_STATUS}
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
