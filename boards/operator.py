@@ -33,6 +33,8 @@ def describe(message: Message) -> str:
         return f"{what} position {_numbers(message.position)} quaternion {_numbers(message.quaternion)}"
     if goal == Goal.DIRECTION:
         return f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
+    if goal == Goal.WORDS:
+        return f"{what} {message.words}"
     return f"{what} home" if goal == Goal.HOME else what
 
 

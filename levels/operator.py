@@ -32,6 +32,8 @@ class Operation(IntEnum):
     RESUME = 2  # return to the level's own work
     SETPOINT = 3  # bring the joints to positions, and stay until RESUME
     GOTO = 4  # move to a goal by the level's own planning, and stay until RESUME
+    TABLE = 5  # decide by another state table from now on
+    DO = 6  # do one of the level's own commands in place of those of the level above, until RESUME
 
 
 class Goal(IntEnum):
@@ -42,6 +44,7 @@ class Goal(IntEnum):
     POSE = 2  # position and orientation of the tool
     DIRECTION = 3  # position of the tool and direction of its z axis, any turn about it
     HOME = 4  # where the arm starts
+    WORDS = 5  # as the level words it: see `Executor.wording`
 
 
 class Answer(IntEnum):
@@ -53,9 +56,12 @@ class Answer(IntEnum):
     REFUSED = 3  # the level continues as before
 
 
+WORDS_BYTES = 64
+"""Longest text of a goal in words."""
+
 OPERATOR_COMMAND = command(
     "operator_command",
-    1,
+    2,
     Field("what", "u1", Operation, "what to do"),
     Field("goal", "u1", Goal, "form of the goal"),
     Field("count", "u1", "1", "joints that follow"),
@@ -63,6 +69,7 @@ OPERATOR_COMMAND = command(
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
     Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
     Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
+    Field("words", f"S{WORDS_BYTES}", "ASCII", "for goal words"),
 )
 
 RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or above, that this rests on; 0: none")
@@ -77,7 +84,12 @@ ANSWER = (
 
 Commands = Mapping[Operation, Sequence[Goal]]
 
-EFFECTS = {Operation.HOLD: "held", Operation.SETPOINT: "kept at a set point", Operation.GOTO: "diverted"}
+EFFECTS = {
+    Operation.HOLD: "held",
+    Operation.SETPOINT: "kept at a set point",
+    Operation.GOTO: "diverted",
+    Operation.DO: "commanded",
+}
 """Effects of a standing command on a level, in words."""
 HELD_FROM_ABOVE = "held by the level above"
 """Reason of a level that is held from above; the level above does not pass it on."""
@@ -113,7 +125,7 @@ class Orders:
 
     def __init__(self, commands: Commands) -> None:
         self._commands = commands
-        self.standing = Operation.NONE  # in force: HOLD, SETPOINT or GOTO; NONE: the level does its own work
+        self.standing = Operation.NONE  # in force: one of `EFFECTS`; NONE: the level does its own work
         self.serial = 0  # of the newest command; 0: none yet
         self.basis = 0  # of the newest command that was not refused; 0: none yet
         self.answer = Answer.NONE
@@ -146,10 +158,10 @@ class Orders:
         if what not in self._commands or goal not in (self._commands[Operation(what)] or (Goal.NONE,)):
             self.refuse(f"{described(what, goal)} is not a command of this level; permitted: {listed(self._commands)}")
             return False
-        resumes = what == Operation.RESUME
         self.basis = self.serial
-        self.standing = Operation.NONE if resumes else Operation(what)
-        self.answer = Answer.DONE if resumes else Answer.TAKEN
+        if what != Operation.TABLE:
+            self.standing = Operation(what) if what in EFFECTS else Operation.NONE
+        self.answer = Answer.TAKEN if what in EFFECTS else Answer.DONE
         return True
 
     def refuse(self, why: str) -> None:

@@ -12,14 +12,19 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
+WORDED = ("table", "do")
+"""Commands whose goal is words."""
 
 Level = Annotated[
     str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own")
 ]
-What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint or goto")]
+What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, table or do")]
 Goals = Annotated[
     list[str] | None,
-    typer.Argument(metavar="GOAL", help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1"),
+    typer.Argument(
+        metavar="GOAL",
+        help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; words for table and do",
+    ),
 ]
 Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
 At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")]
@@ -47,6 +52,9 @@ def command(
     setpoint  the same, at the servo level: a straight line in joint space,
               without checking for collisions
     resume    let the level continue its own work
+    do        do one of the level's own commands, in place of the level above;
+              a level with state tables takes it, --list shows which
+    table     decide by another state table from now on
 
     The command stays in force until `resume`, even if the level's board restarts. An emergency stop takes precedence.
 
@@ -61,6 +69,8 @@ def command(
       rack command nasrem servo setpoint joints=0.2,1.3,-2.9,0,-1.3,0 --wait
       rack command nasrem task goto position=0.45,0.1,0.95
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
+      rack command nist-state-table task table careful
+      rack command nist-state-table elemental_move do pick block1 --wait
     """
     from rack.tools.console.tables import terminal_width
     from rack.tools.runs.desk import LiveDesk
@@ -75,7 +85,7 @@ def command(
     check_timeout(timeout, wait)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising():
-        reply = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
+        reply = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}, wait, timeout)
     print_answer(reply.document(), reply.line, as_json)
     if not reply.worked:
         raise typer.Exit(1)
@@ -83,8 +93,10 @@ def command(
         print(f"in force until: {resume_command(rack, level)}")
 
 
-def goal_of(words: Sequence[str]) -> dict[str, Any]:
-    """Return a goal, typed as `home` or key=numbers, as in a `[[command]]` table. Raises `Failure`."""
+def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return a goal, typed as words, `home` or key=numbers, as in a `[[command]]` table. Raises `Failure`."""
+    if what in WORDED:
+        return {"words": " ".join(words)} if words else {}
     goal: dict[str, Any] = {}
     for word in words:
         key, is_given, values = word.partition("=")

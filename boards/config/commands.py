@@ -19,7 +19,7 @@ from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.levels.algebra import norm
-from rack.levels.errors import RobotError
+from rack.levels.errors import LevelError, RobotError
 from rack.levels.level import Executor
 from rack.levels.operator import Commands, Goal, goal_names, listed
 
@@ -71,6 +71,7 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
     if command.position is not None:
         message.position[:] = command.position
         message.direction[:] = command.direction or DOWN
+    message.words = command.words or ""
     if command.quaternion is not None:
         message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
     return Request(index, bytes(message.raw), _tick(command, layout.clock_ns))
@@ -116,6 +117,8 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
     yield from _goal(at, command, known)
     if command.joints is not None and Goal.JOINTS in known[command.said]:
         yield from _joints(at("joints"), command.joints, config)
+    if command.words is not None and Goal.WORDS in known[command.said]:
+        yield from _words(at("words"), command, config)
     for key in ("quaternion", "direction"):
         if getattr(command, key) is not None and not any(getattr(command, key)):
             yield Mistake(at(key), list(getattr(command, key)), "all zero; its length must not be zero")
@@ -142,6 +145,16 @@ def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> 
 
 def _key(goal: Goal) -> str:
     return {Goal.POSE: "quaternion", Goal.DIRECTION: "position"}.get(goal, goal.name.lower())
+
+
+def _words(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+    board = config.board[command.level]
+    try:
+        permitted = find_class(board.executor, Executor).wording(command.said, board.params, config.scene)
+    except LevelError:
+        return  # reported elsewhere
+    if command.words not in permitted:
+        yield Mistake(place, command.words, f"'{command.level}' knows no such words; permitted: {', '.join(permitted)}")
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:

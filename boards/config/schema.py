@@ -18,7 +18,7 @@ from rack.backplane.layout import Protocol, Role, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
-from rack.levels.operator import Goal, Operation
+from rack.levels.operator import WORDS_BYTES, Goal, Operation
 from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
@@ -189,8 +189,9 @@ class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal["hold", "resume", "setpoint", "goto"] = Field(
-        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there"
+    what: Literal["hold", "resume", "setpoint", "goto", "table", "do"] = Field(
+        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; table: decide "
+        "by another state table; do: do one of the level's own commands"
     )
     tick: int | None = Field(
         None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"
@@ -207,6 +208,9 @@ class CommandConfig(Table):
         None, description="goal: direction of the tool's z axis, rotation about it left free; default: down"
     )
     home: bool = Field(False, description="goal: the arm's start position")
+    words: Annotated[str, StringConstraints(min_length=1, max_length=WORDS_BYTES)] | None = Field(
+        None, description="goal of table and do: name of a table, or the level's command, as in pick block1"
+    )
 
     @property
     def said(self) -> Operation:
@@ -219,7 +223,7 @@ class CommandConfig(Table):
         found = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
             found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
-        return [*found, Goal.HOME] if self.home else found
+        return found + [Goal.HOME] * self.home + [Goal.WORDS] * (self.words is not None)
 
 
 class TaskPlace(NamedTuple):
