@@ -32,8 +32,8 @@ OnLoss = Literal["hold", "stop", "brake"]
 
 
 def _listed(value: Any) -> Any:
-    """Return a single name as a list of one."""
-    return (value,) if isinstance(value, str) else value
+    """Return a single name as a list of one, and TOML's list as a tuple."""
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
 
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
