@@ -85,7 +85,9 @@ def command(
     check_timeout(timeout, wait)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising():
-        reply = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}, wait, timeout)
+        reply = desk.give(
+            {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}, wait, timeout
+        )
     print_answer(reply.document(), reply.line, as_json)
     if not reply.worked:
         raise typer.Exit(1)

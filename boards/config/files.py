@@ -98,8 +98,7 @@ def anchor(tables: Tables, folder: Path) -> Tables:
 def _with_tables(board: Any, folder: Path) -> Any:
     """Return a board with absolute paths of its level's state tables."""
     params = board.get("params") if isinstance(board, dict) else None
-    files = params.get("tables") if isinstance(params, dict) else None
-    if not isinstance(files, dict):
+    if not isinstance(params, dict) or not isinstance(files := params.get("tables"), dict):
         return board
     paths = {name: str(_find(file, folder) or folder / file) for name, file in files.items() if isinstance(file, str)}
     return {**board, "params": {**params, "tables": {**files, **paths}}}

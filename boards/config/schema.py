@@ -190,8 +190,8 @@ class CommandConfig(Table):
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
     what: Literal["hold", "resume", "setpoint", "goto", "table", "do"] = Field(
-        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; table: decide "
-        "by another state table; do: do one of the level's own commands"
+        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; table: "
+        "decide by another state table; do: do one of the level's own commands"
     )
     tick: int | None = Field(
         None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"

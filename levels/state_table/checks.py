@@ -6,11 +6,9 @@ boxes, a set of values per condition each; what a row leaves of a box are at mos
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
 
-from rack.levels.state_table.table import STATES, RowConfig, StateTable, TableError, TableText, read_text
+from rack.levels.state_table.table import SAME, STATES, RowConfig, TableText
 from rack.levels.state_table.vocabulary import Lexicon, Vocabulary, objection
 
 Box = dict[str, frozenset[str]]
@@ -19,14 +17,6 @@ REASONED = ("error", "holding")
 """Values of `status` that need a reason."""
 MAX_HOLES = 3
 """Holes of one state that are reported one by one."""
-
-
-def read_table(path: Path, vocabulary: Vocabulary, lexicon: Callable[[Any], Lexicon]) -> StateTable:
-    """Return the table in a file; `lexicon` is called with its plan. Raises `TableError` with every mistake."""
-    text = read_text(path, vocabulary)
-    if found := flaws(text, vocabulary, None if text.plan is None else lexicon(text.plan)):
-        raise TableError(found)
-    return text.table()
 
 
 def flaws(text: TableText, vocabulary: Vocabulary, lexicon: Lexicon | None) -> list[str]:
@@ -97,17 +87,19 @@ def _states(text: TableText) -> Iterator[str]:
     """Yield next states that do not exist, and states that no row leads to."""
     names = _names(text)
     known = ", ".join(names)
+    if SAME in names:
+        yield f"state: '{SAME}' is no name of a state: `next = \"{SAME}\"` stays in a state"
     if text.start not in names:
         yield f"start: no row has the state '{text.start}'; states: {known}"
     for number, row in text.rows.items():
-        if row.next is not None and row.next not in names:
+        if row.next is not None and row.next not in (*names, SAME):
             yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
     reached, ahead = set[str](), [text.start]
     while ahead:
         state = ahead.pop()
         if state not in reached:
             reached.add(state)
-            ahead += [row.next for row in _rows_of(state, text).values() if row.next is not None]
+            ahead += [row.next for row in _rows_of(state, text).values() if row.next not in (None, SAME)]
     # If the start is unknown, nothing is reached.
     for state in names if text.start in names else ():
         if state not in reached:

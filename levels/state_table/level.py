@@ -27,15 +27,15 @@ from rack.levels.operator import (
     Operation,
     Orders,
 )
-from rack.levels.state_table.checks import read_table
-from rack.levels.state_table.table import ROW_NAME_BYTES, Name, Row, StateTable, TableError
+from rack.levels.state_table.checks import flaws
+from rack.levels.state_table.table import LATE, ROW_NAME_BYTES, SAME, Name, Row, StateTable, TableError, read_text
 from rack.levels.state_table.vocabulary import (
     NAME_BYTES,
     PHRASE_BYTES,
     TAKE,
     Condition,
     Lexicon,
-    Verb,
+    Phrase,
     Vocabulary,
     objection,
     phrases,
@@ -63,6 +63,7 @@ STATUS_HEAD = (
 WORD_COMMAND = command("word_command", 1, *COMMAND_HEAD)
 TABLE_STATUS = status("table_status", 1, *STATUS_HEAD)
 YES_NO = ("no", "yes")
+UNKNOWN = "unknown"
 BELOW = Condition(
     ("waiting", "executing", "done", "error", "lost"),
     "the level below: waiting: it has not answered the newest command; lost: its board is",
@@ -79,16 +80,20 @@ class StateTableParams(Table):
 
 def vocabulary(
     conditions: Mapping[str, Condition],
-    actions: Mapping[str, Verb],
-    commands: Mapping[str, Verb] | None = None,
+    actions: Mapping[str, Phrase],
+    commands: Mapping[str, Phrase] | None = None,
     plan: type[Table] | None = None,
 ) -> Vocabulary:
     """Return the vocabulary of a level: its own words and, if it accepts commands, those that come with them."""
-    found, acts = dict(conditions), dict(actions)
+    late = Condition(YES_NO, "whether the state has lasted longer than the table's patience")
+    found, acts = {**conditions, LATE: late}, dict(actions)
     if commands:
-        found["command"] = Condition(("none", *commands), "the newest command, of an operator or the level above")
+        found["command"] = Condition(
+            ("none", UNKNOWN, *commands),
+            f"the newest command, of an operator or the level above; {UNKNOWN}: the level does not know its words",
+        )
         found["new"] = Condition(YES_NO, f"whether no row has done '{TAKE}' since that command came")
-        acts[TAKE] = Verb((), "let the newest command be the one in force: the status answers it from now on")
+        acts[TAKE] = Phrase((), "let the newest command be the one in force: the status answers it from now on")
     return Vocabulary(found, commands or {}, acts, *([plan] if plan is not None else []))
 
 
@@ -113,9 +118,10 @@ class StateTableExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         params = read_params(StateTableParams, context.params)
-        self.tables = {name: self._read(name, path, context.scene) for name, path in params.tables.items()}
+        self.tables = {name: self.read(path, context.scene) for name, path in params.tables.items()}
+        self.state = ""  # of the table
+        self._since: int | None = None  # tick at which it began; None: in this cycle
         self.use(next(iter(self.tables)))
-        self.state = self.table.start  # of the table
         self.orders = Orders(self.commands)
         self.detail = ""  # why, from below: added to the reason of a row
         self.resting = True  # nothing moves on this level's behalf
@@ -127,16 +133,26 @@ class StateTableExecutor(Executor):
         self._started = False
 
     @classmethod
-    def _read(cls, name: str, path: Path, scene: SceneConfig) -> StateTable:
-        try:
-            return read_table(path, cls.vocabulary, lambda plan: cls.lexicon(scene, plan))
-        except TableError as error:
-            raise TableError(f"table '{name}', {path.name}: {flaw}" for flaw in error.flaws) from error
+    def read(cls, path: Path, scene: SceneConfig) -> StateTable:
+        """Return the table in a file. Raises `TableError` with every mistake in it."""
+        text = read_text(path, cls.vocabulary)
+        lexicon = None if text.plan is None else cls.lexicon(scene, text.plan)
+        found = flaws(text, cls.vocabulary, lexicon)
+        if text.plan is not None:
+            found += cls.plan_flaws(scene, text.plan)
+        if found:
+            raise TableError(found)
+        return text.table()
 
     @classmethod
     def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
         """Return the sets of words that depend on the scene, and on a table's plan, by name."""
         return {"object": scene.objects}
+
+    @classmethod
+    def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
+        """Return what does not suit the scene in a plan, a line each."""
+        return []
 
     @classmethod
     def misfits(
@@ -145,7 +161,7 @@ class StateTableExecutor(Executor):
         """Yield every mistake in every table."""
         for name, path in read_params(StateTableParams, context.params).tables.items():
             try:
-                read_table(path, cls.vocabulary, lambda plan: cls.lexicon(context.scene, plan))
+                cls.read(path, context.scene)
             except TableError as error:
                 for flaw in error.flaws:
                     yield f"params.tables.{name}", path.name, flaw
@@ -156,14 +172,14 @@ class StateTableExecutor(Executor):
         tables = read_params(StateTableParams, params).tables
         if what is Operation.TABLE:
             return tuple(tables)
-        name, path = next(iter(tables.items()))
-        return tuple(phrases(cls.vocabulary.commands, cls.lexicon(scene, cls._read(name, path, scene).plan)))
+        plan = cls.read(next(iter(tables.values())), scene).plan
+        return tuple(phrases(cls.vocabulary.commands, cls.lexicon(scene, plan)))
 
     def use(self, name: str) -> None:
         """Put a table in force. It goes on in the state of the same name; without one, in the state it starts in."""
         self.table_name, self.table = name, self.tables[name]
-        if getattr(self, "state", "") not in self.table.rows:
-            self.state = self.table.start
+        if self.state not in self.table.rows:
+            self.state, self._since = self.table.start, None
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Do one cycle: read, let one row fire, write."""
@@ -172,6 +188,8 @@ class StateTableExecutor(Executor):
             self.recall(read, write)
         self._preprocess(read)
         values = self.look(read, tick)
+        self._since = tick if self._since is None else self._since
+        values[LATE] = YES_NO[(tick - self._since) * self.context.tick_s > self.table.patience_s]
         if self.vocabulary.commands:
             is_new = self._newest[:2] != self._taken and self._newest[1] > 0
             words = self._newest[2] if is_new else self._words
@@ -180,7 +198,8 @@ class StateTableExecutor(Executor):
         if row is not None:
             for verb, *parameters in row.do:
                 getattr(self, f"do_{verb}")(*parameters)
-            self.state = row.next
+            if row.next not in (SAME, self.state):
+                self.state, self._since = row.next, tick
         self.give(write, tick)
         self._report(write, row, values)
 
@@ -212,17 +231,17 @@ class StateTableExecutor(Executor):
             return
         last = read.last_status.value
         write.status.copy_from(last)
-        # Its own table follows from the operator's commands, which come again.
-        self.state = last.in_state
+        # The table in force follows from the operator's commands, which come again.
+        self.state = last.in_state if last.in_state in self.table.rows else self.table.start
         self._words, self._done = last.words, last.done
         self._taken = (True, last.ordered) if last.ordered else (False, last.echo)
 
     def _preprocess(self, read: Ports) -> None:
         self.orders.take(read.operator, self._judge)
-        above: Reading | None = next(iter(read.command.values()), None)
+        above: Reading | None = next(iter(read.command.values()), None) if "command" in self.inputs else None
         ordered = self.orders.standing is Operation.DO
         if not ordered and above is not None and above.value.id != self._done:
-            self._newest = False, above.value.id, above.value.words
+            self._newest = False, above.value.id, self._understood(above.value)
         elif not ordered:
             self._newest = (*self._taken, self._words)
         self._kept = ""
@@ -231,6 +250,14 @@ class StateTableExecutor(Executor):
         elif above is not None and not ordered:
             self._kept = ABOVE_LOST if above.is_lost else HELD_FROM_ABOVE if above.value.hold else ""
         self._rests_on = self.orders.rests_on(above.value.operator if above is not None else 0)
+
+    def _understood(self, command: Message) -> str:
+        """Return the words of a command from above; `UNKNOWN` if the level does not know them."""
+        serial, words = self._newest[1:]
+        if command.id == serial and not self._newest[0]:
+            return words
+        lexicon = self.lexicon(self.context.scene, self.table.plan)
+        return UNKNOWN if objection(command.words, self.vocabulary.commands, lexicon) else command.words
 
     def _judge(self, order: Message) -> None:
         """Take up an operator's command for this kind of level."""
@@ -254,6 +281,8 @@ class StateTableExecutor(Executor):
             state, reason = State.HOLDING, self._kept
         elif reason and self.detail:
             reason = f"{reason}: {self.detail}"
+        if row is not None and row.next == SAME and state is State.ERROR and shown.state == state:
+            reason = shown.reason  # the first one, from below too: the row only stays with it
         is_operators, serial = self._taken
         if state is State.DONE and not is_operators:
             self._done = serial

@@ -18,8 +18,9 @@
 
     [plan]                                  # the static plan, as the level declares it
 
-In every cycle the first row that matches fires, and no other. Rows of a state exclude each other, unless the later one
-says `else`; together they take every case. `rack.levels.state_table.checks` sees to that before the launch.
+`next = "same"` stays in the state. In every cycle the first row that matches fires, and no other. Rows of a state
+exclude each other, unless the later one says `else`; together they take every case. `rack.levels.state_table.checks`
+sees to that before the launch.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from pydantic import BeforeValidator, Field, StringConstraints, ValidationError
 from rack.backplane.message import REASON_BYTES, State
 from rack.levels.errors import LevelError
 from rack.levels.state_table.vocabulary import NAME_BYTES, Vocabulary
-from rack.levels.tables import Table
+from rack.levels.tables import Finite, Positive, Table
 
 MAX_FILE_BYTES = 200_000
 ROW_NAME_BYTES = 48
@@ -45,8 +46,22 @@ STATES = {state.name.lower(): state for state in State}
 Name = Annotated[str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{NAME_BYTES - 1}}}$")]
 RowName = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{ROW_NAME_BYTES}}}$")]
 Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$")]
-Words = Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)]
-States = Annotated[tuple[Name, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)]
+
+
+def _listed(value: Any) -> Any:
+    """Return one word as a list of one, and TOML's lists as tuples, which are frozen."""
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+
+
+Words = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+States = Annotated[tuple[Name, ...], BeforeValidator(_listed)]
+Place = Annotated[tuple[Finite, Finite, Finite], BeforeValidator(_listed)]
+
+
+SAME = "same"
+"""The `next` of a row that stays in its state."""
+LATE = "late"
+"""The condition that every table may use: whether its state has lasted longer than its `patience`."""
 
 
 class RowConfig(Table):
@@ -57,7 +72,7 @@ class RowConfig(Table):
     when: dict[str, Words] = Field({}, description="value, or a list of values, by condition")
     otherwise: bool = Field(False, alias="else", description="takes what the rows of the state above this one leave")
     # Missing ones are reported with what else is wrong with the table.
-    next: Name | None = Field(None, description="next state")
+    next: Name | None = Field(None, description="next state, or same")
     do: Words | None = Field(None, description="actions with their parameters, in order; may be an empty list")
     status: str | None = Field(None, description="state shown upwards: " + ", ".join(STATES))
     reason: Reason | None = Field(None, description="shown with status error or holding")
@@ -67,6 +82,7 @@ class TableConfig(Table):
     """A state table's file."""
 
     start: Name = Field(description="state in which the table begins")
+    patience: Positive = Field(10.0, description="time in one state after which the condition late is yes, s")
     row: tuple[dict[str, Any], ...] = Field(min_length=1, max_length=500, description="its rows")
     plan: dict[str, Any] = Field({}, description="the level's static plan")
 
@@ -94,10 +110,7 @@ class Row:
 
     def matches(self, values: Mapping[str, str]) -> bool:
         """Return whether the row fires on these values of the conditions."""
-        for condition, permitted in self.when.items():
-            if values[condition] not in permitted:
-                return False
-        return True
+        return all(values[condition] in permitted for condition, permitted in self.when.items())
 
 
 @dataclass(frozen=True)
@@ -105,6 +118,7 @@ class StateTable:
     """The rows of a file by state, each state's in their order; `plan` is the level's record of `[plan]`."""
 
     start: str
+    patience_s: float
     rows: Mapping[str, tuple[Row, ...]]
     plan: Any
     checksum: int  # CRC-32 of the file
@@ -125,6 +139,7 @@ class TableText:
     """
 
     start: str
+    patience_s: float
     rows: Mapping[int, RowConfig]
     plan: Any  # the level's record of `[plan]`; None: it has mistakes
     checksum: int  # CRC-32 of the file
@@ -139,14 +154,15 @@ class TableText:
                 name=config.name,
                 when={condition: frozenset(values) for condition, values in config.when.items()},
                 is_else=config.otherwise,
-                next=config.next or self.start,
+                next=config.next or SAME,
                 do=tuple(tuple(phrase.split()) for phrase in config.do or ()),
                 status=STATES.get(config.status or "", State.ERROR),
                 reason=config.reason or "",
             )
             for state in config.state:
                 found.setdefault(state, []).append(row)
-        return StateTable(self.start, {state: tuple(rows) for state, rows in found.items()}, self.plan, self.checksum)
+        rows = {state: tuple(rows) for state, rows in found.items()}
+        return StateTable(self.start, self.patience_s, rows, self.plan, self.checksum)
 
 
 def read_text(path: Path, vocabulary: Vocabulary) -> TableText:
@@ -172,7 +188,7 @@ def read_text(path: Path, vocabulary: Vocabulary) -> TableText:
         plan = vocabulary.plan(**config.plan)
     except (ValidationError, TypeError) as error:
         flaws += _flaws(error, "plan: ", vocabulary.plan)
-    return TableText(config.start, rows, plan, zlib.crc32(data), tuple(flaws))
+    return TableText(config.start, config.patience, rows, plan, zlib.crc32(data), tuple(flaws))
 
 
 def _flaws(error: ValidationError | TypeError, place: str, kind: type[Table]) -> list[str]:

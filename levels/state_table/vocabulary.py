@@ -28,7 +28,7 @@ class Condition(NamedTuple):
     meaning: str
 
 
-class Verb(NamedTuple):
+class Phrase(NamedTuple):
     """A command that a level accepts, or an action: a word, and the words that may follow it."""
 
     parameters: tuple[str | tuple[str, ...], ...]  # one set of words each; a name stands for a set of `Lexicon`
@@ -48,12 +48,12 @@ class Vocabulary:
     """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file of a table."""
 
     conditions: Mapping[str, Condition]
-    commands: Mapping[str, Verb]
-    actions: Mapping[str, Verb]
+    commands: Mapping[str, Phrase]
+    actions: Mapping[str, Phrase]
     plan: type[Table] = NoPlan
 
 
-def phrases(verbs: Mapping[str, Verb], lexicon: Lexicon) -> Iterator[str]:
+def phrases(verbs: Mapping[str, Phrase], lexicon: Lexicon) -> Iterator[str]:
     """Yield every command or action with its parameters: "pick block1"."""
     for word, verb in verbs.items():
         for parameters in product(*(_words(parameter, lexicon) for parameter in verb.parameters)):
@@ -64,11 +64,11 @@ def _words(parameter: str | tuple[str, ...], lexicon: Lexicon) -> Sequence[str]:
     return lexicon[parameter] if isinstance(parameter, str) else parameter
 
 
-def objection(phrase: str, verbs: Mapping[str, Verb], lexicon: Lexicon) -> str:
+def objection(phrase: str, verbs: Mapping[str, Phrase], lexicon: Lexicon) -> str:
     """Return why `phrase` is none of the commands or actions; empty: it is one."""
     if len(phrase) > PHRASE_BYTES:
         return f"'{phrase}' has {len(phrase)} characters; permitted: {PHRASE_BYTES}"
-    word, *given = phrase.split()[: PHRASE_BYTES] or [""]
+    word, *given = phrase.split()[:PHRASE_BYTES] or [""]
     if word not in verbs:
         return f"unknown '{word}'; known: {', '.join(verbs) or 'none'}"
     wanted = verbs[word].parameters
