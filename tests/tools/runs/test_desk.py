@@ -114,7 +114,7 @@ REFUSED = {
         "--timeout needs --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
-    "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
+    "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint', 'goto', 'table' or 'do'"),
     "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
     "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
     "no word": (("upper", "goto", "hom"), "'hom': not a goal; permitted: home, joints=..., position=..."),
@@ -183,7 +183,7 @@ def test_a_clock_without_ticks_is_not_waited_for(
 
 
 def test_goals_are_numbers_with_commas() -> None:
-    assert goal_of(["position=1,-2.5,3e-1", "direction=0,0,-1"]) == {
+    assert goal_of("goto", ["position=1,-2.5,3e-1", "direction=0,0,-1"]) == {
         "position": [1.0, -2.5, 0.3],
         "direction": [0.0, 0.0, -1.0],
     }
