@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Protocol = Literal["time-slice", "double-buffer", "lock"]
-PROTOCOLS: tuple[Protocol, ...] = ("time-slice", "double-buffer", "lock")
+Sampled = Literal["time-slice", "double-buffer", "lock"]
+"""Protocols whose readers sample the newest message."""
+PROTOCOLS: tuple[Sampled, ...] = ("time-slice", "double-buffer", "lock")
+Protocol = Literal[Sampled, "queue"]
 
 Role = Literal["executor", "planner"]
 
@@ -40,7 +42,9 @@ class MailboxSpec:
     """One mailbox: its writer and readers, its message, its protocol.
 
     `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
-    become visible at multiples of `every`. `depth` is the number of slots, a power of two.
+    become visible at multiples of `every`. `depth` is the number of slots, a power of two. `rests_on` names the
+    mailboxes on whose information its messages rest, all read by its writer; queues, in which messages wait, are not
+    among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
     """
 
     name: str
@@ -54,6 +58,13 @@ class MailboxSpec:
     version: int
     size: int
     fields: tuple[FieldSpec, ...]
+    rests_on: tuple[str, ...] = ()
+    capacity: int = 0
+
+    @property
+    def is_by_ticks(self) -> bool:
+        """Whether what its readers get depends on ticks alone."""
+        return self.protocol in ("time-slice", "queue")
 
 
 @dataclass(frozen=True)

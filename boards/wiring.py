@@ -32,7 +32,8 @@ class TaskWiring:
     """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
-    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config.
+    task is one of the fastest and watches the clock. `sent`: the ports whose messages the level sends itself.
+    `fails_self_test`: a fault in the config.
     """
 
     task: str
@@ -42,6 +43,7 @@ class TaskWiring:
     context: LevelContext
     critical_priority: int = 0
     guards_clock: bool = False
+    sent: tuple[str, ...] = ()
     fails_self_test: bool = False
     transfer: BusTimes = field(default_factory=BusTimes)
 

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MAX_JOINTS = 16
 """Most joints of an arm: an operator's mailbox is the same in every rack."""
+NAME_BYTES = 64
+"""Longest name that a command can give."""
 
 
 class Operation(IntEnum):
@@ -32,8 +34,9 @@ class Operation(IntEnum):
     RESUME = 2  # return to the level's own work
     SETPOINT = 3  # bring the joints to positions, and stay until RESUME
     GOTO = 4  # move to a goal by the level's own planning, and stay until RESUME
-    TABLE = 5  # decide by another state table from now on
-    DO = 6  # do one of the level's own commands in place of those of the level above, until RESUME
+    MODIFY = 5  # put the control modification `name` in, or take it out
+    TABLE = 6  # decide by the state table `name` from now on
+    DO = 7  # do the level's own command `name` in place of those of the level above, and stay until RESUME
 
 
 class Goal(IntEnum):
@@ -44,7 +47,14 @@ class Goal(IntEnum):
     POSE = 2  # position and orientation of the tool
     DIRECTION = 3  # position of the tool and direction of its z axis, any turn about it
     HOME = 4  # where the arm starts
-    WORDS = 5  # as the level words it: see `Executor.wording`
+    ON = 5
+    OFF = 6
+
+
+SETTINGS = (Operation.MODIFY, Operation.TABLE)
+"""Operations that are done at once and leave the command in force as it is; each names what it sets."""
+NAMED = (*SETTINGS, Operation.DO)
+"""Operations that give a name: see `Executor.wording`."""
 
 
 class Answer(IntEnum):
@@ -56,9 +66,6 @@ class Answer(IntEnum):
     REFUSED = 3  # the level continues as before
 
 
-WORDS_BYTES = 64
-"""Longest text of a goal in words."""
-
 OPERATOR_COMMAND = command(
     "operator_command",
     2,
@@ -69,7 +76,7 @@ OPERATOR_COMMAND = command(
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
     Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
     Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
-    Field("words", f"S{WORDS_BYTES}", "ASCII", "for goal words"),
+    Field("name", f"S{NAME_BYTES}", "ASCII", "what a setting sets, or the level's own command to do"),
 )
 
 RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or above, that this rests on; 0: none")
@@ -134,16 +141,17 @@ class Orders:
         self._reported: int | None = None  # newest command rested on, in the last report; None: there is news
 
     def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
-        """Read the mailbox; return True in the cycle that accepts a command.
+        """Read the mailbox; return True in the cycle that accepts a command other than a setting.
 
-        `judge` is called with each command accepted: there a level may refuse it for its own reasons.
+        `judge` is called with each command accepted: there a level may refuse it for its own reasons, and makes a
+        setting.
         """
         if not operator.is_new:
             return False
         taken = False
         for message in (*operator.earlier, operator.value):
             if self._take_up(message):
-                taken = True
+                taken = taken or message.what not in SETTINGS
                 if judge is not None:
                     judge(message)
         return taken
@@ -159,9 +167,9 @@ class Orders:
             self.refuse(f"{described(what, goal)} is not a command of this level; permitted: {listed(self._commands)}")
             return False
         self.basis = self.serial
-        if what != Operation.TABLE:
-            self.standing = Operation(what) if what in EFFECTS else Operation.NONE
-        self.answer = Answer.TAKEN if what in EFFECTS else Answer.DONE
+        if what not in SETTINGS:
+            self.standing = Operation.NONE if what == Operation.RESUME else Operation(what)
+        self.answer = Answer.DONE if what in (Operation.RESUME, *SETTINGS) else Answer.TAKEN
         return True
 
     def refuse(self, why: str) -> None:

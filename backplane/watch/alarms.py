@@ -53,6 +53,8 @@ class Alarm(IntEnum):
     BABBLE = 26  # [mailbox; serials per cycle]
     MASQUERADE = 27  # [mailbox; process id that the message names]  not from the writer that holds the claim
     LOCKED = 28  # [mailbox; -]  a dead or stopped process holds the lock
+    # Raised by writers: mailboxes.
+    QUEUE_FULL = 29  # [mailbox; messages refused in the cycle]  its reader does not take messages as fast as they come
     # Raised by tasks: the clock.
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]
@@ -70,6 +72,7 @@ class Alarm(IntEnum):
     RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
+    MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)

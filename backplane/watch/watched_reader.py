@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_reader
+from rack.backplane.mailbox.queue import ALL
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter, Episodes
 from rack.backplane.watch.message_watch import MessageWatch, ReadFindings
 from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
+from rack.backplane.watch.watched_queue import WatchedQueue
 from rack.backplane.words import Block
 
 _LOST = int(Block.LOST)
 
 
-def watched(segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> WatchedReader | SporadicReader:
-    """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have no period."""
-    if segment.layout.mailbox(name).writer == CLOCK:
+def everything() -> int:
+    """Return room for every message."""
+    return ALL
+
+
+def watched(
+    segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask, room: Callable[[], int] = everything
+) -> WatchedReader | SporadicReader | WatchedQueue:
+    """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have no period.
+
+    `room`: how many messages of a queue to take, asked before each read.
+    """
+    spec = segment.layout.mailbox(name)
+    if spec.protocol == "queue":
+        return WatchedQueue(segment, name, alarms, task, room)
+    if spec.writer == CLOCK:
         return SporadicReader(segment, name, alarms, task)
     return WatchedReader(segment, name, alarms, task)
 

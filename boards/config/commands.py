@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from rack.boards.errors import ConfigError, Mistake
 from rack.levels.algebra import norm
 from rack.levels.errors import LevelError, RobotError
 from rack.levels.level import Executor
-from rack.levels.operator import Commands, Goal, goal_names, listed
+from rack.levels.operator import NAMED, Commands, Goal, goal_names, listed
 
 OWN_OPERATOR = "own.operator"
 DOWN = (0.0, 0.0, -1.0)
@@ -38,6 +38,16 @@ def commandable(config: RackConfig) -> dict[str, Commands]:
         if any(port.source == OWN_OPERATOR for port in executor.inputs.values()):
             found[name] = executor.commands
     return found
+
+
+def setting_name(config: RackConfig, board: str, number: int) -> str:
+    """Return the name that a board's level gives to something by `number`: see `Executor.names`."""
+    return _names(board, config)[number]
+
+
+def _names(board: str, config: RackConfig) -> Sequence[str]:
+    table = config.board[board]
+    return find_class(table.executor, Executor).names(table.params)
 
 
 def asked(given: Mapping[str, Any]) -> CommandConfig:
@@ -71,9 +81,9 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
     if command.position is not None:
         message.position[:] = command.position
         message.direction[:] = command.direction or DOWN
-    message.words = command.words or ""
     if command.quaternion is not None:
         message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
+    message.name = command.name or ""
     return Request(index, bytes(message.raw), _tick(command, layout.clock_ns))
 
 
@@ -115,10 +125,9 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         yield Mistake(at("what"), command.what, why)
         return
     yield from _goal(at, command, known)
+    yield from _name(at("name"), command, config)
     if command.joints is not None and Goal.JOINTS in known[command.said]:
         yield from _joints(at("joints"), command.joints, config)
-    if command.words is not None and Goal.WORDS in known[command.said]:
-        yield from _words(at("words"), command, config)
     for key in ("quaternion", "direction"):
         if getattr(command, key) is not None and not any(getattr(command, key)):
             yield Mistake(at(key), list(getattr(command, key)), "all zero; its length must not be zero")
@@ -144,17 +153,23 @@ def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> 
 
 
 def _key(goal: Goal) -> str:
-    return {Goal.POSE: "quaternion", Goal.DIRECTION: "position"}.get(goal, goal.name.lower())
+    keys = {Goal.POSE: "quaternion", Goal.DIRECTION: "position", Goal.OFF: "on"}
+    return keys.get(goal, goal.name.lower())
 
 
-def _words(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+    """Check that an operation that gives a name, and no other, gives one that its level knows."""
+    if command.said not in NAMED:
+        if command.name is not None:
+            yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
+        return
     board = config.board[command.level]
     try:
-        permitted = find_class(board.executor, Executor).wording(command.said, board.params, config.scene)
+        known = find_class(board.executor, Executor).wording(command.said, board.params, config.scene)
     except LevelError:
         return  # reported elsewhere
-    if command.words not in permitted:
-        yield Mistake(place, command.words, f"'{command.level}' knows no such words; permitted: {', '.join(permitted)}")
+    if command.name not in known:
+        yield Mistake(place, command.name, f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}")
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:

@@ -14,11 +14,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, StringConstraints
 
 from rack.backplane.clock.system_clock import ticks_of
-from rack.backplane.layout import Protocol, Role, Wake
+from rack.backplane.layout import Protocol, Role, Sampled, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
-from rack.levels.operator import WORDS_BYTES, Goal, Operation
+from rack.levels.operator import NAME_BYTES, Goal, Operation
 from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
@@ -49,6 +49,8 @@ Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
+UNREAD, MOST_UNREAD = 32, 4096
+"""Default and greatest depth of a queue, messages."""
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
@@ -126,8 +128,11 @@ class TransferConfig(Table):
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
-    default: Protocol = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
+    default: Sampled = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
     mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
+    depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
+        {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
+    )
 
 
 class SupervisionConfig(Table):
@@ -189,9 +194,10 @@ class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal["hold", "resume", "setpoint", "goto", "table", "do"] = Field(
-        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; table: "
-        "decide by another state table; do: do one of the level's own commands"
+    what: Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do"] = Field(
+        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify: put "
+        "a control modification in or take it out; table: decide by another state table; do: do one of the level's own "
+        "commands"
     )
     tick: int | None = Field(
         None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"
@@ -208,9 +214,11 @@ class CommandConfig(Table):
         None, description="goal: direction of the tool's z axis, rotation about it left free; default: down"
     )
     home: bool = Field(False, description="goal: the arm's start position")
-    words: Annotated[str, StringConstraints(min_length=1, max_length=WORDS_BYTES)] | None = Field(
-        None, description="goal of table and do: name of a table, or the level's command, as in pick block1"
+    name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = Field(
+        None,
+        description="control modification to put in or take out; name of a table; command to do, as in pick block1",
     )
+    on: bool | None = Field(None, description="true: put it in; false: take it out")
 
     @property
     def said(self) -> Operation:
@@ -223,7 +231,8 @@ class CommandConfig(Table):
         found = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
             found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
-        return found + [Goal.HOME] * self.home + [Goal.WORDS] * (self.words is not None)
+        found += [Goal.HOME] if self.home else []
+        return found if self.on is None else [*found, Goal.ON if self.on else Goal.OFF]
 
 
 class TaskPlace(NamedTuple):
@@ -267,6 +276,12 @@ class RackConfig(Table):
         if config.every is not None:
             return config.every
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
+
+    def links(self) -> Iterator[tuple[str, str]]:
+        """Yield board above and board below of every two neighbours, whichever of them names the other."""
+        listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
+        listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
+        yield from (link for link in dict.fromkeys(listed) if {*link} <= self.board.keys() and link[0] != link[1])
 
     def tasks(self) -> Iterator[TaskPlace]:
         """Yield every task in order: each board's executor, then its planner."""

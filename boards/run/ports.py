@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
 from rack.backplane.fault_table import Entry, FaultEntry
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.mailbox.queue import ALL, QueueWriter, taken_name
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
+from rack.boards.faults.kind import KINDS
 from rack.boards.faults.messages import FaultyWriter
+from rack.boards.run.queues import QueuePort, Write
 from rack.boards.wiring import Source
 from rack.levels.level import Ports, Reading, Verdict
 
@@ -19,14 +23,29 @@ Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
 """One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
 
 
+def all_of(port: str) -> int:
+    """Return room for every message of a queue."""
+    return ALL
+
+
 class InputPorts:
     """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port.
 
-    `readers` holds the reader of each port that reads one mailbox.
+    `readers` holds the reader of each mailbox.
     """
 
-    def __init__(self, segment: Segment, sources: Mapping[str, Source], alarms: AlarmWriter, plan: str = "") -> None:
-        """Read `sources` by port; `plan` is the mailbox that holds the task's own plan."""
+    def __init__(
+        self,
+        segment: Segment,
+        sources: Mapping[str, Source],
+        alarms: AlarmWriter,
+        plan: str = "",
+        room: Callable[[str], int] = all_of,
+    ) -> None:
+        """Read `sources` by port, from a queue as many messages as there is `room` for on its port.
+
+        `plan` is the mailbox that holds the task's own plan.
+        """
         self.task = ReadingTask()
         self.values = Ports()
         self.readers: dict[str, Reader] = {}
@@ -35,25 +54,27 @@ class InputPorts:
         self._rest: list[Line] = []
         self._readers: list[Reader] = []
         for port, source in sources.items():
-            if isinstance(source, str):
-                self.readers[port] = self._add(segment, self.values.__dict__, port, source, alarms, plan)
-            else:
-                by_board: dict[str, Reading] = {}
+            by_board: dict[str, Reading] = {}
+            boxes = {port: source} if isinstance(source, str) else source
+            values = self.values.__dict__ if isinstance(source, str) else by_board
+            for key, mailbox in boxes.items():
+                found = watched(segment, mailbox, alarms, self.task, partial(room, port))
+                values[key] = Reading(found.reader.message, Verdict.NONE)
+                (self._plan if mailbox == plan else self._rest).append((values, key, found.read))
+                self._readers.append(found.reader)
+                self.readers[mailbox] = found.reader
+            if not isinstance(source, str):
                 setattr(self.values, port, by_board)
-                for board, mailbox in source.items():
-                    self._add(segment, by_board, board, mailbox, alarms, plan)
         self.reads_plan = bool(self._plan)
         self._statistics = [reader.statistics for reader in self._readers]
         self._counted = self._traffic
 
-    def _add(
-        self, segment: Segment, values: dict[str, Reading], key: str, mailbox: str, alarms: AlarmWriter, plan: str
-    ) -> Reader:
-        found = watched(segment, mailbox, alarms, self.task)
-        values[key] = Reading(found.reader.message, Verdict.NONE)
-        (self._plan if mailbox == plan else self._rest).append((values, key, found.read))
+    def follow(self, segment: Segment, queue: QueuePort, alarms: AlarmWriter) -> None:
+        """Read the position of the reader of a queue that the task writes, with the mailboxes of its ports."""
+        found = watched(segment, taken_name(queue.writer.spec.name), alarms, self.task)
+        self._rest.append(({}, "", queue.noting(found.read)))
         self._readers.append(found.reader)
-        return found.reader
+        self._statistics.append(found.reader.statistics)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
@@ -92,19 +113,52 @@ class InputPorts:
         return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
 
+class OldestOf:
+    """The basis of what rests on several mailboxes: the oldest of those that hold a message. As of a `Reader`."""
+
+    def __init__(self, readers: Sequence[Reader]) -> None:
+        self._readers = readers
+
+    @property
+    def serial(self) -> int:
+        """Serial of one of the messages; 0: there is none."""
+        return max([reader.serial for reader in self._readers])
+
+    @property
+    def basis(self) -> int:
+        """Tick of the oldest information that the last good messages rest on."""
+        return min([reader.basis for reader in self._readers if reader.serial])
+
+
 class OutputPorts:
     """The mailboxes that a task writes; `messages` holds the outgoing message of each port.
 
     Each message carries the tick of the oldest information that it rests on. A command inherits the tick of the command
-    that it follows, a status that of the status below. So the system's response time can be measured.
+    that it follows, a status that of the status below: see `Output.rests_on`. So the system's response time can be
+    measured.
     """
 
-    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, inputs: InputPorts) -> None:
+    def __init__(
+        self,
+        segment: Segment,
+        mailboxes: Mapping[str, str],
+        alarms: AlarmWriter,
+        inputs: InputPorts,
+        sent: Collection[str] = (),
+    ) -> None:
+        """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level sends by itself."""
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
         self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
-        self._rests_on = {port: inputs.readers.get(port) for port in mailboxes}
+        self._rests_on = {port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()}
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
+        self._queues = {
+            port: QueuePort(writer, self._episodes[port], port in sent)
+            for port, writer in self.writers.items()
+            if isinstance(writer, QueueWriter)
+        }
+        for queue in self._queues.values():
+            inputs.follow(segment, queue, alarms)
         self._faulty: dict[str, FaultyWriter] = {}
         self._held_up = dict.fromkeys(self.writers, 0)
         self._writers = list(self.writers.values())
@@ -115,7 +169,8 @@ class OutputPorts:
         """Apply these faults, by kind, from now on; messages delayed by earlier ones go out with the next write."""
         for port, writer in self.writers.items():
             index = self._indices[writer.spec.name]
-            chosen = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
+            struck = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
+            chosen = [(kind, e) for kind, e in struck if port not in self._queues or not KINDS[kind].not_queued]
             if chosen or port in self._faulty:
                 self._faulty.setdefault(port, FaultyWriter(writer, index)).apply(chosen)
         self._route()
@@ -123,16 +178,13 @@ class OutputPorts:
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [
-            (
-                port,
-                w,
-                getattr(self._faulty.get(port), "write", w.write),
-                self._rests_on[port],
-                w.spec.delay,
-                w.spec.every,
-            )
+            (port, w, self._write_of(port), self._rests_on[port], w.spec.delay, w.spec.every)
             for port, w in self.writers.items()
         ]
+
+    def _write_of(self, port: str) -> Write:
+        write: Write = getattr(self._faulty.get(port), "write", self.writers[port].write)
+        return partial(self._queues[port].write, write) if port in self._queues else write
 
     @property
     def bus_errors(self) -> int:
@@ -192,3 +244,9 @@ class OutputPorts:
     def _traffic(self) -> tuple[int, int]:
         writers = self.writers.values()
         return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)
+
+
+def _basis(mailboxes: Sequence[str], readers: Mapping[str, Reader]) -> Reader | OldestOf | None:
+    """Return what gives the basis of a message that rests on these mailboxes; None: it rests on nothing read."""
+    found = [readers[name] for name in mailboxes]
+    return OldestOf(found) if len(found) > 1 else next(iter(found), None)

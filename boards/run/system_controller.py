@@ -147,8 +147,8 @@ class EndOfRun:
         self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
         self._silent = wiring.silent
         self._heard: int | None = None
-        # Under time-slice a message becomes visible at a boundary of its writer's period.
-        is_by_ticks = self._reader is not None and self._reader.spec.protocol == "time-slice"
+        # By ticks a message becomes visible at a boundary of its writer's period.
+        is_by_ticks = self._reader is not None and self._reader.spec.is_by_ticks
         self._every = self._reader.spec.every if self._reader is not None and is_by_ticks else 1
         self._next = 0
 
@@ -186,5 +186,5 @@ def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: A
     """Return the clock driver for the run's mode."""
     if not wiring.lockstep:
         return RealtimeDriver(segment, ended, alarms)
-    at_once = any(mailbox.protocol != "time-slice" for mailbox in segment.layout.mailboxes)
+    at_once = not all(mailbox.is_by_ticks for mailbox in segment.layout.mailboxes)
     return LockstepDriver(segment, ended, at_once, wiring.history, alarms)

@@ -23,7 +23,6 @@ from rack.levels.operator import (
     HELD_FROM_ABOVE,
     OPERATOR_COMMAND,
     RESTS_ON,
-    Goal,
     Operation,
     Orders,
 )
@@ -103,8 +102,8 @@ class StateTableExecutor(Executor):
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
-        Operation.TABLE: (Goal.WORDS,),
-        Operation.DO: (Goal.WORDS,),
+        Operation.TABLE: (),
+        Operation.DO: (),
     }
     inputs = {
         "command": Input(WORD_COMMAND, "above.command", many=True, optional=True),
@@ -262,16 +261,16 @@ class StateTableExecutor(Executor):
     def _judge(self, order: Message) -> None:
         """Take up an operator's command for this kind of level."""
         if order.what == Operation.TABLE:
-            if order.words in self.tables:
-                self.use(order.words)
+            if order.name in self.tables:
+                self.use(order.name)
             else:
-                self.orders.refuse(f"no table '{order.words}'; tables: {', '.join(self.tables)}")
+                self.orders.refuse(f"no table '{order.name}'; tables: {', '.join(self.tables)}")
         elif order.what == Operation.DO:
             lexicon = self.lexicon(self.context.scene, self.table.plan)
-            if why := objection(order.words, self.vocabulary.commands, lexicon):
+            if why := objection(order.name, self.vocabulary.commands, lexicon):
                 self.orders.refuse(why)
             else:
-                self._newest = True, order.id, order.words
+                self._newest = True, order.id, order.name
 
     def _report(self, write: Ports, row: Row | None, values: Mapping[str, str]) -> None:
         """Fill the fields of `STATUS_HEAD`, and the operator's in the command."""

@@ -9,7 +9,7 @@ from pydantic import Field as Key
 
 from rack.backplane.message import Field, status
 from rack.levels.level import Input, LevelContext, Ports
-from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.operator import OPERATOR_COMMAND, Operation
 from rack.levels.state_table.elemental_move import MOVE_TABLE_STATUS, MoveTable
 from rack.levels.state_table.level import (
     BELOW,
@@ -61,7 +61,7 @@ class TaskTable(StateTableExecutor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": WORD_COMMAND, "status": TASK_TABLE_STATUS}
-    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.TABLE: (Goal.WORDS,)}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.TABLE: ()}
     vocabulary = vocabulary(
         conditions={
             "below": BELOW,
