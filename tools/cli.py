@@ -33,6 +33,7 @@ COMMANDS = (
     ("stop", "rack.tools.stop:stop", "End a run and wait until it is gone."),
     ("clean", "rack.tools.clean:clean", "Remove the shared memory that killed racks left behind."),
     ("command", "rack.tools.command:command", "Command one level of a running rack."),
+    ("step", "rack.tools.step:step", "Let a rack in lockstep go on by single cycles."),
     (
         "prompt",
         "rack.tools.prompt:prompt",

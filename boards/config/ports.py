@@ -140,10 +140,11 @@ def _sources(
         boards = neighbours.get(start, (start,))
         found = wired.get(port, tuple(f"{board}.{rest}" for board in boards))
         at, given = (f"{key}.{port}", list(found)) if port in wired else (start, list(boards))
-        if not found:
-            mistakes.append(
-                Mistake(f"{table_of(place)}.{start}", None, f"missing; port '{port}' of the {role} needs it")
-            )
+        if not found and entry.many and entry.optional:
+            yield port, {}
+        elif not found:
+            why = f"missing; port '{port}' of the {role} needs it"
+            mistakes.append(Mistake(f"{table_of(place)}.{start}", None, why))
         elif not entry.many and len(found) > 1:
             why = f"port '{port}' of the {role} reads one mailbox, not {len(found)}"
             mistakes.append(Mistake(f"{table_of(place)}.{at}", given, why))
