@@ -128,7 +128,7 @@ def display_for(silent: bool) -> Iterator[Display]:
 
 @dataclass(frozen=True)
 class RackView:
-    """A snapshot, for rich to draw: head line, tasks, their complaints, active faults, holds, progress."""
+    """A snapshot, for rich to draw: head line, tasks, their complaints, queues, active faults, holds, progress."""
 
     snapshot: Snapshot
 
@@ -139,6 +139,7 @@ class RackView:
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
         yield grid(list(COLUMNS), cells, width, DROPPED, _style)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
+        yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             why, *release = hold.parts

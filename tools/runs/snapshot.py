@@ -16,6 +16,7 @@ from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
+from rack.tools.runs.queues import QueueFill, Queues
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
@@ -66,7 +67,7 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work.
+    the arm, that are kept from their work; `queues` are all of them, empty ones too.
     """
 
     rack: str
@@ -80,6 +81,7 @@ class Snapshot:
     tasks: tuple[TaskRow, ...]
     progress: TaskProgress | None
     holds: tuple[Hold, ...] = ()
+    queues: tuple[QueueFill, ...] = ()
 
 
 class RackMonitor:
@@ -90,6 +92,7 @@ class RackMonitor:
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
         self._holds = Holds(segment)
+        self._queues = Queues(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
@@ -118,6 +121,7 @@ class RackMonitor:
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
             holds=self._holds.look(),
+            queues=self._queues.look(),
         )
 
     def _active_faults(self) -> Iterator[str]:
