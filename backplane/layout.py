@@ -42,8 +42,9 @@ class MailboxSpec:
     """One mailbox: its writer and readers, its message, its protocol.
 
     `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
-    become visible at multiples of `every`. `depth` is the number of slots, a power of two. `capacity`: of a queue, the
-    largest number of unread messages; 0: it is no queue.
+    become visible at multiples of `every`. `depth` is the number of slots, a power of two. `rests_on` names the
+    mailboxes on whose information its messages rest, all read by its writer; queues, in which messages wait, are not
+    among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
     """
 
     name: str
@@ -57,6 +58,7 @@ class MailboxSpec:
     version: int
     size: int
     fields: tuple[FieldSpec, ...]
+    rests_on: tuple[str, ...] = ()
     capacity: int = 0
 
     @property

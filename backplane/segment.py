@@ -25,7 +25,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 7
+VERSION = 8
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -236,7 +236,14 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
 def layout_of(entry: dict[str, Any]) -> Layout:
     """Return a layout from the plain data that `dataclasses.asdict` makes of it."""
     boxes = [
-        MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": tuple(_field(f) for f in m["fields"])})
+        MailboxSpec(
+            **{
+                **m,
+                "readers": tuple(m["readers"]),
+                "fields": tuple(_field(f) for f in m["fields"]),
+                "rests_on": tuple(m.get("rests_on", ())),  # recordings of earlier versions lack it
+            }
+        )
         for m in entry["mailboxes"]
     ]
     tasks = tuple(TaskSpec(**t) for t in entry["tasks"])

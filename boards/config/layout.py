@@ -182,7 +182,8 @@ class Wiring:
             readers = [by_name[reader] for reader in self.readers(name)]
             slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
             depth = depth_for(max(slowest + delay, self._kept_ticks), every)
-            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth)
+            rests_on = tuple(box for box in ports.rests_on(name.partition(".")[2]) if self.protocol(box) != "queue")
+            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, rests_on=rests_on)
             box = self._mailbox(name, output.type, sizes, spec)
             mailboxes += self._queue(box, readers[0], writer) if box.protocol == "queue" else [box]
         # The clock passes an operator's commands on.

@@ -38,8 +38,8 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
     within_ms = None if board.budget is None else board.budget.plan_within_ms
     return BoardTiming(
         name=name,
-        above=board.above,
-        below=board.below,
+        above=tuple(upper for upper, lower in config.links() if lower == name),
+        below=tuple(lower for upper, lower in config.links() if upper == name),
         coupling=board.coupling,
         every=layout.task(name).every,
         within_cycles=board.within_cycles,

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from rack.backplane.layout import Layout
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.mailbox.queue import is_position
 from rack.levels.timing.equations import response_ticks, system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import RackTiming
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Response of the hierarchy `levels`, highest first, in ms of simulated time; all 0 without a hierarchy.
+    """Response of the hierarchy, in ms of simulated time; all 0 without one. `levels` are its boards by level, as text.
 
     `command_ms` and `status_ms` are the bounds down and up, with the waits for the grid. `plan_ms` is, by level, the
     time from a planner's release until its plan can be used.
@@ -28,11 +29,11 @@ class Prediction:
 
 def predict(rack: RackTiming) -> Prediction:
     """Return the system's response as it follows from the cycles alone."""
-    levels, tick_ms = rack.hierarchy, rack.clock_ns * 1e-6
-    cycles = [rack.boards[name].every for name in levels]
+    hierarchy, tick_ms = rack.hierarchy, rack.clock_ns * 1e-6
+    cycles = hierarchy.cycles
     planned = [board for board in rack.boards.values() if board.has_planner]
     return Prediction(
-        levels=levels,
+        levels=hierarchy.levels,
         bound_eq_3_2_ms=system_response_bound_ns(cycles or [0]) * tick_ms,
         sum_eq_3_3_ms=system_response_ns((), cycles) * tick_ms,
         command_ms=response_ticks(cycles) * tick_ms,
@@ -86,23 +87,43 @@ class CommandPath:
         return self.delay + self.cycles[0] - 1 + response_ticks(self.cycles)
 
 
+def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
+    """Return the mailboxes that take information from board to board, each resting on the one before.
+
+    Where the way is broken, they are those of its end: of the longest part that arrives at the last board. A queue
+    breaks it: how long its messages wait there is for their writer to decide.
+    """
+    if len(boards) < 2:
+        return ()
+    sampled = [box for box in layout.mailboxes if box.protocol != "queue" and not is_position(box)]
+    return _along(layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers})
+
+
+def _along(layout: Layout, boards: Sequence[str], taken: Collection[str]) -> tuple[MailboxSpec, ...]:
+    """Return the longest row of mailboxes, one a board, that ends with one of those `taken`."""
+    if not boards:
+        return ()
+    last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]
+    return max(((*_along(layout, boards[:-1], box.rests_on), box) for box in last), key=len, default=())
+
+
 def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
-    """Return the path from every level of the hierarchy that an operator can command, by level."""
-    levels, boxes = rack.hierarchy, {box.name: box for box in layout.mailboxes}
-    found = {}
-    for at, level in enumerate(levels):
-        passed = levels[at:]
-        names = [f"{level}.operator", *(f"{name}.command" for name in passed[:-1])]
-        if all(name in boxes for name in names):
-            cycles = tuple(rack.boards[name].every for name in passed)
-            is_exact = all(boxes[name].protocol == "time-slice" for name in names)
-            found[level] = CommandPath(passed, cycles, boxes[names[0]].delay, is_exact)
+    """Return the longest path from every level that an operator can command to the lowest, by level."""
+    boxes = {box.name: box for box in layout.mailboxes}
+    found: dict[str, CommandPath] = {}
+    for chain in rack.chains:
+        passed = mailboxes_along(layout, chain)
+        for at, level in enumerate(chain):
+            operator, rest = boxes.get(f"{level}.operator"), chain[at:]
+            if operator is None or len(passed) < len(rest) - 1:
+                continue
+            cycles = tuple(rack.boards[name].every for name in rest)
+            taken = (operator, *passed[len(passed) - len(rest) + 1 :])
+            is_exact = all(box.protocol == "time-slice" for box in taken)
+            path = CommandPath(rest, cycles, operator.delay, is_exact)
+            if level not in found or path.longest > found[level].longest:
+                found[level] = path
     return found
-
-
-def lowest_level(paths: Mapping[str, CommandPath]) -> str:
-    """Return the level at the end of every path, which acts on all commands."""
-    return next(iter(paths.values())).levels[-1]
 
 
 def _up(tick: int, every: int) -> int:

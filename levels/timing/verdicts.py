@@ -14,7 +14,7 @@ from typing import Any
 
 from rack.levels.timing import equations
 from rack.levels.timing.equations import Relation, response_ticks
-from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.rack import LevelTiming, ParallelChains, RackTiming
 from rack.levels.timing.response_time import response_times
 
 SYSTEM = "system"
@@ -85,16 +85,22 @@ def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVer
 
 
 def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the system's response; with a goal for it, also on every cycle of its chains."""
+    """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on every cycle in them."""
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
     cycles_ns = {name: board.every * rack.tick_ns for name, board in rack.boards.items()}
-    for names in rack.chains:
-        subject = SYSTEM if len(rack.chains) == 1 else f"{SYSTEM}, {names[-1]}"
-        yield from _of_chain(subject, [cycles_ns[name] for name in names], rack.tick_ns, goal_ns)
+    for found in rack.parallel:
+        yield from _of_chain(
+            response_subject(rack, found), [cycle * rack.tick_ns for cycle in found.cycles], rack.tick_ns, goal_ns
+        )
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
             relation = Relation(cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns))
             yield EquationVerdict.of("3.1", name, relation, "R_i <= R_max = R_s / n")
+
+
+def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
+    """Return the subject of the system's response along these chains; where there are others, it names them."""
+    return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
 
 
 def _of_chain(subject: str, cycles_ns: Sequence[int], tick_ns: int, goal_ns: float | None) -> Iterator[EquationVerdict]:

@@ -241,6 +241,13 @@ class Operator:
         self._rack.write(f"{level}.operator", message)
         return self.serial
 
+    def modify(self, level: str, name: str, is_on: bool) -> int:
+        """Put a control modification in now, or take it out; return the serial."""
+        message = self._message(level, Operation.MODIFY, Goal.ON if is_on else Goal.OFF)
+        message.name = name
+        self._rack.write(f"{level}.operator", message)
+        return self.serial
+
     def _message(self, level: str, what: Operation, goal: Goal) -> Message:
         self.serial += 1
         message = self._rack.message(f"{level}.operator")

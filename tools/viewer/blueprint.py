@@ -104,7 +104,7 @@ def _log() -> rrb.Container:
 
 
 def _graph(layout: Layout, config: RackConfig) -> rrb.View:
-    places = positions(layout, rack_timing(config, layout).hierarchy).values()
+    places = positions(layout, rack_timing(config, layout)).values()
     columns, rows = zip(*places, strict=True)
     bounds = rrb.VisualBounds2D(
         x_range=(min(columns) - 0.6 * COLUMN, max(columns) + 0.6 * COLUMN), y_range=(min(rows) - ROW, max(rows) + ROW)

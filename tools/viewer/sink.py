@@ -80,7 +80,7 @@ class ViewSink:
         for mailbox, age in self._ages.items():
             of_mailbox[mailbox].append(age.write)
         self._parts = self._of_task | of_mailbox
-        self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout).hierarchy)
+        self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
         self._events = Events(stream, folder / "events.jsonl", self._hierarchy)
         self._losses = Losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
