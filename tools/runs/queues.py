@@ -46,7 +46,7 @@ class Queues:
             # The position first: what is taken meanwhile was in the queue.
             taken = int(position.peek().value.taken)
             words, spec = queue.slots.box, queue.spec
-            found.append(QueueFill(spec.name, words[Box.HEAD] - taken, spec.capacity, words[Box.REFUSED]))
+            found.append(QueueFill(spec.name, words[Box.SENT] - taken, spec.capacity, words[Box.REFUSED]))
         return tuple(found)
 
 

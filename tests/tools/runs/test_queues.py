@@ -39,7 +39,7 @@ def test_a_running_rack_shows_its_queues(tmp_path: Path, rack_name: str) -> None
         assert empty.line == "queue upper.requests: 0 of 7 unread"
         rack.run(1.0)
         (full,) = queues.look()
-    assert full.line == f"queue upper.requests: 5 of 7 unread, 19 refused"
+    assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
 
 
 def test_check_shows_the_depth_of_a_queue(tmp_path: Path) -> None:
