@@ -159,6 +159,18 @@ def test_a_plan_may_be_a_queue(config: MakeConfig) -> None:
     assert len(digests) == 1
 
 
+def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> None:
+    planner = ("board.lower.executor=queue_levels:Filed", "board.lower.planner=queue_levels:Filing")
+    slow = ("board.lower.coupling=tight", "board.lower.rate_hz=50", "board.lower.within_cycles=30")
+    digests = set()
+    for _ in range(2):
+        with Rack(config("board.upper.params.until=360", *planner, *slow, text=QUEUES)) as rack:
+            digests.add(rack.run(3.0).digest)
+            found = counts(rack, "lower")
+            assert (found["taken"], found["newest"], found["repeated"], found["missing"]) == (27, 27, 0, 0)
+    assert len(digests) == 1
+
+
 def test_a_mailbox_is_a_queue_if_the_config_says_so(config: MakeConfig) -> None:
     with Rack(config("protocol.mailbox={ 'wave.status' = 'queue' }", text=PLAIN)) as rack:
         rack.run(0.5)
