@@ -36,7 +36,7 @@ class Queues:
     """Looks at the queues of a rack, from the host side."""
 
     def __init__(self, segment: Segment) -> None:
-        boxes = [box for box in segment.layout.mailboxes if box.protocol == "queue"]
+        boxes = [box for box in segment.layout.timed if box.protocol == "queue"]
         self._ends = [(open_observer(segment, b.name), open_observer(segment, taken_name(b.name))) for b in boxes]
 
     def look(self) -> tuple[QueueFill, ...]:
@@ -57,7 +57,7 @@ def queues(recording: Recording) -> list[dict[str, Any]]:
     """
     refused = recording.ended.get("refused", {})
     found = []
-    for box in recording.layout.mailboxes:
+    for box in recording.layout.timed:
         if box.protocol == "queue":
             position = taken_name(box.name)
             taken, unread = (recording.signal(position, field) for field in ("taken", "unread"))
