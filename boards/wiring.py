@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from rack.backplane.layout import ExchangeSpec
 from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
@@ -32,7 +33,8 @@ class TaskWiring:
     """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
-    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config.
+    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config. `exchange`: the ports
+    that are not simply read in every cycle; it makes the task write its mailbox `<board>.exchange`.
     """
 
     task: str
@@ -44,6 +46,7 @@ class TaskWiring:
     guards_clock: bool = False
     fails_self_test: bool = False
     transfer: BusTimes = field(default_factory=BusTimes)
+    exchange: Mapping[str, ExchangeSpec] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -84,12 +84,12 @@ class Output(NamedTuple):
 
     type: MessageType
     cycles: int = 1
-    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, so that readers released then
-    find it fresh. If that cycle is missed, the message is missing too."""
+    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, counted from the board's phase,
+    so that readers released then find it fresh. If that cycle is missed, the message is missing too."""
 
-    def is_due(self, tick: int, every: int) -> bool:
-        """Return whether the cycle released at `tick`, one of those every `every` ticks, writes it."""
-        return (tick + every) % (self.cycles * every) == 0
+    def is_due(self, tick: int, every: int, phase: int) -> bool:
+        """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`, writes it."""
+        return (tick - phase + every) % (self.cycles * every) == 0
 
 
 class Ports(SimpleNamespace):
@@ -138,6 +138,7 @@ class LevelContext:
     above: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level above, by name
     below: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level below, by name
     params: Mapping[str, Any] = field(default_factory=dict)  # `[board.<name>.params]`, as given
+    phase: int = 0  # first tick of the level, less than `every`
 
     @property
     def period_s(self) -> float:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Sequence
 
 from rack.backplane.byte_lock import ByteLock
-from rack.backplane.layout import Protocol
+from rack.backplane.layout import BY_TICKS, Protocol
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, DoubleBufferWriter, Reader, Reading, Writer
 from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
@@ -133,9 +133,10 @@ def open_writer(segment: Segment, name: str) -> Writer:
     return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
 
 
-def open_reader(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading under its protocol."""
-    return READERS[segment.layout.mailbox(name).protocol](segment, name)
+def open_reader(segment: Segment, name: str, asynchronous: bool = False) -> Reader:
+    """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is whole."""
+    protocol = segment.layout.mailbox(name).protocol
+    return READERS["double-buffer" if asynchronous and protocol in BY_TICKS else protocol](segment, name)
 
 
 def open_observer(segment: Segment, name: str) -> Reader:

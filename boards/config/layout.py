@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -12,9 +12,10 @@ from pydantic import ValidationError
 
 from rack.backplane.address_map import CLOCK, AddressMap
 from rack.backplane.errors import MailboxError
-from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
+from rack.backplane.layout import ExchangeSpec, FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
+from rack.boards.config.exchange import exchanges, strict_mistakes
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports
 from rack.boards.config.schema import RackConfig, TaskPlace
@@ -57,7 +58,7 @@ class Wiring:
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
         self.config = config
-        self.mistakes: list[Mistake] = []
+        self.mistakes: list[Mistake] = [*strict_mistakes(config)]
         self.tasks = all_ports(config, self.mistakes)
         found = {ports.task for ports in self.tasks}
         # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
@@ -168,7 +169,7 @@ class Wiring:
             readers = [by_name[reader] for reader in self._readers(name)]
             slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
             depth = depth_for(max(slowest + delay, self._kept_ticks), every)
-            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth)
+            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, phase=writer.phase)
             mailboxes.append(self._mailbox(name, output.type, sizes, spec))
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
@@ -188,6 +189,7 @@ class Wiring:
             within_cycles=self.config.board[place.board].within_cycles if place.role == "planner" else 1,
             depth=depth_for(self._kept_ticks, every),
             wake=self._wake(place),
+            phase=self.config.board[place.board].phase,
         )
 
     def _wake(self, place: TaskPlace) -> Wake:
@@ -206,6 +208,7 @@ class Wiring:
         return spec(
             name=name,
             readers=self._readers(name),
+            exchanges=tuple(self._exchanges(name)),
             protocol=self._protocol(name),
             message=kind.name,
             version=kind.version,
@@ -215,6 +218,11 @@ class Wiring:
 
     def _readers(self, mailbox: str) -> tuple[str, ...]:
         return tuple(ports.task for ports in self.tasks if any(mailbox == box for _, box in ports.sources))
+
+    def _exchanges(self, mailbox: str) -> Iterator[ExchangeSpec]:
+        for ports in self.tasks:
+            found = exchanges(self.config, ports.place.board) if ports.place.role == "executor" else {}
+            yield from (found[port] for port, box in ports.sources if box == mailbox and port in found)
 
     def _protocol(self, mailbox: str) -> Protocol:
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from rack.backplane.layout import Role
 from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
+from rack.boards.config.exchange import exchange_mistakes
 from rack.boards.config.schema import RackConfig, TaskPlace
 from rack.boards.errors import Mistake
+from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.level import Executor, Input, Output, Planner
 
@@ -63,12 +65,19 @@ def _wired(config: RackConfig, place: TaskPlace, mistakes: list[Mistake]) -> Tas
     except LookupError as error:
         mistakes.append(Mistake(f"board.{place.board}.{place.role}", wanted, str(error.args[0])))
         return None
+    reads = dict(_sources(config, place, kind.inputs, mistakes))
+    if place.role == "executor" and config.board[place.board].exchange:
+        mistakes += exchange_mistakes(config, place.board, kind.inputs)
+        if EXCHANGE in outputs:
+            why = "the executor writes a mailbox of that name itself; rename its output"
+            mistakes.append(Mistake(f"board.{place.board}.exchange", None, why))
+        outputs = {**outputs, EXCHANGE: Output(exchange_message(reads))}
     return TaskPorts(
         place=place,
         kind=kind,
         inputs=kind.inputs,
         outputs=outputs,
-        reads=dict(_sources(config, place, kind.inputs, mistakes)),
+        reads=reads,
         writes={port: f"{place.board}.{port}" for port in outputs},
     )
 

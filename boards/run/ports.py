@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import watched
+from rack.backplane.watch.watched_reader import GridReader, SporadicReader, WatchedReader, watched
+from rack.boards.exchange import Taken
 from rack.boards.faults.messages import FaultyWriter
 from rack.boards.wiring import Source
 from rack.levels.level import Ports, Reading, Verdict
@@ -22,37 +25,53 @@ Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
 class InputPorts:
     """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port.
 
-    `readers` holds the reader of each port that reads one mailbox.
+    `readers` holds the reader of each port that reads one mailbox, `taken` every mailbox in the order of the ports.
     """
 
-    def __init__(self, segment: Segment, sources: Mapping[str, Source], alarms: AlarmWriter, plan: str = "") -> None:
-        """Read `sources` by port; `plan` is the mailbox that holds the task's own plan."""
+    def __init__(
+        self,
+        segment: Segment,
+        sources: Mapping[str, Source],
+        alarms: AlarmWriter,
+        plan: str = "",
+        exchange: Mapping[str, ExchangeSpec] | None = None,
+    ) -> None:
+        """Read `sources` by port; `plan` is the mailbox that holds the task's own plan.
+
+        `exchange` holds the ports that are not simply read in every cycle.
+        """
         self.task = ReadingTask()
+        self.taken: list[Taken] = []
+        self._open = partial(watched, segment, alarms=alarms, task=self.task)
         self.values = Ports()
         self.readers: dict[str, Reader] = {}
         # Where each reading goes: the ports themselves, or the dict of a port that reads many mailboxes.
         self._plan: list[Line] = []
         self._rest: list[Line] = []
-        self._readers: list[Reader] = []
         for port, source in sources.items():
+            how = (exchange or {}).get(port)
             if isinstance(source, str):
-                self.readers[port] = self._add(segment, self.values.__dict__, port, source, alarms, plan)
+                self.readers[port] = self._add(self.values.__dict__, port, source, source == plan, how)
             else:
                 by_board: dict[str, Reading] = {}
                 setattr(self.values, port, by_board)
                 for board, mailbox in source.items():
-                    self._add(segment, by_board, board, mailbox, alarms, plan)
+                    self._add(by_board, board, mailbox, mailbox == plan, how)
         self.reads_plan = bool(self._plan)
+        self._readers = [entry.reader for entry in self.taken]
         self._statistics = [reader.statistics for reader in self._readers]
         self._counted = self._traffic
 
     def _add(
-        self, segment: Segment, values: dict[str, Reading], key: str, mailbox: str, alarms: AlarmWriter, plan: str
+        self, values: dict[str, Reading], key: str, mailbox: str, is_plan: bool, how: ExchangeSpec | None
     ) -> Reader:
-        found = watched(segment, mailbox, alarms, self.task)
+        found: WatchedReader | SporadicReader | GridReader
+        found = self._open(mailbox, asynchronous=how is not None and how.asynchronous)
+        if how is not None:
+            found = GridReader(found, how.grid)
         values[key] = Reading(found.reader.message, Verdict.NONE)
-        (self._plan if mailbox == plan else self._rest).append((values, key, found.read))
-        self._readers.append(found.reader)
+        (self._plan if is_plan else self._rest).append((values, key, found.read))
+        self.taken.append(Taken(values, key, found.reader))
         return found.reader
 
     def read(self, tick: int) -> None:
@@ -128,7 +147,7 @@ class OutputPorts:
                 w,
                 getattr(self._faulty.get(port), "write", w.write),
                 self._rests_on[port],
-                w.spec.delay,
+                w.spec.delay - w.spec.phase,
                 w.spec.every,
             )
             for port, w in self.writers.items()
@@ -145,9 +164,9 @@ class OutputPorts:
         `now`: the clock's tick, if the cycle's end may have passed.
         """
         in_time = True
-        for port, writer, write, source, delay, every in self._lines:
-            # A message that is not written in every cycle becomes visible at multiples of its period.
-            if (tick + delay) % every:
+        for port, writer, write, source, ahead, every in self._lines:
+            # A message that is not written in every cycle becomes visible at multiples of its period, from its phase.
+            if (tick + ahead) % every:
                 if port in self._faulty:
                     self._faulty[port].flush(tick, now)
                 continue

@@ -41,7 +41,7 @@ class Task(ABC):
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
         self.next_cycle = NextCycle(segment, wiring.task, self.alarms if wiring.guards_clock else None)
-        self.inputs = InputPorts(segment, wiring.inputs, self.alarms, f"{spec.board}.plan")
+        self.inputs = InputPorts(segment, wiring.inputs, self.alarms, f"{spec.board}.plan", wiring.exchange)
         self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs)
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
         self.faults = TaskFaults(segment, spec, self.outputs, level)

@@ -126,7 +126,7 @@ class ServoExecutor(Executor):
         self.operator.orders.report(write.status, self._rests_on)
         self.arm.save(write.state)
         self.stopping.remember(write.state)
-        if SCENES.is_due(tick, self.context.every):
+        if SCENES.is_due(tick, self.context.every, self.context.phase):
             self.arm.look(write.scene)
 
     def _take_messages(self, read: Ports) -> None:

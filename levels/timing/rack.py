@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Literal
 
-from rack.levels.timing.equations import communication_ns, residual_ns, response_ticks
+from rack.backplane.layout import TickGrid
+from rack.levels.timing.equations import communication_ns, grid_wait, residual_ns, response_ticks
 from rack.levels.timing.response_time import load_of
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
@@ -16,10 +18,11 @@ Coupling = Literal["tight", "loose", "none"]
 
 @dataclass(frozen=True)
 class BoardTiming:
-    """One board. `every` is its cycle in ticks; cores are those that the config asks for.
+    """One board. `every` is its cycle, `phase` its first release, in ticks; cores are those that the config asks for.
 
     `is_critical` is true if the plan update is the paper's critical section: it keeps the executor waiting. `budget` is
-    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock.
+    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock. `reads` holds
+    the ticks at which it reads a mailbox, by mailbox, if not in every cycle.
     """
 
     name: str
@@ -36,6 +39,17 @@ class BoardTiming:
     is_critical: bool
     budget: Budget | None
     plan_within_ns: int | None = None
+    phase: int = 0
+    reads: Mapping[str, TickGrid] = field(default_factory=dict)
+
+    @property
+    def releases(self) -> TickGrid:
+        """The ticks at which its cycles begin."""
+        return TickGrid(self.every, self.phase)
+
+    def reads_at(self, mailbox: str) -> TickGrid:
+        """Return the ticks at which its executor reads a mailbox."""
+        return self.reads.get(mailbox, self.releases)
 
     @property
     def is_plan_budgeted(self) -> bool:
@@ -146,9 +160,13 @@ class RackTiming:
     @property
     def hierarchy(self) -> tuple[str, ...]:
         """The chain with the longest response, from the highest board to the lowest; empty without one."""
-        return max(
-            self.chains, key=lambda chain: response_ticks([self.boards[name].every for name in chain]), default=()
-        )
+        return max(self.chains, key=lambda chain: self.response_ticks(chain, "command"), default=())
+
+    def response_ticks(self, boards: Sequence[str], port: str) -> int:
+        """Return the longest response along boards that pass on what they read, by their mailboxes `port`, ticks."""
+        passed = [self.boards[name] for name in boards]
+        waits = [grid_wait(one.releases, other.reads_at(f"{one.name}.{port}")) for one, other in pairwise(passed)]
+        return response_ticks([board.every for board in passed], waits)
 
     @cached_property
     def longest_cycles(self) -> dict[str, float]:
@@ -210,6 +228,7 @@ class RackTiming:
             core=board.core,
             priority=board.priority,
             every_ns=board.every * self.tick_ns,
+            phase_ns=board.phase * self.tick_ns,
             parts=_nonzero(
                 Part(Unit.EXCHANGE, budget.exchange_ns if board.has_planner else 0),
                 Part(Unit.READ, budget.read_ns),

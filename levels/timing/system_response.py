@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rack.backplane.layout import Layout
-from rack.levels.timing.equations import response_ticks, system_response_bound_ns, system_response_ns
+from rack.backplane.layout import Layout, TickGrid
+from rack.levels.timing.equations import grid_wait, response_ticks, system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import RackTiming
 
 
@@ -35,35 +35,43 @@ def predict(rack: RackTiming) -> Prediction:
         levels=levels,
         bound_eq_3_2_ms=system_response_bound_ns(cycles or [0]) * tick_ms,
         sum_eq_3_3_ms=system_response_ns((), cycles) * tick_ms,
-        command_ms=response_ticks(cycles) * tick_ms,
-        status_ms=response_ticks(cycles[::-1]) * tick_ms,
+        command_ms=rack.response_ticks(levels, "command") * tick_ms,
+        status_ms=rack.response_ticks(levels[::-1], "status") * tick_ms,
         plan_ms={board.name: board.every * board.within_cycles * tick_ms for board in planned},
     )
 
 
 @dataclass(frozen=True)
 class CommandPath:
-    """The levels that an operator's command passes, from the commanded one to the lowest; `cycles` in ticks.
+    """The levels that an operator's command passes, from the commanded one to the lowest.
 
-    `delay` is the ticks until a given command can be read. `is_exact` is true if every message on the path is of
-    protocol time-slice: with all deadlines met, the releases below are then exact, otherwise bounds.
+    `releases` are the ticks at which each level begins its cycles, `reads` those at which it reads the command of the
+    one above it, the first the operator's. `delay` is the ticks until a given command can be read. `is_exact` is true
+    if every message on the path is visible by ticks: with all deadlines met, the releases below are then exact,
+    otherwise bounds.
     """
 
     levels: tuple[str, ...]
-    cycles: tuple[int, ...]
+    releases: tuple[TickGrid, ...]
+    reads: tuple[TickGrid, ...]
     delay: int
     is_exact: bool
 
+    @property
+    def cycles(self) -> tuple[int, ...]:
+        """The cycle of each level, ticks."""
+        return tuple(releases.every for releases in self.releases)
+
     def samples_at(self, visible_at: int) -> int:
         """Return the release of the first level that reads a command visible from that tick on."""
-        return _up(visible_at, self.cycles[0])
+        return self.reads[0].since(visible_at)
 
     def acts_at(self, visible_at: int) -> int:
         """Return the release of the lowest level's cycle that rests on the command."""
         release = self.samples_at(visible_at)
-        for earlier, later in zip(self.cycles, self.cycles[1:], strict=False):
+        for cycle, read in zip(self.cycles, self.reads[1:], strict=False):
             # Output is visible at the end of its cycle; the next level reads it at its next release (eq. 3.7).
-            release = _up(release + earlier, later)
+            release = read.since(release + cycle)
         return release
 
     def response(self, given: int, acts: int) -> int:
@@ -83,7 +91,8 @@ class CommandPath:
     @property
     def longest(self) -> int:
         """The longest response on the grid: given just too late for a release, waiting for every level's next one."""
-        return self.delay + self.cycles[0] - 1 + response_ticks(self.cycles)
+        waits = [grid_wait(written, read) for written, read in zip(self.releases, self.reads[1:], strict=False)]
+        return self.delay + self.reads[0].every - 1 + response_ticks(self.cycles, waits)
 
 
 def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
@@ -94,16 +103,14 @@ def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
         passed = levels[at:]
         names = [f"{level}.operator", *(f"{name}.command" for name in passed[:-1])]
         if all(name in boxes for name in names):
-            cycles = tuple(rack.boards[name].every for name in passed)
-            is_exact = all(boxes[name].protocol == "time-slice" for name in names)
-            found[level] = CommandPath(passed, cycles, boxes[names[0]].delay, is_exact)
+            boards = [rack.boards[name] for name in passed]
+            reads = tuple(board.reads_at(box) for board, box in zip(boards, names, strict=True))
+            is_exact = all(boxes[name].is_by_ticks for name in names)
+            releases = tuple(board.releases for board in boards)
+            found[level] = CommandPath(passed, releases, reads, boxes[names[0]].delay, is_exact)
     return found
 
 
 def lowest_level(paths: Mapping[str, CommandPath]) -> str:
     """Return the level at the end of every path, which acts on all commands."""
     return next(iter(paths.values())).levels[-1]
-
-
-def _up(tick: int, every: int) -> int:
-    return -(-tick // every) * every

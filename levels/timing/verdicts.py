@@ -13,7 +13,7 @@ from math import inf, isfinite
 from typing import Any
 
 from rack.levels.timing import equations
-from rack.levels.timing.equations import Relation, response_ticks
+from rack.levels.timing.equations import Relation
 from rack.levels.timing.rack import LevelTiming, RackTiming
 from rack.levels.timing.response_time import response_times
 
@@ -90,22 +90,22 @@ def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
     cycles_ns = {name: board.every * rack.tick_ns for name, board in rack.boards.items()}
     for names in rack.chains:
         subject = SYSTEM if len(rack.chains) == 1 else f"{SYSTEM}, {names[-1]}"
-        yield from _of_chain(subject, [cycles_ns[name] for name in names], rack.tick_ns, goal_ns)
+        yield from _of_chain(subject, rack, names, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
             relation = Relation(cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns))
             yield EquationVerdict.of("3.1", name, relation, "R_i <= R_max = R_s / n")
 
 
-def _of_chain(subject: str, cycles_ns: Sequence[int], tick_ns: int, goal_ns: float | None) -> Iterator[EquationVerdict]:
+def _of_chain(subject: str, rack: RackTiming, names: Sequence[str], goal_ns: float | None) -> Iterator[EquationVerdict]:
+    cycles_ns = [rack.boards[name].every * rack.tick_ns for name in names]
     bound, limit = goal_ns, "timing.response_ms"
     if bound is None:
         bound, limit = equations.system_response_bound_ns(cycles_ns), "n R_max"
     total = equations.system_response_ns((), cycles_ns)
     yield EquationVerdict.of("3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}")
     for way, order in (("command", 1), ("status", -1)):
-        ticks = response_ticks([cycle // tick_ns for cycle in cycles_ns[::order]])
-        relation = Relation(ticks * tick_ns, "<=", bound)
+        relation = Relation(rack.response_ticks(names[::order], way) * rack.tick_ns, "<=", bound)
         yield EquationVerdict.of("3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {limit}")
 
 

@@ -48,12 +48,14 @@ def _way(recording: Recording, levels: Sequence[str], port: str, bound_ms: float
     layout = recording.layout
     first, last = (layout.task(levels[at]).every for at in (0, -1))
     mailbox, tick_ms = f"{levels[-2]}.{port}", layout.clock_ns * 1e-6
+    read = layout.read_grid(layout.mailbox(mailbox), levels[-1])
     basis, visible_at = recording.signal(mailbox, "basis"), recording.signal(mailbox, "visible_at")
     # Until the first level's messages arrive, those of the later levels rest on their own ticks.
-    real = np.flatnonzero(basis >= first)
+    real = np.flatnonzero(basis >= first + max(layout.task(name).phase for name in levels))
     arrived, at = np.unique(basis[real], return_index=True)
     at = real[at]
-    acts = -(-visible_at[at[1:]] // last) * last + last
+    visible = visible_at[at[1:]]
+    acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
     seen = np.ones(len(ms), bool)
     if recording.lost.get(mailbox):
