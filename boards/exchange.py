@@ -7,6 +7,7 @@ cycle, so that ages and arrivals are on record like any other message.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
@@ -36,6 +37,22 @@ def _fields(label: str) -> tuple[Field, Field]:
     age = "from the release of the message in use to that of this cycle; negative: released later; 0 before the first"
     taken = f"release of the cycle that took it; {NEVER} before the first"
     return Field(f"{label}_{AGE}", "i8", "tick", age), Field(f"{label}_{TAKEN}", "i8", "tick", taken)
+
+
+@dataclass(frozen=True)
+class PortAge:
+    """Age and arrival of the message in use, as in the exchange message: both in ticks."""
+
+    age: int
+    taken: int
+
+
+def ages_of(exchange: Message) -> dict[str, PortAge]:
+    """Return the inputs of an exchange message that have a message in use, by label."""
+    names, values = exchange.record.dtype.names or (), iter(exchange.raw.cast("q"))
+    labels = [name.removesuffix(f"_{AGE}") for name in names[::2]]
+    found = {label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)}
+    return {label: port for label, port in found.items() if port.taken != NEVER}
 
 
 class Taken(NamedTuple):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
@@ -14,6 +14,7 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
+from rack.boards.exchange import EXCHANGE, PortAge, ages_of
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
 
@@ -66,7 +67,7 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work.
+    the arm, that are kept from their work; `exchanges` the messages in use of boards with an exchange, by port.
     """
 
     rack: str
@@ -80,6 +81,7 @@ class Snapshot:
     tasks: tuple[TaskRow, ...]
     progress: TaskProgress | None
     holds: tuple[Hold, ...] = ()
+    exchanges: Mapping[str, Mapping[str, PortAge]] = field(default_factory=dict)
 
 
 class RackMonitor:
@@ -98,6 +100,9 @@ class RackMonitor:
             task.name: open_observer(segment, f"{task.name}.status")
             for task in segment.layout.tasks
             if f"{task.name}.status" in written
+        }
+        self._exchanges = {
+            box.writer: open_observer(segment, box.name) for box in segment.layout.mailboxes if box.message == EXCHANGE
         }
         whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
         self._whole = open_observer(segment, whole) if whole else None
@@ -118,6 +123,11 @@ class RackMonitor:
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
             holds=self._holds.look(),
+            exchanges={
+                board: ages_of(reading.value)
+                for board, reader in self._exchanges.items()
+                if (reading := reader.peek()).is_there
+            },
         )
 
     def _active_faults(self) -> Iterator[str]:
