@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 from rack.backplane.mailbox.mailbox import Verdict
 from rack.boards import Rack
+from rack.boards.config import resolve
+from rack.boards.errors import ConfigError
 from rack.boards.exchange import PortAge
 from rack.boards.faults.config import FaultConfig
 from rack.tools.runs.snapshot import RackMonitor
@@ -135,3 +138,10 @@ def test_a_lost_writer_shows_between_two_exchanges(config: MakeConfig) -> None:
     assert len(lost) > 2 * SPARSE[0]
     assert lost.all()
     assert not rows["message"]["lost"][rows["tick"] > 41 + 40 + 3 * NOTES[0] * SPARSE[0]].any()
+
+
+def test_a_level_that_writes_a_mailbox_of_that_name_cannot_have_an_exchange(config: MakeConfig) -> None:
+    with pytest.raises(
+        ConfigError, match=r"^board.notes.exchange: the executor writes a mailbox of that name itself; "
+    ):
+        resolve(config("board.notes.executor='exchange_levels:Exchanging'", text=TEXT))
