@@ -9,10 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-Protocol = Literal["time-slice", "double-buffer", "lock"]
-PROTOCOLS: tuple[Protocol, ...] = ("time-slice", "double-buffer", "lock")
+Sampled = Literal["time-slice", "double-buffer", "lock"]
+"""Protocols whose readers sample the newest message."""
+PROTOCOLS: tuple[Sampled, ...] = ("time-slice", "double-buffer", "lock")
+Protocol = Literal[Sampled, "queue"]
 
-BY_TICKS: tuple[Protocol, ...] = ("time-slice",)
+BY_TICKS: tuple[Protocol, ...] = ("time-slice", "queue")
 """Protocols under which messages become visible at ticks fixed in advance."""
 
 Role = Literal["executor", "planner"]
@@ -77,7 +79,8 @@ class MailboxSpec:
 
     `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
     become visible at multiples of `every`, counted from tick `phase`. `depth` is the number of slots, a power of two.
-    `exchanges` are the readers that do not simply read it in every cycle.
+    `capacity`: of a queue, the largest number of unread messages; 0: it is no queue. `exchanges` are the readers that
+    do not simply read it in every cycle.
     """
 
     name: str
@@ -91,13 +94,19 @@ class MailboxSpec:
     version: int
     size: int
     fields: tuple[FieldSpec, ...]
+    capacity: int = 0
     phase: int = 0
     exchanges: tuple[ExchangeSpec, ...] = ()
 
     @property
     def is_by_ticks(self) -> bool:
-        """Whether what every reader gets follows from ticks alone."""
-        return self.protocol in BY_TICKS and not any(exchange.asynchronous for exchange in self.exchanges)
+        """Whether its messages become visible by ticks alone."""
+        return self.protocol in BY_TICKS
+
+    @property
+    def is_repeatable(self) -> bool:
+        """Whether what each of its readers gets depends on ticks alone."""
+        return self.is_by_ticks and not any(exchange.asynchronous for exchange in self.exchanges)
 
 
 @dataclass(frozen=True)

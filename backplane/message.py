@@ -17,6 +17,7 @@ import numpy as np
 from rack.backplane.errors import MailboxError
 
 REASON_BYTES = 120
+NO_QUEUE = "only messages of a queue are sent: declare the port as Output(..., queued=True)"
 
 
 class State(IntEnum):
@@ -128,6 +129,17 @@ class Message:
     def copy_from(self, other: Message) -> None:
         """Copy the bytes of a message of the same type."""
         self.raw[:] = other.raw
+
+    def send(self) -> bool:
+        """Put a copy into the queue to which an output port leads; return False if the queue is full.
+
+        Messages of other mailboxes are written by the board: there it raises `MailboxError`.
+        """
+        raise MailboxError(NO_QUEUE)
+
+    def room(self) -> int:
+        """Return how many messages the queue still takes in this cycle; raises as `send` does."""
+        raise MailboxError(NO_QUEUE)
 
     if TYPE_CHECKING:
         # Field names come from the layout: a type checker cannot know them.

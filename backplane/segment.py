@@ -25,7 +25,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 6
+VERSION = 7
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -138,7 +138,10 @@ class Segment:
             )
         if self.words[Head.SIZE] != len(self.bytes):
             raise SegmentError(f"rack '{self.rack}': {len(self.bytes)} bytes; its head says {self.words[Head.SIZE]}")
-        self.layout = layout_of(json.loads(self._text(Head.LAYOUT_AT)))
+        try:
+            self.layout = layout_of(json.loads(self._text(Head.LAYOUT_AT)))
+        except (TypeError, KeyError, ValueError) as error:
+            raise SegmentError(f"rack '{self.rack}': layout unreadable, from another program: {error}") from None
         self.config = self._text(Head.CONFIG_AT)
         self.map = AddressMap(self.layout)
 

@@ -114,6 +114,7 @@ class Box(IntEnum):
     CLAIM = 3  # no value: the writer holds the kernel's lock on this address
     OWNER = 4  # the same for the critical section of protocol lock; value: its owner's process id, 0: none
     CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
+    REFUSED = 6  # of a queue: messages refused because it was full
 
 
 class Slot(IntEnum):

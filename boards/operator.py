@@ -25,7 +25,7 @@ def message_of(entry: RequestEntry, layout: Layout) -> Message:
 
 
 def describe(message: Message) -> str:
-    """Return a command as one line: its verb and its goal."""
+    """Return a command as one line: its verb, what it names, and its goal."""
     what, goal = Operation(message.what).name.lower(), message.goal
     if goal == Goal.JOINTS:
         return f"{what} joints {_numbers(message.joints[: message.count])}"
@@ -33,7 +33,8 @@ def describe(message: Message) -> str:
         return f"{what} position {_numbers(message.position)} quaternion {_numbers(message.quaternion)}"
     if goal == Goal.DIRECTION:
         return f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
-    return f"{what} home" if goal == Goal.HOME else what
+    name = f" {message.name}" if message.name else ""
+    return what + name + (f" {Goal(goal).name.lower()}" if goal else "")
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -33,8 +33,9 @@ class TaskWiring:
     """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
-    task is one of the fastest and watches the clock. `fails_self_test`: a fault in the config. `exchange`: the ports
-    that are not simply read in every cycle; it makes the task write its mailbox `<board>.exchange`.
+    task is one of the fastest and watches the clock. `sent`: the ports whose messages the level sends itself.
+    `fails_self_test`: a fault in the config. `exchange`: the ports that are not simply read in every cycle; it makes
+    the task write its mailbox `<board>.exchange`.
     """
 
     task: str
@@ -44,6 +45,7 @@ class TaskWiring:
     context: LevelContext
     critical_priority: int = 0
     guards_clock: bool = False
+    sent: tuple[str, ...] = ()
     fails_self_test: bool = False
     transfer: BusTimes = field(default_factory=BusTimes)
     exchange: Mapping[str, ExchangeSpec] = field(default_factory=dict)

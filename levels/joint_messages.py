@@ -22,6 +22,8 @@ JOINT_REFERENCE = command(
     Field("load", "f8", "N m", "torques of gravity and motion there, without acceleration", ("joints",)),
     Field("opening", "f8", "m", "gripper joint position to go to"),
     Field("force", "f8", "N", "largest gripper force"),
+    Field("payload_mass", "f8", "kg", "mass in the gripper, which `inertia` and `load` include"),
+    Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
 )
 """From the trajectory level to all boards that servo joints; these interpolate between its set points."""
 
@@ -29,12 +31,15 @@ JOINT_TORQUE = command(
     "joint_torque",
     1,
     RESTS_ON,
+    Field("sampled", "i8", "tick", "tick of the arm's status that it rests on; -1: none yet, so no torque"),
     Field("torque", "f8", "N m", "of the board's own joints; others 0", ("joints",)),
-    Field("target", "f8", "rad", "where the board wants its own joints in this cycle", ("joints",)),
+    Field("target", "f8", "rad", "where the board wants its own joints when the torque acts; others 0", ("joints",)),
     Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
-    Field("grip_force", "f8", "N", "of the gripper, from the board that drives it"),
+    Field("grip_force", "f8", "N", "of the gripper, from the board that drives it; others 0"),
+    Field("payload_mass", "f8", "kg", "mass in the gripper, from the board that drives it; others 0"),
+    Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
 )
-"""From a board that servoes joints to the board of the arm; id rises with every cycle."""
+"""From a board that servoes joints to the board of the arm, which adds them up; id rises with every cycle."""
 
 JOINT_STATUS = status(
     "joint_status",
@@ -55,6 +60,7 @@ ARM_STATUS = status(
     "arm_status",
     1,
     *ANSWER,
+    Field("tick", "i8", "tick", "tick at which the arm was sensed"),
     Field("position", "f8", "rad", "joint positions, measured; estimated for suspect sensors", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
     Field("torque", "f8", "N m", "torque given to the arm in this cycle, after the limit gate", ("joints",)),

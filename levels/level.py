@@ -20,6 +20,11 @@ Messages
 - A status (`status`), written to the port "status", echoes the command's `id` and shows `state` in every cycle: the
   board with `ends_run` ends the run by DONE or ERROR; HOLDING (kept from its work) and ERROR need a `reason` of one
   line, which users see as the cause of a stall. A status whose `error` is not 0 at the end fails the run.
+- Messages of which none may be missed, such as requests for motions, go through a queue: declare
+  `Output(REQUEST, queued=True)`, fill `write.port` and call `write.port.send()` for each, several in a cycle if need
+  be. False: the queue is full; try again in a later cycle. Its one reader gets each once and in order, the older
+  unread ones in `Reading.earlier`, at most `room(port)` in a cycle. What a board has taken in the cycle in which it
+  dies is lost with it: the sender notices by the ids that the reader's status echoes.
 - Symbolic sizes of fields ("joints", "bodies", "state") follow from `[robot]` and `[scene]`, see `context.sizes`.
   Reader and writer of a mailbox must name the same message type and version.
 
@@ -57,6 +62,7 @@ from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.mailbox.queue import ALL
 from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
@@ -80,12 +86,15 @@ class Input(NamedTuple):
 
 
 class Output(NamedTuple):
-    """A port that a level does not write in every cycle."""
+    """A port that a level does not write once in every cycle."""
 
     type: MessageType
     cycles: int = 1
     """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, counted from the board's phase,
     so that readers released then find it fresh. If that cycle is missed, the message is missing too."""
+    queued: bool = False
+    """The level sends its messages itself, any number in a cycle: it fills `write.port` and calls `write.port.send()`.
+    False: the queue is full, and the message was not taken; `write.port.room()` says how many more it takes."""
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
         """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`, writes it."""
@@ -182,6 +191,11 @@ class Executor(ABC):
         """Load what every process of the level needs, such as compiled code. Called once, before the crate forks."""
 
     @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return what an operator's settings, and alarms of the level by number, name; `params` may be invalid."""
+        return ()
+
+    @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
@@ -201,6 +215,10 @@ class Executor(ABC):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
 
+    def room(self, port: str) -> int:
+        """Return how many messages to take from the queue that `port` reads, asked before each read. Default: all."""
+        return ALL
+
     def close(self) -> None:
         """Release what the level holds; called once, after the last cycle."""
 
@@ -209,11 +227,11 @@ class Planner(ABC):
     """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
 
     It runs in a separate process and shares nothing with the executor but mailboxes. Its one
-    output is its mailbox `<board>.plan`.
+    output is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {}
-    output: ClassVar[MessageType]
+    output: ClassVar[MessageType | Output]
     params: ClassVar[type[Table] | None] = None
     """As the executor's: both share one table."""
     program: ClassVar[type[Program] | None] = None
@@ -228,6 +246,10 @@ class Planner(ABC):
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
+
+    def room(self, port: str) -> int:
+        """Return how many messages to take from the queue that `port` reads, asked before each read. Default: all."""
+        return ALL
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is new."""

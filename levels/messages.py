@@ -282,7 +282,7 @@ ARM_STATE = MessageType(
             "kept",
             "i8",
             "tick",
-            "ticks for which faults have kept the arm from its set points: see ServoParams.patience",
+            "ticks for which faults have kept the arm from its set points: see ArmParams.patience",
         ),
         Field("error", "u2", Error, "latched fault; 0: none"),
         Field("reason", "S120", "ASCII", "that fault, readable"),

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MAX_JOINTS = 16
 """Most joints of an arm: an operator's mailbox is the same in every rack."""
+NAME_BYTES = 32
+"""Longest name that a command can give."""
 
 
 class Operation(IntEnum):
@@ -32,6 +34,7 @@ class Operation(IntEnum):
     RESUME = 2  # return to the level's own work
     SETPOINT = 3  # bring the joints to positions, and stay until RESUME
     GOTO = 4  # move to a goal by the level's own planning, and stay until RESUME
+    MODIFY = 5  # put the control modification `name` in, or take it out
 
 
 class Goal(IntEnum):
@@ -42,6 +45,12 @@ class Goal(IntEnum):
     POSE = 2  # position and orientation of the tool
     DIRECTION = 3  # position of the tool and direction of its z axis, any turn about it
     HOME = 4  # where the arm starts
+    ON = 5
+    OFF = 6
+
+
+SETTINGS = (Operation.MODIFY,)
+"""Operations that are done at once and leave the command in force as it is; each names what it sets."""
 
 
 class Answer(IntEnum):
@@ -55,7 +64,7 @@ class Answer(IntEnum):
 
 OPERATOR_COMMAND = command(
     "operator_command",
-    1,
+    2,
     Field("what", "u1", Operation, "what to do"),
     Field("goal", "u1", Goal, "form of the goal"),
     Field("count", "u1", "1", "joints that follow"),
@@ -63,6 +72,7 @@ OPERATOR_COMMAND = command(
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
     Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
     Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
+    Field("name", f"S{NAME_BYTES}", "ASCII", "what a setting sets"),
 )
 
 RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or above, that this rests on; 0: none")
@@ -122,16 +132,17 @@ class Orders:
         self._reported: int | None = None  # newest command rested on, in the last report; None: there is news
 
     def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
-        """Read the mailbox; return True in the cycle that accepts a command.
+        """Read the mailbox; return True in the cycle that accepts a command other than a setting.
 
-        `judge` is called with each command accepted: there a level may refuse it for its own reasons.
+        `judge` is called with each command accepted: there a level may refuse it for its own reasons, and makes a
+        setting.
         """
         if not operator.is_new:
             return False
         taken = False
         for message in (*operator.earlier, operator.value):
             if self._take_up(message):
-                taken = True
+                taken = taken or message.what not in SETTINGS
                 if judge is not None:
                     judge(message)
         return taken
@@ -146,10 +157,10 @@ class Orders:
         if what not in self._commands or goal not in (self._commands[Operation(what)] or (Goal.NONE,)):
             self.refuse(f"{described(what, goal)} is not a command of this level; permitted: {listed(self._commands)}")
             return False
-        resumes = what == Operation.RESUME
         self.basis = self.serial
-        self.standing = Operation.NONE if resumes else Operation(what)
-        self.answer = Answer.DONE if resumes else Answer.TAKEN
+        if what not in SETTINGS:
+            self.standing = Operation.NONE if what == Operation.RESUME else Operation(what)
+        self.answer = Answer.DONE if what in (Operation.RESUME, *SETTINGS) else Answer.TAKEN
         return True
 
     def refuse(self, why: str) -> None:

@@ -12,14 +12,19 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
+DONE_AT_ONCE = ("resume", "modify")
+"""Commands that leave none in force."""
 
 Level = Annotated[
     str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own")
 ]
-What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint or goto")]
+What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto or modify")]
 Goals = Annotated[
     list[str] | None,
-    typer.Argument(metavar="GOAL", help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1"),
+    typer.Argument(
+        metavar="GOAL",
+        help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify: NAME on|off",
+    ),
 ]
 Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
 At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")]
@@ -47,8 +52,11 @@ def command(
     setpoint  the same, at the servo level: a straight line in joint space,
               without checking for collisions
     resume    let the level continue its own work
+    modify    put a control modification of the servo level in, or take it out,
+              between two samples and without a step in the torque
 
-    The command stays in force until `resume`, even if the level's board restarts. An emergency stop takes precedence.
+    All but `modify` stay in force until `resume`. They survive a restart of the level's board. An emergency stop takes
+    precedence.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did not answer in time;
     2 usage.
@@ -61,6 +69,7 @@ def command(
       rack command nasrem servo setpoint joints=0.2,1.3,-2.9,0,-1.3,0 --wait
       rack command nasrem task goto position=0.45,0.1,0.95
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
+      rack command brown joints modify friction on --at 2.5
     """
     from rack.tools.console.tables import terminal_width
     from rack.tools.runs.desk import LiveDesk
@@ -75,16 +84,24 @@ def command(
     check_timeout(timeout, wait)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising():
-        reply = desk.give({"level": level, "what": what, "tick": tick, "at": at, **goal_of(goal or [])}, wait, timeout)
+        given = {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}
+        reply = desk.give(given, wait, timeout)
     print_answer(reply.document(), reply.line, as_json)
     if not reply.worked:
         raise typer.Exit(1)
-    if reply.is_standing and what != "resume" and not as_json:
+    if reply.is_standing and what not in DONE_AT_ONCE and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
 
 
-def goal_of(words: Sequence[str]) -> dict[str, Any]:
-    """Return a goal, typed as `home` or key=numbers, as in a `[[command]]` table. Raises `Failure`."""
+def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return what follows the verb, typed as `home`, key=numbers or NAME on|off, as in a `[[command]]` table.
+
+    Raises `Failure`.
+    """
+    if what == "modify":
+        if len(words) != 2 or words[1] not in ("on", "off"):
+            raise Failure(f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2)
+        return {"name": words[0], "on": words[1] == "on"}
     goal: dict[str, Any] = {}
     for word in words:
         key, is_given, values = word.partition("=")

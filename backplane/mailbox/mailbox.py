@@ -12,7 +12,7 @@ protocol `double-buffer`). For the memory order that readers rely on see `slots`
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import IntEnum
 from struct import Struct
 from typing import NamedTuple
@@ -82,6 +82,8 @@ class Writer:
         self.bus_errors = 0
         self.held_up = 0
         """Accesses so far that timed out because a dead or stopped process held the lock."""
+        self.held = 0
+        """Messages that injected faults hold back."""
         self.intruder = 0
         """Another process that has published since this writer's last message but one; 0: none."""
         self._claim = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.CLAIM)
@@ -127,6 +129,13 @@ class Writer:
         """Publish a serial without its message, as an injected loss does."""
         self._slots.lose()
 
+    def outgoing(self) -> Iterator[None]:
+        """Put each message of the cycle into `message` in turn: here the one that is there."""
+        yield
+
+    def show(self) -> None:
+        """Show what was published to readers: here they see it already."""
+
     @property
     def serial(self) -> int:
         """Serial of the newest message written."""
@@ -140,7 +149,7 @@ class Writer:
 class ReadStatistics:
     """Counts of one reader's failed reads so far."""
 
-    __slots__ = ("bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up")
+    __slots__ = ("bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up", "lost")
 
     def __init__(self) -> None:
         self.bad_reads = 0  # reads with any of the following
@@ -148,6 +157,7 @@ class ReadStatistics:
         self.corrupt = 0  # messages that failed their check
         self.forged = 0  # messages of a process that does not hold the claim
         self.forger = 0  # process id of the last such process
+        self.lost = 0  # of a queue: serials without a message
         self.held_up = 0  # accesses that timed out because a dead or stopped process held the lock
 
 

@@ -11,8 +11,9 @@ import os
 from collections.abc import Callable, Sequence
 
 from rack.backplane.byte_lock import ByteLock
-from rack.backplane.layout import BY_TICKS, Protocol
+from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, DoubleBufferWriter, Reader, Reading, Writer
+from rack.backplane.mailbox.queue import QueueReader, QueueWriter
 from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import lock_semaphore
@@ -124,8 +125,20 @@ class LockReader(Reader):
             self.lock.release()
 
 
-WRITERS: dict[Protocol, type[Writer]] = {"time-slice": Writer, "double-buffer": DoubleBufferWriter, "lock": LockWriter}
-READERS: dict[Protocol, type[Reader]] = {"time-slice": Reader, "double-buffer": DoubleBufferReader, "lock": LockReader}
+WRITERS: dict[Protocol, type[Writer]] = {
+    "time-slice": Writer,
+    "double-buffer": DoubleBufferWriter,
+    "lock": LockWriter,
+    "queue": QueueWriter,
+}
+READERS: dict[Protocol, type[Reader]] = {
+    "time-slice": Reader,
+    "double-buffer": DoubleBufferReader,
+    "lock": LockReader,
+    "queue": QueueReader,
+}
+OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader, "queue": Reader}
+"""Readers that never take a lock, nor a message out of a queue."""
 
 
 def open_writer(segment: Segment, name: str) -> Writer:
@@ -136,10 +149,9 @@ def open_writer(segment: Segment, name: str) -> Writer:
 def open_reader(segment: Segment, name: str, asynchronous: bool = False) -> Reader:
     """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is whole."""
     protocol = segment.layout.mailbox(name).protocol
-    return READERS["double-buffer" if asynchronous and protocol in BY_TICKS else protocol](segment, name)
+    return READERS["double-buffer" if asynchronous and protocol == "time-slice" else protocol](segment, name)
 
 
 def open_observer(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading that never takes its lock: for the clock and the host side."""
-    is_locked = segment.layout.mailbox(name).protocol == "lock"
-    return DoubleBufferReader(segment, name) if is_locked else open_reader(segment, name)
+    """Open a mailbox for reading its newest message at no cost to others: for the clock and the host side."""
+    return OBSERVERS[segment.layout.mailbox(name).protocol](segment, name)

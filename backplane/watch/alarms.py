@@ -53,6 +53,8 @@ class Alarm(IntEnum):
     BABBLE = 26  # [mailbox; serials per cycle]
     MASQUERADE = 27  # [mailbox; process id that the message names]  not from the writer that holds the claim
     LOCKED = 28  # [mailbox; -]  a dead or stopped process holds the lock
+    # Raised by writers: mailboxes.
+    QUEUE_FULL = 29  # [mailbox; messages refused in the cycle]  its reader does not take messages as fast as they come
     # Raised by tasks: the clock.
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]

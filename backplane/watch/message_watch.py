@@ -55,7 +55,7 @@ class MessageWatch:
         self._heads_and_bodies = reader.slots.heads_and_bodies()
         self._cycles = CycleRecord(segment, reader.spec.writer)
         self.newest = LONG_AGO
-        self._is_sliced = reader.spec.protocol == "time-slice"
+        self._is_sliced = reader.spec.is_by_ticks
         # From this delay on a message is late. A message visible at once carries the tick at which it was written.
         self.late_from = self._spec.delay + self._is_sliced
         self._findings = ReadFindings(reader, episodes)

@@ -7,6 +7,8 @@ cycles for which no message came.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from rack.backplane.mailbox.mailbox import NOT_YET, Reader
 from rack.backplane.mailbox.slots import pid_of
 from rack.backplane.process import GONE, STOPPED, state_of
@@ -26,10 +28,11 @@ class ReadingTask:
     """The task that reads: the tick `since` which it has read without a pause, and which writers are dead or stopped.
 
     After a pause of this task or of the clock, all messages are old but no writer is silent. `troubles` counts reads
-    that failed or found a bad message.
+    that failed or found a bad message. `now` returns the clock's tick; None: no read is ever late.
     """
 
     def __init__(self) -> None:
+        self.now: Callable[[], int | None] = lambda: None
         self.since = 0
         self.troubles = 0
         self._last = LONG_AGO

@@ -2,31 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.mailbox.protocols import open_reader
+from rack.backplane.mailbox.queue import ALL
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter, Episodes
 from rack.backplane.watch.message_watch import MessageWatch, ReadFindings
 from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
+from rack.backplane.watch.watched_queue import WatchedQueue
 from rack.backplane.words import Block
 
 _LOST = int(Block.LOST)
 
 
+def everything() -> int:
+    """Return room for every message."""
+    return ALL
+
+
 def watched(
-    segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask, asynchronous: bool = False
-) -> WatchedReader | SporadicReader:
+    segment: Segment,
+    name: str,
+    alarms: AlarmWriter,
+    task: ReadingTask,
+    *,
+    room: Callable[[], int] = everything,
+    asynchronous: bool = False,
+) -> WatchedReader | SporadicReader | WatchedQueue:
     """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have no period.
 
-    `asynchronous`: the task gets each message as soon as it is whole, whatever the protocol.
+    `room`: how many messages of a queue to take, asked before each read. `asynchronous`: the task gets each message as
+    soon as it is whole, under any other protocol.
     """
-    kind = SporadicReader if segment.layout.mailbox(name).writer == CLOCK else WatchedReader
+    spec = segment.layout.mailbox(name)
+    if spec.protocol == "queue":
+        return WatchedQueue(segment, name, alarms, task, room)
+    kind = SporadicReader if spec.writer == CLOCK else WatchedReader
     return kind(segment, open_reader(segment, name, asynchronous), alarms, task)
 
 
@@ -114,7 +131,7 @@ class GridReader:
     A read that falls into a skipped cycle is left out. So a restarted task reads at the same ticks as before.
     """
 
-    def __init__(self, watched: WatchedReader | SporadicReader, grid: TickGrid) -> None:
+    def __init__(self, watched: WatchedReader | SporadicReader | WatchedQueue, grid: TickGrid) -> None:
         self.reader = watched.reader
         self._watched, self._every, self._phase = watched, *grid
         kept = [Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)]

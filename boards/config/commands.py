@@ -21,7 +21,7 @@ from rack.boards.errors import ConfigError, Mistake
 from rack.levels.algebra import norm
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor
-from rack.levels.operator import Commands, Goal, goal_names, listed
+from rack.levels.operator import SETTINGS, Commands, Goal, goal_names, listed
 
 OWN_OPERATOR = "own.operator"
 DOWN = (0.0, 0.0, -1.0)
@@ -73,6 +73,7 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
         message.direction[:] = command.direction or DOWN
     if command.quaternion is not None:
         message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
+    message.name = command.name or ""
     return Request(index, bytes(message.raw), _tick(command, layout.clock_ns))
 
 
@@ -114,6 +115,7 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         yield Mistake(at("what"), command.what, why)
         return
     yield from _goal(at, command, known)
+    yield from _name(at("name"), command, config)
     if command.joints is not None and Goal.JOINTS in known[command.said]:
         yield from _joints(at("joints"), command.joints, config)
     for key in ("quaternion", "direction"):
@@ -141,7 +143,20 @@ def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> 
 
 
 def _key(goal: Goal) -> str:
-    return {Goal.POSE: "quaternion", Goal.DIRECTION: "position"}.get(goal, goal.name.lower())
+    keys = {Goal.POSE: "quaternion", Goal.DIRECTION: "position", Goal.OFF: "on"}
+    return keys.get(goal, goal.name.lower())
+
+
+def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+    """Check that a setting, and nothing else, names something that its level has."""
+    if command.said not in SETTINGS:
+        if command.name is not None:
+            yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
+        return
+    board = config.board[command.level]
+    known = find_class(board.executor, Executor).names(board.params)
+    if command.name not in known:
+        yield Mistake(place, command.name, f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}")
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
 
 from rack.backplane.layout import BY_TICKS, ExchangeSpec
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake
 from rack.levels.level import Input
+
+if TYPE_CHECKING:
+    from rack.boards.config.layout import Wiring
 
 
 def exchanges(config: RackConfig, board: str) -> dict[str, ExchangeSpec]:
@@ -32,16 +36,26 @@ def exchange_mistakes(config: RackConfig, board: str, inputs: Mapping[str, Input
             yield Mistake(f"{place}.phase", entry.phase, why)
 
 
+def asynchronous_queues(wiring: Wiring) -> Iterator[Mistake]:
+    """Yield a mistake for every queue that an asynchronous port reads."""
+    for ports in wiring.tasks:
+        entries = wiring.config.board[ports.place.board].exchange if ports.place.role == "executor" else {}
+        for port, mailbox in ports.sources:
+            if port in entries and entries[port].asynchronous and wiring.protocol(mailbox) == "queue":
+                why = f"'{mailbox}' is a queue, and its messages are taken by ticks; permitted: false"
+                yield Mistake(f"board.{ports.place.board}.exchange.{port}.asynchronous", True, why)
+
+
 def strict_mistakes(config: RackConfig) -> Iterator[Mistake]:
     """Yield a mistake for everything that makes a run depend on timing, if that is refused."""
     if not config.protocol.strict:
         return
     why = "makes a run depend on timing, refused by protocol.strict = true; permitted"
-    protocols = {"default": config.protocol.default}
-    protocols |= {f"mailbox.{mailbox}": protocol for mailbox, protocol in config.protocol.mailbox.items()}
-    for key, protocol in protocols.items():
+    if config.protocol.default not in BY_TICKS:
+        yield Mistake("protocol.default", config.protocol.default, f"{why}: time-slice")
+    for mailbox, protocol in config.protocol.mailbox.items():
         if protocol not in BY_TICKS:
-            yield Mistake(f"protocol.{key}", protocol, f"{why}: {', '.join(BY_TICKS)}")
+            yield Mistake(f"protocol.mailbox.{mailbox}", protocol, f"{why}: {', '.join(BY_TICKS)}")
     for name, board in config.board.items():
         for port, entry in board.exchange.items():
             if entry.asynchronous:

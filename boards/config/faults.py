@@ -9,6 +9,7 @@ from zlib import crc32
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout, Role
+from rack.backplane.mailbox.queue import is_position
 from rack.boards.classes import find_class
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
@@ -192,10 +193,16 @@ class FaultRules:
             yield from self._mailboxes(kind, self.layout)
 
     def _mailboxes(self, kind: Kind, layout: Layout) -> Iterator[Mistake]:
-        written = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
+        every = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
+        # The position of a queue's reader is not written through a port.
+        written = {name: m for name, m in every.items() if kind.where == "bus" or not is_position(m)}
         wanted = self.fault.mailbox
+        struck = [m for m in written.values() if wanted in (None, m.name)]
         if wanted is not None and wanted not in written:
             yield self._mistake("mailbox", f"'{self.fault.board}' does not write it; it writes: {_listed(written)}")
+        elif kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
+            why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike: {kind.not_queued}"
+            yield self._mistake("mailbox", why)
         elif kind.where == "bus" and wanted is None and not any(m.readers for m in written.values()):
             yield self._mistake("mailbox", f"missing; no mailbox of '{self.fault.board}' has a reader")
         elif kind.where == "lock":

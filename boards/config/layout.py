@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,12 +14,14 @@ from pydantic import ValidationError
 from rack.backplane.address_map import CLOCK, AddressMap
 from rack.backplane.errors import MailboxError
 from rack.backplane.layout import ExchangeSpec, FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
+from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
-from rack.boards.config.exchange import exchanges, strict_mistakes
+from rack.boards.config.exchange import asynchronous_queues, exchanges, strict_mistakes
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports
-from rack.boards.config.schema import RackConfig, TaskPlace
+from rack.boards.config.queues import queue_mistakes, queue_slots
+from rack.boards.config.schema import UNREAD, RackConfig, TaskPlace
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
 from rack.levels.operator import OPERATOR_COMMAND
@@ -52,8 +55,9 @@ def shared_out(config: RackConfig) -> list[str]:
 class Wiring:
     """The ports of all tasks, connected: the writer and the readers of each mailbox.
 
-    `mistakes` holds every mistake in them. Nothing that depends on the tables in `broken`, which have mistakes of
-    their own, is checked.
+    `writers` holds the writing task and its declaration by mailbox, `operated` the message types of operators'
+    mailboxes. `mistakes` holds every mistake in them. Nothing that depends on the tables in `broken`, which have
+    mistakes of their own, is checked.
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
@@ -64,44 +68,48 @@ class Wiring:
         # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
         self._unknown = {place.board for place in config.tasks() if place.name not in found}
         self._unknown |= {place.removeprefix("board.") for place in broken}
-        self._writers: dict[str, tuple[TaskPorts, Output]] = {}
+        self.writers: dict[str, tuple[TaskPorts, Output]] = {}
         for ports in self.tasks:
             self._add_writer(ports)
-        self._operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
+        self.operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
         self._check_operated()
         for ports in self.tasks:
             self._check_reads(ports)
         self._check_rest()
+        self.mistakes += queue_mistakes(self)
+        self.mistakes += asynchronous_queues(self)
         self._check_params()
         if not broken & {"robot", "scene", "task"}:
             self._check_programs()
 
     def _add_writer(self, ports: TaskPorts) -> None:
         for port, mailbox in ports.writes.items():
-            if mailbox in self._writers:
-                first = self._writers[mailbox][0].task
+            if mailbox in self.writers:
+                first = self.writers[mailbox][0].task
                 self.mistakes.append(Mistake(f"mailbox {mailbox}", ports.task, f"already written by {first}"))
             else:
-                self._writers[mailbox] = ports, ports.outputs[port]
+                self.writers[mailbox] = ports, ports.outputs[port]
 
     def _check_operated(self) -> None:
-        """Check that only the clock writes operators' mailboxes, and never waits for a lock."""
-        for mailbox in self._operated:
-            if mailbox in self._writers:
-                first = self._writers[mailbox][0].task
+        """Check that only the clock writes operators' mailboxes, never waits, and never finds one full."""
+        for mailbox in self.operated:
+            if mailbox in self.writers:
+                first = self.writers[mailbox][0].task
                 self.mistakes.append(
                     Mistake(f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox")
                 )
-            if self.config.protocol.mailbox.get(mailbox) == "lock":
-                why = "the clock writes it and must not wait; permitted: time-slice, double-buffer"
-                self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", "lock", why))
+            given = self.config.protocol.mailbox.get(mailbox)
+            if given in ("lock", "queue"):
+                why = "the clock writes it and must not wait" if given == "lock" else "it keeps every command already"
+                why += "; permitted: time-slice, double-buffer"
+                self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", given, why))
 
     def _check_reads(self, ports: TaskPorts) -> None:
         key = "reads" if ports.place.role == "executor" else "planner_reads"
         for port, mailbox in ports.sources:
             place, wanted = f"board.{ports.place.board}.{key}.{port}", ports.inputs[port].type
-            if not self._is_known(mailbox):
-                why = f"no task writes it; mailboxes: {self._names()}"
+            if not self.is_known(mailbox):
+                why = f"no task writes it; mailboxes: {self.names()}"
                 self.mistakes.append(Mistake(place, mailbox, why))
             elif (found := self._kind(mailbox)) is not None and found != wanted:
                 why = f"carries {found.name} {found.version}; the port needs {wanted.name} {wanted.version}"
@@ -109,11 +117,11 @@ class Wiring:
 
     def _check_rest(self) -> None:
         for mailbox in self.config.protocol.mailbox:
-            if not self._is_known(mailbox):
-                why = f"no such mailbox; mailboxes: {self._names()}"
+            if not self.is_known(mailbox):
+                why = f"no such mailbox; mailboxes: {self.names()}"
                 self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", None, why))
         for name, board in self.config.board.items():
-            if board.ends_run and not self._is_known(f"{name}.status"):
+            if board.ends_run and not self.is_known(f"{name}.status"):
                 self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
 
     def _check_params(self) -> None:
@@ -137,19 +145,26 @@ class Wiring:
                 misfits = program.misfits(self.config.robot, self.config.scene)
                 self.mistakes += [Mistake(f"task.{key}", value, why) for key, value, why in misfits]
 
-    def _is_known(self, mailbox: str) -> bool:
-        return mailbox in self._writers or mailbox in self._operated or mailbox.partition(".")[0] in self._unknown
+    @property
+    def has_unknown(self) -> bool:
+        """Whether the ports of some boards are not known, since these have mistakes of their own."""
+        return bool(self._unknown)
+
+    def is_known(self, mailbox: str) -> bool:
+        """Say whether a mailbox exists, or may: its board has mistakes of its own."""
+        return mailbox in self.writers or mailbox in self.operated or mailbox.partition(".")[0] in self._unknown
 
     def _kind(self, mailbox: str) -> MessageType | None:
-        return self._writers[mailbox][1].type if mailbox in self._writers else self._operated.get(mailbox)
+        return self.writers[mailbox][1].type if mailbox in self.writers else self.operated.get(mailbox)
 
-    def _names(self) -> str:
-        return ", ".join([*self._writers, *self._operated])
+    def names(self) -> str:
+        """Return the names of all mailboxes, as a list to read."""
+        return ", ".join([*self.writers, *self.operated])
 
     def check_sizes(self, sizes: Mapping[str, int]) -> list[Mistake]:
         """Return a mistake for every message that needs a size unknown to the rack."""
         found = []
-        for mailbox, (ports, output) in self._writers.items():
+        for mailbox, (ports, output) in self.writers.items():
             try:
                 output.type.dtype(sizes)
             except MailboxError as error:
@@ -160,21 +175,34 @@ class Wiring:
         """Return the layout of a config without mistakes."""
         tasks = tuple(self._task(ports) for ports in self.tasks)
         by_name = {task.name: task for task in tasks}
-        mailboxes = []
-        for name, (ports, output) in self._writers.items():
+        mailboxes: list[MailboxSpec] = []
+        for name, (ports, output) in self.writers.items():
             writer = by_name[ports.task]
             every = writer.every * output.cycles
             delay = writer.every * writer.within_cycles
             # A reader may read as late as the end of its slice a message that was visible at its start.
-            readers = [by_name[reader] for reader in self._readers(name)]
+            readers = [by_name[reader] for reader in self.readers(name)]
             slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
             depth = depth_for(max(slowest + delay, self._kept_ticks), every)
             spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, phase=writer.phase)
-            mailboxes.append(self._mailbox(name, output.type, sizes, spec))
+            box = self._mailbox(name, output.type, sizes, spec)
+            mailboxes += self._queue(box, readers[0], writer) if box.protocol == "queue" else [box]
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
-        mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self._operated.items()]
+        mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self.operated.items()]
         return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes))
+
+    def _queue(self, box: MailboxSpec, reader: TaskSpec, writer: TaskSpec) -> Iterator[MailboxSpec]:
+        """Yield a queue with its size, and the mailbox in which its reader writes its position for the writer."""
+        delay, slowest = reader.every * reader.within_cycles, writer.every * writer.within_cycles
+        read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
+        capacity = self.config.protocol.depth.get(box.name, UNREAD)
+        yield replace(box, capacity=capacity, depth=queue_slots(capacity, box.delay + delay, self._kept_ticks))
+        depth = depth_for(max(slowest + delay, self._kept_ticks), read.every)
+        visible = (read.phase + delay) % read.every
+        spec = partial(MailboxSpec, writer=reader.name, every=read.every, delay=delay, depth=depth, phase=visible)
+        position = self._mailbox(taken_name(box.name), TAKEN, {}, spec)
+        yield replace(position, readers=(writer.name,), protocol="time-slice")
 
     def _task(self, ports: TaskPorts) -> TaskSpec:
         place, every = ports.place, self.config.every(ports.place.board)
@@ -207,16 +235,17 @@ class Wiring:
         """Complete the record of a mailbox by its message, readers and protocol."""
         return spec(
             name=name,
-            readers=self._readers(name),
+            readers=self.readers(name),
             exchanges=tuple(self._exchanges(name)),
-            protocol=self._protocol(name),
+            protocol=self.protocol(name),
             message=kind.name,
             version=kind.version,
             size=kind.dtype(sizes).itemsize,
             fields=field_specs(kind, sizes),
         )
 
-    def _readers(self, mailbox: str) -> tuple[str, ...]:
+    def readers(self, mailbox: str) -> tuple[str, ...]:
+        """Return the tasks that read a mailbox."""
         return tuple(ports.task for ports in self.tasks if any(mailbox == box for _, box in ports.sources))
 
     def _exchanges(self, mailbox: str) -> Iterator[ExchangeSpec]:
@@ -224,10 +253,13 @@ class Wiring:
             found = exchanges(self.config, ports.place.board) if ports.place.role == "executor" else {}
             yield from (found[port] for port, box in ports.sources if box == mailbox and port in found)
 
-    def _protocol(self, mailbox: str) -> Protocol:
+    def protocol(self, mailbox: str) -> Protocol:
+        """Return the protocol of a mailbox."""
+        if mailbox in self.writers and self.writers[mailbox][1].queued:
+            return "queue"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
         # A lock would make the clock wait for readers.
-        return "double-buffer" if protocol == "lock" and mailbox in self._operated else protocol
+        return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
 
 
 def too_large(layout: Layout) -> Iterable[Mistake]:

@@ -88,9 +88,9 @@ def _class(wanted: str, role: Role) -> tuple[type[Executor] | type[Planner], Map
         given = executor.outputs.items()
         return executor, {port: kind if isinstance(kind, Output) else Output(kind) for port, kind in given}
     planner = find_class(wanted, Planner)
-    if not isinstance(getattr(planner, "output", None), MessageType):
+    if not isinstance(output := getattr(planner, "output", None), MessageType | Output):
         raise LookupError("the class has no 'output', the message type of its plan")
-    return planner, {"plan": Output(planner.output)}
+    return planner, {"plan": output if isinstance(output, Output) else Output(output)}
 
 
 def _sources(

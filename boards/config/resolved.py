@@ -219,6 +219,7 @@ class _Examined:
             outputs=dict(ports.writes),
             context=self._context(spec.board),
             critical_priority=board.priority if critical else 0,
+            sent=tuple(port for port, output in ports.outputs.items() if output.queued),
             guards_clock=is_executor and spec.every == min(task.every for task in layout.tasks),
             fails_self_test=fails_self_test,
             exchange=exchanges(self._config, spec.board) if is_executor else {},

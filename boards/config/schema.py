@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, StringConstraints
 
 from rack.backplane.clock.system_clock import ticks_of
-from rack.backplane.layout import Protocol, Role, Wake
+from rack.backplane.layout import Protocol, Role, Sampled, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
@@ -32,8 +32,8 @@ OnLoss = Literal["hold", "stop", "brake"]
 
 
 def _listed(value: Any) -> Any:
-    """Return a single name as a list of one."""
-    return (value,) if isinstance(value, str) else value
+    """Return a single name as a list of one, and TOML's list as a tuple."""
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
 
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
@@ -49,6 +49,8 @@ Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
+UNREAD, MOST_UNREAD = 32, 4096
+"""Default and greatest depth of a queue, messages."""
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
@@ -138,9 +140,12 @@ class ExchangeConfig(Table):
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
-    default: Protocol = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
+    default: Sampled = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
     mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
     strict: bool = Field(False, description="refuse whatever makes a run depend on timing")
+    depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
+        {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
+    )
 
 
 class SupervisionConfig(Table):
@@ -208,8 +213,9 @@ class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal["hold", "resume", "setpoint", "goto"] = Field(
-        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there"
+    what: Literal["hold", "resume", "setpoint", "goto", "modify"] = Field(
+        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify: put "
+        "a control modification in or take it out"
     )
     tick: int | None = Field(
         None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"
@@ -226,6 +232,8 @@ class CommandConfig(Table):
         None, description="goal: direction of the tool's z axis, rotation about it left free; default: down"
     )
     home: bool = Field(False, description="goal: the arm's start position")
+    name: str | None = Field(None, description="control modification to put in or take out")
+    on: bool | None = Field(None, description="true: put it in; false: take it out")
 
     @property
     def said(self) -> Operation:
@@ -238,7 +246,8 @@ class CommandConfig(Table):
         found = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
             found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
-        return [*found, Goal.HOME] if self.home else found
+        found += [Goal.HOME] if self.home else []
+        return found if self.on is None else [*found, Goal.ON if self.on else Goal.OFF]
 
 
 class TaskPlace(NamedTuple):

@@ -35,6 +35,7 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.BRAKES_OPENED: "recovery",
     Alarm.RE_REFERENCED: "recovery",
     Alarm.LATCHED: "reaction",
+    Alarm.QUEUE_FULL: "held",
     **dict.fromkeys(MISSES, "miss"),
 }
 """The kind of event for each alarm; any other alarm is a detection."""
@@ -52,6 +53,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.DAMAGED: ("mailbox", "'{subject}': a message failed its check"),
     Alarm.BABBLE: ("mailbox", "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1"),
     Alarm.MASQUERADE: ("mailbox", "'{subject}': a message comes from process {value:.0f}, which is not its writer"),
+    Alarm.QUEUE_FULL: ("mailbox", "'{subject}' is full: {messages} of '{writer}' refused"),
     Alarm.LOCKED: ("mailbox", "'{subject}': a dead or stopped process holds the lock"),
     Alarm.CLOCK_STOPPED: ("nothing", "clock stopped: no tick for {span}"),
     Alarm.CLOCK_SKIPPED: ("nothing", "clock skipped {ticks}"),

@@ -86,7 +86,8 @@ class Kind:
 
     `realtime`: impossible in lockstep, where time waits for every task. `once`: it strikes once; other kinds last for a
     time or until the run ends. `within_tick`: it can strike within a tick; other kinds begin with a cycle.
-    `visible_from`: the smallest value of its parameter `size` that must be detected.
+    `visible_from`: the smallest value of its parameter `size` that must be detected. `not_queued`: why it does not
+    strike queues; empty if it does.
     """
 
     name: str
@@ -103,6 +104,7 @@ class Kind:
     once: bool = False
     within_tick: bool = False
     visible_from: float | None = None
+    not_queued: str = ""
 
     @property
     def number(self) -> int:

@@ -119,6 +119,7 @@ KINDS.add(
         means="the task runs but writes no messages",
         step=messages.Mute,
         detected_as=(Alarm.MUTE,),
+        not_queued="a queue is written on demand: its silence proves nothing",
         # A message is stale after two periods, but that proves nothing until its writer has finished another release.
         bound=bounds.missing_writes(2) + bounds.READ,
         lasts=draw.silence(1.2, 2.0),
@@ -155,6 +156,7 @@ KINDS.add(
         parameters=(_probability(0.3, 0.9),),
         # The last message may have no successor to be swapped with: it is only late.
         detected_as=(Alarm.DISORDER, Alarm.HELD_BACK),
+        not_queued="the messages of one cycle have the same tick: nothing would show their order",
         bound=bounds.writes(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
         lasts=draw.messages(4, 8),
@@ -180,6 +182,7 @@ KINDS.add(
             Parameter("writes", "1", "messages per cycle", 32, 3, 1000, is_whole=True, drawn=draw.whole(8, 64)),
         ),
         detected_as=(Alarm.BABBLE,),
+        not_queued="a queue takes several messages in a cycle, and refuses those that it cannot hold",
         bound=bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP)),
         lasts=draw.cycles(3, 6),

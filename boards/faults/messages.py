@@ -210,7 +210,9 @@ class FaultyWriter:
         self.flush(tick, now)
         spec, self._written = self._writer.spec, True
         visible_at = self._writer.visible_at(tick, now)
-        self._first(Outgoing(tick, tick, visible_at, tick if basis is None else basis))
+        for _ in self._writer.outgoing():
+            self._first(Outgoing(tick, tick, visible_at, tick if basis is None else basis))
+        self._show()
         return self._written and (now is None or now < tick + spec.delay)
 
     def flush(self, tick: int, now: int | None = None) -> None:
@@ -221,6 +223,11 @@ class FaultyWriter:
             held.send(self._writer, tick, visible_at, self._publish)
         for step in self._steps.values():
             step.flush(tick, visible_at)
+        self._show()
+
+    def _show(self) -> None:
+        self._writer.held = len(self._late) + sum(len(step.held) for step in self._steps.values())
+        self._writer.show()
 
     def _publish(self, message: Outgoing) -> None:
         if not self._writer.publish(message.released, message.visible_at, message.basis, message.damage):

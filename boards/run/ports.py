@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
 from rack.backplane.fault_table import Entry, FaultEntry
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.mailbox.queue import ALL, QueueWriter, taken_name
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import GridReader, SporadicReader, WatchedReader, watched
+from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
+from rack.boards.faults.kind import KINDS
 from rack.boards.faults.messages import FaultyWriter
+from rack.boards.run.queues import QueuePort, Write
 from rack.boards.wiring import Source
 from rack.levels.level import Ports, Reading, Verdict
 
 Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
 """One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
+
+
+def all_of(port: str) -> int:
+    """Return room for every message of a queue."""
+    return ALL
 
 
 class InputPorts:
@@ -34,11 +42,14 @@ class InputPorts:
         sources: Mapping[str, Source],
         alarms: AlarmWriter,
         plan: str = "",
+        *,
+        room: Callable[[str], int] = all_of,
         exchange: Mapping[str, ExchangeSpec] | None = None,
     ) -> None:
-        """Read `sources` by port; `plan` is the mailbox that holds the task's own plan.
+        """Read `sources` by port, from a queue as many messages as there is `room` for on its port.
 
-        `exchange` holds the ports that are not simply read in every cycle.
+        `plan` is the mailbox that holds the task's own plan, `exchange` the ports that are not simply read in every
+        cycle.
         """
         self.task = ReadingTask()
         self.taken: list[Taken] = []
@@ -49,30 +60,32 @@ class InputPorts:
         self._plan: list[Line] = []
         self._rest: list[Line] = []
         for port, source in sources.items():
+            by_board: dict[str, Reading] = {}
+            boxes = {port: source} if isinstance(source, str) else source
+            values = self.values.__dict__ if isinstance(source, str) else by_board
             how = (exchange or {}).get(port)
+            open_port = partial(watched, segment, alarms=alarms, task=self.task, room=partial(room, port))
+            for key, mailbox in boxes.items():
+                found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
+                read = found.read if how is None else GridReader(found, how.grid).read
+                values[key] = Reading(found.reader.message, Verdict.NONE)
+                (self._plan if mailbox == plan else self._rest).append((values, key, read))
+                self.taken.append(Taken(values, key, found.reader))
             if isinstance(source, str):
-                self.readers[port] = self._add(self.values.__dict__, port, source, source == plan, how)
+                self.readers[port] = self.taken[-1].reader
             else:
-                by_board: dict[str, Reading] = {}
                 setattr(self.values, port, by_board)
-                for board, mailbox in source.items():
-                    self._add(by_board, board, mailbox, mailbox == plan, how)
         self.reads_plan = bool(self._plan)
         self._readers = [entry.reader for entry in self.taken]
         self._statistics = [reader.statistics for reader in self._readers]
         self._counted = self._traffic
 
-    def _add(
-        self, values: dict[str, Reading], key: str, mailbox: str, is_plan: bool, how: ExchangeSpec | None
-    ) -> Reader:
-        found: WatchedReader | SporadicReader | GridReader
-        found = self._open(mailbox, asynchronous=how is not None and how.asynchronous)
-        if how is not None:
-            found = GridReader(found, how.grid)
-        values[key] = Reading(found.reader.message, Verdict.NONE)
-        (self._plan if is_plan else self._rest).append((values, key, found.read))
-        self.taken.append(Taken(values, key, found.reader))
-        return found.reader
+    def follow(self, segment: Segment, queue: QueuePort, alarms: AlarmWriter) -> None:
+        """Read the position of the reader of a queue that the task writes, with the mailboxes of its ports."""
+        found = watched(segment, taken_name(queue.writer.spec.name), alarms, self.task)
+        self._rest.append(({}, "", queue.noting(found.read)))
+        self._readers.append(found.reader)
+        self._statistics.append(found.reader.statistics)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
@@ -118,12 +131,27 @@ class OutputPorts:
     that it follows, a status that of the status below. So the system's response time can be measured.
     """
 
-    def __init__(self, segment: Segment, mailboxes: Mapping[str, str], alarms: AlarmWriter, inputs: InputPorts) -> None:
+    def __init__(
+        self,
+        segment: Segment,
+        mailboxes: Mapping[str, str],
+        alarms: AlarmWriter,
+        inputs: InputPorts,
+        sent: Collection[str] = (),
+    ) -> None:
+        """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level sends by itself."""
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
         self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
         self._rests_on = {port: inputs.readers.get(port) for port in mailboxes}
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
+        self._queues = {
+            port: QueuePort(writer, self._episodes[port], port in sent)
+            for port, writer in self.writers.items()
+            if isinstance(writer, QueueWriter)
+        }
+        for queue in self._queues.values():
+            inputs.follow(segment, queue, alarms)
         self._faulty: dict[str, FaultyWriter] = {}
         self._held_up = dict.fromkeys(self.writers, 0)
         self._writers = list(self.writers.values())
@@ -134,7 +162,8 @@ class OutputPorts:
         """Apply these faults, by kind, from now on; messages delayed by earlier ones go out with the next write."""
         for port, writer in self.writers.items():
             index = self._indices[writer.spec.name]
-            chosen = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
+            struck = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
+            chosen = [(kind, e) for kind, e in struck if port not in self._queues or not KINDS[kind].not_queued]
             if chosen or port in self._faulty:
                 self._faulty.setdefault(port, FaultyWriter(writer, index)).apply(chosen)
         self._route()
@@ -142,16 +171,13 @@ class OutputPorts:
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [
-            (
-                port,
-                w,
-                getattr(self._faulty.get(port), "write", w.write),
-                self._rests_on[port],
-                w.spec.delay - w.spec.phase,
-                w.spec.every,
-            )
+            (port, w, self._write_of(port), self._rests_on[port], w.spec.delay - w.spec.phase, w.spec.every)
             for port, w in self.writers.items()
         ]
+
+    def _write_of(self, port: str) -> Write:
+        write: Write = getattr(self._faulty.get(port), "write", self.writers[port].write)
+        return partial(self._queues[port].write, write) if port in self._queues else write
 
     @property
     def bus_errors(self) -> int:

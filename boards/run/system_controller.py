@@ -14,7 +14,6 @@ from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import State
 from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
@@ -150,7 +149,7 @@ class EndOfRun:
         self._heard: int | None = None
         # By ticks, a message becomes visible at a boundary of its writer's period.
         self._every, self._phase = 1, 0
-        if self._reader is not None and self._reader.spec.protocol in BY_TICKS:
+        if self._reader is not None and self._reader.spec.is_by_ticks:
             self._every, self._phase = self._reader.spec.every, self._reader.spec.phase
         self._next = 0
 
@@ -188,5 +187,5 @@ def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: A
     """Return the clock driver for the run's mode."""
     if not wiring.lockstep:
         return RealtimeDriver(segment, ended, alarms)
-    at_once = not all(mailbox.is_by_ticks for mailbox in segment.layout.mailboxes)
+    at_once = not all(mailbox.is_repeatable for mailbox in segment.layout.mailboxes)
     return LockstepDriver(segment, ended, at_once, wiring.history, alarms)

@@ -1,6 +1,8 @@
-"""The servo level: torques at the clock's rate from set points at the rate of the level above."""
+"""The servo level, on one board or several: torques at the clock's rate from set points of the level above."""
 
+from rack.levels.servo.arm_executor import ArmExecutor
 from rack.levels.servo.executor import ServoExecutor
+from rack.levels.servo.joint_servo import JointServo
 from rack.levels.servo.planner import ServoPlanner
 
-__all__ = ["ServoExecutor", "ServoPlanner"]
+__all__ = ["ArmExecutor", "JointServo", "ServoExecutor", "ServoPlanner"]

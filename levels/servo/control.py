@@ -21,11 +21,16 @@ from rack.levels.tables import GripperConfig, Positive, Table
 Reacting = Literal["hold", "stop", "brake"]
 
 
-class ServoParams(Table):
-    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
+class LoopGains(Table):
+    """Gains of the joint loop."""
 
     bandwidth: Positive = Field(60.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
     damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
+
+
+class ArmParams(Table):
+    """The arm that a board drives, and its reactions to faults of sensors and motors."""
+
     following: Positive = Field(
         0.02, description="distance of a joint from its set point at which a motor counts as failed, rad"
     )
@@ -49,6 +54,10 @@ class ServoParams(Table):
     def _is_an_arm(cls, reference: str) -> str:
         find_arm(reference)
         return reference
+
+
+class ServoParams(ArmParams, LoopGains):
+    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
 
 
 class ComputedTorque:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
@@ -12,6 +13,8 @@ from rack.levels.algebra import Array
 from rack.levels.operator import Commands, Operation, Orders, joints_of
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
+
+Mask = NDArray[np.bool_]
 
 
 class OperatorControl:
@@ -21,16 +24,20 @@ class OperatorControl:
     the arm on its path. A restarted board has lost these places: the level above then continues from where the arm is.
     """
 
-    def __init__(self, commands: Commands, joints: Sequence[str], ranges: Array) -> None:
-        """Permit set points within `ranges` (joints, 2), rad."""
+    def __init__(self, commands: Commands, joints: Sequence[str], ranges: Array, driven: Mask | None = None) -> None:
+        """Permit set points of the joints `driven`, (joints,), default all, within `ranges` (joints, 2), rad."""
         self.orders = Orders(commands)
         self.stands = False  # the level follows the operator, not the level above
-        self._joints, self._ranges = joints, ranges
+        self._driven = np.full(len(joints), True) if driven is None else driven
+        self._joints = [joint for joint, own in zip(joints, self._driven, strict=True) if own]
+        self._ranges = ranges[self._driven]
+        self._position = np.zeros(len(joints))  # (joints,), rad: of the arm, at the newest command
         self._goal: Array | None = None  # (joints,), rad
         self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
 
-    def take(self, operator: Reading) -> None:
-        """Accept new commands."""
+    def take(self, operator: Reading, position: Array) -> None:
+        """Accept new commands, with the arm at `position`, (joints,), rad."""
+        self._position[:] = position
         if not self.orders.take(operator, self._judge):
             return
         if self.orders.standing is Operation.NONE and self._way:
@@ -51,9 +58,12 @@ class OperatorControl:
         """Take the goal of a set point, or refuse it."""
         if self.orders.standing is Operation.SETPOINT:
             try:
-                self._goal = joints_of(command, self._joints, self._ranges)
+                own = joints_of(command, self._joints, self._ranges)
             except ValueError as error:
                 self.orders.refuse(str(error))
+            else:
+                self._goal = self._position.copy()
+                self._goal[self._driven] = own
 
     def wanted(self, reference: Reference, tick: int) -> Motion:
         """Return the motion wanted at `tick`, while the level follows the operator."""

@@ -14,7 +14,7 @@ from rack.levels.arm import Sensed
 from rack.levels.compiled import compiled
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
-from rack.levels.servo.control import ServoParams
+from rack.levels.servo.control import ArmParams
 
 Mask = NDArray[np.bool_]
 
@@ -51,7 +51,7 @@ class SensorMonitor:
     offset greater than `doubt` is never accepted.
     """
 
-    def __init__(self, cell: Cell, params: ServoParams, tick_s: float, every: int) -> None:
+    def __init__(self, cell: Cell, params: ArmParams, tick_s: float, every: int) -> None:
         """Check the joints of a cell in cycles of `every` ticks; they start at home."""
         self._good_cycles = params.good_cycles
         self._retry_cycles = max(round(params.retry / (every * tick_s)), params.good_cycles)

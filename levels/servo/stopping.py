@@ -12,7 +12,7 @@ from rack.backplane.words import Demand
 from rack.levels.arm import Arm
 from rack.levels.level import Finding
 from rack.levels.messages import Error
-from rack.levels.servo.control import ServoParams
+from rack.levels.servo.control import ArmParams
 from rack.levels.servo.sensor_monitor import SensorMonitor
 
 
@@ -49,7 +49,7 @@ class Stopping:
     follows, so recurring faults use it up too. Then the fault is latched: the brakes stay engaged.
     """
 
-    def __init__(self, params: ServoParams, joints: Sequence[str], tick_s: float, every: int) -> None:
+    def __init__(self, params: ArmParams, joints: Sequence[str], tick_s: float, every: int) -> None:
         self._joints, self._params, self._every = joints, params, every
         self._on_sensors = Reaction[params.on_sensor_fault.upper()]
         self._on_motors = Reaction[params.on_actuator_fault.upper()]

@@ -105,7 +105,7 @@ def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
         if all(name in boxes for name in names):
             boards = [rack.boards[name] for name in passed]
             reads = tuple(board.reads_at(box) for board, box in zip(boards, names, strict=True))
-            is_exact = all(boxes[name].is_by_ticks for name in names)
+            is_exact = all(boxes[name].is_repeatable for name in names)
             releases = tuple(board.releases for board in boards)
             found[level] = CommandPath(passed, releases, reads, boxes[names[0]].delay, is_exact)
     return found

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
 from rack.backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec, Wake
+from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import Field, MessageType
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
@@ -31,6 +32,7 @@ def mailbox(
     depth: int = 8,
     name: str = NAME,
     writer: str = "writer",
+    capacity: int = 0,
 ) -> MailboxSpec:
     """Return the spec of a mailbox of points."""
     return MailboxSpec(
@@ -45,7 +47,28 @@ def mailbox(
         version=POINT.version,
         size=POINT.dtype(SIZES).itemsize,
         fields=field_specs(POINT, SIZES),
+        capacity=capacity,
     )
+
+
+def queue(capacity: int, rates: tuple[int, int] = (1, 1), slots: int = 64) -> tuple[MailboxSpec, MailboxSpec]:
+    """Return the specs of a queue of points and of its reader's position; `rates` are both tasks' periods."""
+    written, read = rates
+    box = mailbox("queue", every=written, delay=written, depth=slots, capacity=capacity)
+    position = MailboxSpec(
+        name=taken_name(NAME),
+        writer="reader",
+        readers=("writer",),
+        protocol="time-slice",
+        every=read,
+        delay=read,
+        depth=64,
+        message=TAKEN.name,
+        version=TAKEN.version,
+        size=TAKEN.dtype({}).itemsize,
+        fields=field_specs(TAKEN, {}),
+    )
+    return box, position
 
 
 def task(

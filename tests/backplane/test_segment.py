@@ -90,6 +90,14 @@ def test_another_layout_version_is_refused(make_bus: MakeBus) -> None:
     assert f"layout version {VERSION + 1}; this program attaches to {VERSION}" in message
 
 
+def test_a_layout_with_a_field_unknown_to_this_program_is_refused(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    start = segment.words[Head.LAYOUT_AT]
+    text = bytes(segment.bytes[start : start + segment.words[Head.LAYOUT_SIZE]])
+    segment.bytes[start : start + len(text)] = text.replace(b'"wake"', b'"woke"')
+    assert "layout unreadable" in refusal(lambda: Segment.attach(segment.rack))
+
+
 def test_a_segment_of_another_kind_is_refused(make_bus: MakeBus) -> None:
     segment = make_bus()
     segment.words[Head.MAGIC] += 1

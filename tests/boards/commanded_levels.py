@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 from rack.backplane.message import Field, Message, State, command, status
 from rack.levels.level import Executor, Input, Ports
 from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, Operation, Orders
@@ -38,20 +41,30 @@ class Upper(Executor):
 
 
 class Lower(Executor):
-    """Counts, unless it is held from above or here."""
+    """Counts, unless it is held from above or here; by two at a time while it is set to `twice`."""
 
     inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "command": Input(STEP, "above.command")}
     outputs = {"status": COUNTED}
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.MODIFY: (Goal.ON, Goal.OFF)}
+    step = 1
+
+    @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return the one name."""
+        return ("twice",)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take commands and count."""
-        self.orders.take(read.operator)
+        self.orders.take(read.operator, self._set)
         held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
-        write.status.count += not held
+        write.status.count += 0 if held else self.step
         self.orders.done()
         self.orders.report(write.status, read.command.value.operator)
         write.status.state = State.EXECUTING
+
+    def _set(self, command: Message) -> None:
+        if command.what == Operation.MODIFY:
+            self.step = 2 if command.goal == Goal.ON else 1
 
     def self_test(self) -> None:
         """Begin without orders."""

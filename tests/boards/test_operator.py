@@ -141,6 +141,25 @@ def test_a_command_stays_in_force_when_the_next_one_is_refused(commanded: Callab
     assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, Operation.HOLD)
 
 
+def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
+    commanded: Callable[..., RackConfig],
+) -> None:
+    setting = commands(
+        "level='lower', what='modify', name='twice', on=true, tick=50",
+        "level='lower', what='hold', tick=60",
+        "level='lower', what='modify', name='twice', on=false, tick=70",
+        "level='lower', what='resume', tick=80",
+    )
+    _, events, boxes = run(commanded(setting))
+    rows = boxes["lower.status"]
+    counts = np.diff(rows["message"]["count"])
+    assert [counts[rows["tick"][1:] == tick].item() for tick in (50, 51, 60, 61, 80, 81)] == [1, 2, 2, 0, 0, 1]
+    at = rows["message"][rows["tick"] == 71]
+    assert (at["standing"], at["answer"], at["operator"]) == (Operation.HOLD, Answer.DONE, 3)
+    texts = [event.text for event in events if event.kind == "command" and event.code == "modify"]
+    assert texts == ["modify twice on (command 1)", "modify twice off (command 3)"]
+
+
 def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackConfig]) -> None:
     config = commanded(HELD)
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)})
@@ -211,7 +230,7 @@ MISTAKES = {
     ),
     "not for this level": (
         "level='lower', what='goto', home=true",
-        "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume",
+        "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume, modify on|off",
     ),
     "no goal": ("level='upper', what='goto'", "command[0].goal: missing; goto of 'upper' takes one of: home"),
     "another goal": (
@@ -223,6 +242,22 @@ MISTAKES = {
         "command[0].goal: several given: joints|home; goto of 'upper' takes one of: home",
     ),
     "a goal too much": ("level='upper', what='hold', home=true", "command[0].home: hold takes no goal; remove it"),
+    "a setting of nothing": (
+        "level='lower', what='modify', on=true",
+        "command[0].name: modify of 'lower' knows: twice",
+    ),
+    "a setting of something unknown": (
+        "level='lower', what='modify', name='thrice', on=true",
+        "command[0].name = \"thrice\": modify of 'lower' knows: twice",
+    ),
+    "a setting to nothing": (
+        "level='lower', what='modify', name='twice'",
+        "command[0].goal: missing; modify of 'lower' takes one of: on|off",
+    ),
+    "a name too much": (
+        "level='lower', what='hold', name='twice'",
+        'command[0].name = "twice": hold takes no name; remove it',
+    ),
     "two times": ("level='upper', what='hold', tick=3, at=1", "command[0].at = 1.0: tick is also given"),
     "unknown key": ("level='upper', what='hold', tik=3", "command[0].tik = 3: unknown key; did you mean 'tick'?"),
 }

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.mailbox.queue import is_position
 from rack.boards.config.ports import all_ports
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.toml import to_toml
@@ -111,6 +112,9 @@ class Targets:
         """Return whether the mailbox has readers, and messages often enough: plans are not periodic."""
         # The clock writes only for an operator.
         if not box.readers or box.writer == CLOCK or (kind.where == "lock" and box.protocol != "lock"):
+            return False
+        # A queue is written on demand, and the position of its reader through no port.
+        if kind.where == "writer" and (box.protocol == "queue" or is_position(box)):
             return False
         role = self._roles[box.writer]
         return role in kind.tasks and (kind.where != "writer" or role == "executor")

@@ -15,7 +15,7 @@ from rack.tools.faults.ending import Strike
 
 FOUND = ("detection", "miss", DIED)
 """Kinds of events that can be a detection."""
-MAILBOX_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.LOCKED}
+MAILBOX_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.QUEUE_FULL}
 CLOCK_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE}
 TASK_ALARMS = {alarm.name.lower() for alarm in (Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED)}
 BRAKES = "brakes_closed"

@@ -39,6 +39,7 @@ KINDS = {
     Alarm.BRAKES_OPENED: "recovery",
     Alarm.RE_REFERENCED: "recovery",
     Alarm.LATCHED: "reaction",
+    Alarm.QUEUE_FULL: "held",
 }
 
 

@@ -111,6 +111,35 @@ def test_a_port_that_is_read_rarely_raises_no_alarm(config: MakeConfig) -> None:
         assert [event for event in rack.events if event.kind == "detection"] == []
 
 
+NO_TABLE = TEXT.partition("[board.notes.exchange]")[0]
+QUEUE = (
+    "protocol.mailbox={ 'wave.status' = 'queue' }",
+    "board.notes.executor='wave_levels:Watch'",
+    "board.notes.exchange={ status = { every = 4, phase = 1 } }",
+)
+
+
+def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(config: MakeConfig) -> None:
+    with Rack(config(*QUEUE, text=NO_TABLE)) as rack:
+        rack.run(1.5)
+        assert [event for event in rack.events if event.kind == "detection"] == []
+        found = Written.on(rack.segment).messages
+    (every, phase), (cycles, first) = NOTES, SPARSE
+    taken, sent = found["wave.status_taken"], found["wave.status"]
+    assert taken["tick"].tolist() == list(range(phase + every * first, 600, every * cycles))
+    counts = [int(np.sum(sent["visible_at"] <= tick)) for tick in taken["tick"]]
+    assert taken["message"]["taken"].tolist() == counts
+    assert not taken["message"]["unread"].any()
+
+
+def test_a_queue_is_not_read_asynchronously(config: MakeConfig) -> None:
+    wanted = "board.notes.exchange={ status = { asynchronous = true } }"
+    with pytest.raises(
+        ConfigError, match=r"^board.notes.exchange.status.asynchronous = true: 'wave.status' is a queue"
+    ):
+        resolve(config(*QUEUE[:2], wanted, text=NO_TABLE))
+
+
 def killed(config: MakeConfig, victim: str) -> Any:
     """Return the rows of the reader's record and status after the death of a board at tick 41."""
     plain = config("supervision.lockstep_restart_s=0.1", text=TEXT)

@@ -9,12 +9,22 @@ import pytest
 
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
-from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, executor, reference, sensor_monitor
+from rack.levels.servo import (
+    ServoExecutor,
+    actuator_monitor,
+    control,
+    curves,
+    driver,
+    joint_control,
+    joint_torques,
+    reference,
+    sensor_monitor,
+)
 from tests.levels.arms import config
 from tests.levels.servo.rig import Course, ServoRig
 
 JOINTS = 7
-MODULES = (curves, reference, sensor_monitor, actuator_monitor, control, executor)
+MODULES = (curves, reference, sensor_monitor, actuator_monitor, control, driver, joint_control, joint_torques)
 FUNCTIONS = {name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)}
 
 
@@ -63,6 +73,16 @@ def wanted_of(seed: int, limit: float) -> tuple[Any, ...]:
     return constants, noise(seed + 3, 3, JOINTS), noise(seed + 4, 2, JOINTS), inertia, bias
 
 
+def joints_of(seed: int) -> tuple[Any, ...]:
+    """Return the arguments of `servo_joints`: its torques are cut, NaN, or neither; some joints are of other boards."""
+    limit, driven = (1.0, 1e5)[seed % 2], np.arange(JOINTS) % 2 == 0
+    constants = np.outer((3600.0, 120.0, abs(noise(seed)[0]), limit, 0.0), np.ones(JOINTS))
+    constants[4] = driven
+    loads = np.abs(noise(seed + 1, 4, JOINTS)) * (np.nan if seed == 3 else 1.0)
+    motion = noise(seed + 2, 2 * JOINTS), noise(seed + 3, 3, JOINTS)
+    return constants, loads, 0.4, 0.001, 0.002, *motion, noise(seed + 4, 3 * JOINTS), noise(seed + 5, 4 * JOINTS)
+
+
 CASES: dict[str, list[tuple[Any, ...]]] = {
     "set_motion": [(table(1), 0.02, ends_s, 0.013, 0.00125, noise(2, 3, JOINTS)) for ends_s in (0.01, 0.0135, np.inf)],
     "set_bridge": [(table(3), 0.02, 0.02, 0.013, noise(4), noise(5), 0.02, table(6))],
@@ -76,11 +96,16 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         motion_of(k, following, size) for k in range(20) for following, size in ((0.02, 1), (9, 1), (9, 1e6))
     ],
     "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
+    "servo_joints": [joints_of(k) for k in range(4)],
+    "add_up": [
+        (noise(k, 3 * JOINTS + 5), noise(k + 1, 3, JOINTS), size * noise(k + 2, 90), np.array([0, 30, 60]))
+        for k, size in ((1, 1.0), (2, 0.0))
+    ],
     "show": [
         (noise(1, 5 * JOINTS + 3), noise(2, 3 * JOINTS), noise(5), *noise(3, 2, 3, JOINTS), noise(4), 0.1, 0.2, 0.3)
     ],
 }
-VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2}
+VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2, "add_up": 2}
 """Kinds of verdicts that the cases reach; else: None."""
 
 

@@ -101,7 +101,7 @@ def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
 def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
     rows = {row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)}
     assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
-    assert rows["lower"]["takes"] == "hold, resume"
+    assert rows["lower"]["takes"] == "hold, resume, modify on|off"
 
 
 REFUSED = {
@@ -114,7 +114,7 @@ REFUSED = {
         "--timeout needs --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
-    "nothing that is said": (("upper", "halt"), "what = \"halt\": should be 'hold', 'resume', 'setpoint' or 'goto'"),
+    "nothing that is said": (("upper", "halt"), "'setpoint', 'goto' or 'modify'"),
     "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
     "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
     "no word": (("upper", "goto", "hom"), "'hom': not a goal; permitted: home, joints=..., position=..."),
@@ -183,7 +183,14 @@ def test_a_clock_without_ticks_is_not_waited_for(
 
 
 def test_goals_are_numbers_with_commas() -> None:
-    assert goal_of(["position=1,-2.5,3e-1", "direction=0,0,-1"]) == {
+    assert goal_of("goto", ["position=1,-2.5,3e-1", "direction=0,0,-1"]) == {
         "position": [1.0, -2.5, 0.3],
         "direction": [0.0, 0.0, -1.0],
     }
+
+
+def test_a_setting_is_a_name_and_on_or_off() -> None:
+    assert goal_of("modify", ["friction", "off"]) == {"name": "friction", "on": False}
+    for words in ([], ["friction"], ["friction", "maybe"], ["friction", "on", "off"]):
+        with pytest.raises(Failure, match="permitted: modify NAME on, modify NAME off"):
+            goal_of("modify", words)

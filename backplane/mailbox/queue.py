@@ -1,0 +1,223 @@
+"""Mailboxes under protocol queue: first in first out, one reader, each message read once and in order.
+
+The writer sends any number of messages in a cycle. They are published together at its end, by one store, and become
+visible as under time-slice: a writer killed before that has sent none of them. The reader takes those that are visible
+at its release tick, oldest first, as many as it has room for.
+
+A queue is bounded: its `capacity` is the largest number of unread messages. When it is full `send` returns False: the
+writer never waits, and no unread message is overwritten. What has been taken is a message too: in each of its cycles
+the reader writes its position into a mailbox of its own, `<queue>_taken`, under time-slice. So fullness depends on
+ticks alone: what the reader takes at tick T gives the writer room from T plus the reader's cycle on.
+
+The reader's position is in shared memory before its level processes, so a message is read at most once, whatever
+happens: a reader killed in a cycle has taken the messages of that cycle, and its successor continues after them. The
+other order would read them twice, and a message that makes its reader fail would make every successor fail too. A
+level that must know whether a message was acted on compares its id with the one that the reader's status echoes.
+
+A lost, damaged or forged message is counted, and the order goes on with the next one.
+
+Alternative considered: a position word in the mailbox's head, without a mailbox. It is not a function of ticks, so
+whether a queue is full would depend on which process is faster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from struct import Struct
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
+from rack.backplane.mailbox.slots import Slots, pid_of
+from rack.backplane.message import Field, Message, MessageType
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box, Slot
+
+TAKEN = MessageType(
+    "queue_taken",
+    1,
+    (
+        Field("taken", "i8", "1", "serial of the newest message that the reader of the queue has taken; 0: none"),
+        Field("unread", "i8", "1", "messages that this reader could see, and left in the queue"),
+    ),
+)
+# Plain integers for the hot path.
+_HEAD, _REFUSED = int(Box.HEAD), int(Box.REFUSED)
+_EPOCH, _VISIBLE = int(Slot.EPOCH), int(Slot.VISIBLE_AT)
+_PUT_POSITION = Struct("@2q").pack_into
+ALL = 1 << 62
+"""Room for every message."""
+
+
+def taken_name(queue: str) -> str:
+    """Return the name of the mailbox in which a queue's reader writes its position."""
+    return f"{queue}_taken"
+
+
+def is_position(spec: MailboxSpec) -> bool:
+    """Say whether a mailbox holds the position of a queue's reader: the board itself writes it."""
+    return spec.message == TAKEN.name
+
+
+class QueueWriter(Writer):
+    """The one writer of a queue. A level fills `message` and calls its `send`; the board calls `write`, once a cycle.
+
+    `taken` is the reader's position as of the writer's release tick: the board keeps it up to date.
+    """
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        super().__init__(segment, name)
+        slots = self._slots
+        # Messages are published to a copy of the mailbox's head, then shown together.
+        self._shared = slots.box
+        slots.box = memoryview(bytearray(slots.box)).cast("q")
+        self.message = _sending(slots, self._send, self.room)
+        self.taken = 0
+        self.refused = 0
+        """Messages refused by this writer, because the queue was full."""
+        self._pending: list[bytes] = []
+        self._shown_at = 0
+
+    def room(self) -> int:
+        """Return how many messages the queue still takes in this cycle."""
+        unread = self.serial - self.taken + self.held + len(self._pending)
+        return max(0, self.spec.capacity - unread)
+
+    def _send(self) -> bool:
+        if not self.room():
+            self.refused += 1
+            self._shared[_REFUSED] += 1
+            return False
+        self._pending.append(bytes(self.message.raw))
+        return True
+
+    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
+        """Publish the messages sent in the cycle released at `tick`; return False when it is too late for them."""
+        if not self._pending:
+            return True
+        visible_at = self.visible_at(tick, now)
+        for _ in self.outgoing():
+            self._slots.publish(tick, visible_at, tick if basis is None else basis)
+        self.show()
+        return now is None or now < tick + self._delay
+
+    def visible_at(self, tick: int, now: int | None) -> int:
+        """Return the tick from which messages released at `tick` and written now are visible, lost ones too."""
+        self._shown_at = super().visible_at(tick, now)
+        return self._shown_at
+
+    def outgoing(self) -> Iterator[None]:
+        """Put each message of the cycle into `message` in turn; the level finds its own content there again."""
+        slots, present = self._slots, bytes(self.message.raw)
+        if self._shared[_HEAD] != slots.box[_HEAD]:
+            self.intruder = pid_of(slots.heads[(self.serial + 1) & slots.mask][_EPOCH])
+        pending, self._pending = self._pending, []
+        for content in pending:
+            self.message.raw[:] = content
+            yield
+        self.message.raw[:] = present
+
+    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+        """Publish `message`, to be shown by `show`. `damage`: see `Slots.publish`."""
+        self._slots.publish(tick, visible_at, basis, damage)
+        return True
+
+    def lose(self) -> None:
+        """Publish a serial without its message, as an injected loss does: the reader finds the gap at its tick."""
+        slots = self._slots
+        slots.heads[(self.serial + 1) & slots.mask][_VISIBLE] = self._shown_at
+        slots.lose()
+
+    def show(self) -> None:
+        """Show the reader everything published, by one store."""
+        self._shared[_HEAD] = self.serial
+
+
+def _sending(slots: Slots, send: Callable[[], bool], room: Callable[[], int]) -> Message:
+    """Return the outgoing message of a queue: it has the methods `send` and `room`."""
+    plain = slots.message
+    kind = type("Message", (type(plain),), {"__slots__": ("room", "send")})
+    message: Message = object.__new__(kind)
+    message.__init__(slots.dtype, plain.raw)  # type: ignore[misc]
+    # Their slots hide the methods of `Message`.
+    setattr(message, "send", send)  # noqa: B010
+    setattr(message, "room", room)  # noqa: B010
+    return message
+
+
+class QueueReader(Reader):
+    """The one reader of a queue: a second one is refused with `MailboxError`.
+
+    `taken` is its position, the serial of the newest message taken. A new reader continues after its predecessor's.
+    """
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        super().__init__(segment, name)
+        self._position = Writer(segment, taken_name(name))
+        self.taken = _last_position(segment, name)
+        # The value of a reading without a new message, until there is one.
+        if self.taken and self._obtain(self.taken):
+            self.transfers = 0
+
+    def read(self, tick: int) -> Reading:
+        """Take every message visible at `tick`."""
+        return self.take(tick, ALL)
+
+    def take(self, tick: int, most: int, now: int | None = None) -> Reading:
+        """Take the messages visible at `tick`, oldest first, at most `most`, and publish the position.
+
+        The newest taken is the value, the others are in `earlier`. `now`: the clock's tick, as in `Writer.write`.
+        """
+        self.accesses += 1
+        head, count, earlier = self._box[0], 0, list[Message]()
+        while count < most and self._sees(self.taken + 1, head, tick):
+            last = bytes(self.message.raw) if count else b""
+            if self._obtain(self.taken + 1):
+                if count:
+                    earlier.append(Message(self.slots.dtype, memoryview(bytearray(last))))
+                count += 1
+            elif not self._skips(self.taken + 1, head):
+                break
+            self.taken += 1
+        self._publish_position(head, tick, now)
+        if not count:
+            return self._unchanged
+        return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
+
+    def _sees(self, serial: int, head: int, tick: int) -> bool:
+        return serial <= head and self._heads[serial & self._mask][_VISIBLE] <= tick
+
+    def _publish_position(self, head: int, tick: int, now: int | None) -> None:
+        newest = self.taken
+        while self._sees(newest + 1, head, tick):
+            newest += 1
+        position = self._position
+        _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
+        position.write(tick, now)
+
+    def _skips(self, serial: int, head: int) -> bool:
+        """Judge a message that is not good; return False if the true one may still come in its place."""
+        slots, statistics = self.slots, self.statistics
+        statistics.bad_reads += 1
+        # A second look: the true message may just be overwriting a forged one.
+        slots.copy(serial)
+        if slots.serial != serial:
+            statistics.lost += 1
+        elif not slots.is_sound:
+            statistics.corrupt += 1
+        elif slots.is_lawful(self._signature):
+            return False
+        else:
+            statistics.forged += 1
+            statistics.forger = pid_of(slots.signature)
+            # Once the writer has sent more, it has not taken the place back.
+            return any(slots.fetch(later) and slots.is_lawful(self._signature) for later in range(serial + 1, head + 1))
+        return True
+
+    def close(self) -> None:
+        """Release the claim."""
+        self._position.close()
+
+
+def _last_position(segment: Segment, name: str) -> int:
+    reading = Reader(segment, taken_name(name)).peek()
+    return int(reading.value.taken) if reading.is_there else 0

@@ -1,0 +1,290 @@
+"""The part of a level that drives an arm, whatever it drives it to: sense, decide, drive or brake, report."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
+from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
+from rack.levels.arm.faulty import STEPS
+from rack.levels.compiled import compiled
+from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
+from rack.levels.messages import SCENE, Error
+from rack.levels.operator import Orders
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Terms
+from rack.levels.servo import actuator_monitor, sensor_monitor
+from rack.levels.servo.actuator_monitor import ActuatorMonitor
+from rack.levels.servo.control import ArmParams
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.sensor_monitor import SensorMonitor
+from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
+
+SCENES = Output(SCENE, cycles=8)
+"""At 400 Hz, a scene for every cycle of the levels that read it."""
+
+
+class SteadyStatus(NamedTuple):
+    """The fields of a status that seldom change."""
+
+    command: int
+    holding: bool
+    stopped: bool
+    cut: int  # cycles in which the level itself cut a set point or a torque
+    kept: str  # why the arm does not follow its set points
+    braked: bool
+    demand: Demand
+    clipped: int
+    touches: int
+    violations: int
+    pushed: int
+    error: Error  # latched
+    fault: str  # of the arm
+
+
+class ArmDriver(Executor):
+    """Drives an arm and advances its time; subclasses give the motion wanted, and the torques for it.
+
+    A cycle first advances the arm by the ticks since the last one: its time is the clock's, even if cycles were missed.
+    Safety comes first: on a demand, and while sensors or motors are at fault, the arm holds, stops or is braked;
+    afterwards motion resumes from where it is.
+
+    A subclass reads its last state as "before", and writes "status", "state" and "scene".
+    """
+
+    faults = STEPS
+    orders: Orders
+    """The operator's."""
+
+    def __init__(self, context: LevelContext, params: ArmParams) -> None:
+        super().__init__(context)
+        every = context.every
+        self.cell = cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self.arm: Arm = find_arm(params.arm)(cell, context.scene, context.clock_ns, every, context.seed)
+        self._faulty = FaultyLink(self.arm, cell, every, self.acted)
+        self._link: Link = self.arm  # the path to the arm; through `_faulty` while faults are injected
+        self.sensors = SensorMonitor(cell, params, context.tick_s, every)
+        self.motors = ActuatorMonitor(cell, params.following, context.period_s)
+        self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
+        self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
+        self._brakes = BrakeLog(self.arm, every)
+        self._wanted = np.zeros((2, len(cell.home)))  # the motion wanted in the last cycle begins with: rad, rad/s
+        self._wanted[0] = cell.home
+        self._numbers: tuple[Array, Array, Array] | None = None  # set in every cycle: the first arguments of `show`
+        self._show_numbers = show.load()
+        self._shown: SteadyStatus | None = None  # in the last status
+        self._started = False  # the first cycle has begun
+        self.abandoned = False  # set points were abandoned in the last cycle: the arm was braked
+        self.command = self.rests_on = 0  # serials of the newest command, and of the operator's that it rests on
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the level and of its arm."""
+        preload()
+        for module in (sensor_monitor, actuator_monitor):
+            module.preload()
+        joints = np.zeros((3, 1))
+        show.load()(np.zeros(8), joints[0], joints[0], joints, joints, joints[0], 0.0, 0.0, 0.0)
+
+    def inject(self, faults: Sequence[Fault]) -> None:
+        """Replace the faults between this level and the arm."""
+        self._faulty.inject(faults)
+        self._link = self._faulty if faults else self.arm
+
+    @abstractmethod
+    def take_messages(self, read: Ports) -> None:
+        """Take over what is new."""
+
+    @abstractmethod
+    def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
+        """Return the motion wanted in this cycle; None: there is none, brake. `missed`: cycles before it were missed.
+
+        After braking (`abandoned`) it begins where the arm is; with a reaction it comes to rest.
+        """
+
+    @abstractmethod
+    def terms(self) -> Terms:
+        """Return the equation of motion at the sensed state."""
+
+    @abstractmethod
+    def torques(self, wanted: Motion, sensed: Sensed, terms: Terms) -> tuple[Array, float]:
+        """Return torques, (joints,), N m, and grip force, N, for the wanted motion."""
+
+    @property
+    @abstractmethod
+    def holds(self) -> bool:
+        """Whether the gripper holds a part."""
+
+    @abstractmethod
+    def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
+        """Return the first five fields of a `SteadyStatus`."""
+
+    @property
+    def has_work(self) -> bool:
+        """Whether the level has work from which it can be kept. Default: once there was a command."""
+        return self.command > 0
+
+    def started(self) -> None:
+        """React to the start of a board whose arm was restored from its last state. Default: nothing."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Advance the arm to `tick`, sense, drive or brake, report."""
+        missed = self._catch_up(read.before, tick)
+        self.take_messages(read)
+        sensed, sensors = self._link.sense(), self.sensors
+        contact = self.arm.contact
+        sensors.look(sensed, tick, None if missed or self.abandoned else self._wanted, contact is not None)
+        if contact is not None:
+            self.stopping.struck(contact, self.arm.named(contact), tick)
+        reaction = self.stopping.decide(self.demand, sensors, tick)
+        if reaction is Reaction.BRAKE:
+            self.brake()
+        elif sensors.fresh:
+            self._drive(sensed, reaction, missed, tick)
+        else:
+            self.motors.drop()  # without a new sample the arm keeps its last torque
+        self._brakes.after_cycle(tick, self.findings)
+        self._report(write, sensed, reaction)
+        self.orders.report(write.status, self.rests_on)
+        self.arm.save(write.state)
+        self.stopping.remember(write.state)
+        if SCENES.is_due(tick, self.context.every, self.context.phase):
+            self.arm.look(write.scene)
+
+    def _catch_up(self, before: Reading, tick: int) -> bool:
+        """Advance the arm to `tick`; return whether cycles were missed. A restarted board first restores the arm."""
+        if not self._started:
+            self._start(before.value if before.is_there else None, tick)
+            return False
+        ticks = tick - self.arm.tick
+        self.arm.step(ticks)
+        self._brakes.after_waiting(tick, self.findings)
+        if ticks == self.context.every:
+            return False
+        self.motors.drop()
+        return True
+
+    def _start(self, before: Message | None, tick: int) -> None:
+        if before is not None:
+            self.arm.restore(before)
+            self.sensors.recall(before)
+            self.stopping.recall(before)
+            self.started()
+        if self.arm.braked:
+            self._brakes.start(self.arm.tick)
+        self.arm.step(tick - self.arm.tick)
+        self._brakes.after_waiting(tick, self.findings)
+        self._started = self.abandoned = True
+
+    def brake(self) -> None:
+        """Brake, and abandon the set points."""
+        self.arm.brake()
+        self.motors.drop()
+        self._wanted = self.sensors.state
+        self.abandoned = True
+
+    def _drive(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
+        """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is complete."""
+        wanted = self.next_motion(reaction, missed, tick)
+        if wanted is None:
+            return self.brake()
+        terms = self.terms()
+        failed = self.motors.look(wanted.table, self.sensors.state, terms, self.holds)
+        if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
+            return self.brake()
+        if reaction is Reaction.STOP and (self.abandoned or not wanted.velocity.any()):
+            return self.brake()
+        refused = self._link.drive(*self.torques(wanted, sensed, terms))
+        if refused is not None:
+            return self._refuse(refused, tick)
+        self._wanted, self.abandoned, self.stopping.refused = wanted.table, False, None
+        return self.motors.begin()
+
+    def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
+        if not self.stopping.trying:
+            self.findings.append(finding)
+        return self.stopping.motor_fails(finding.subject, finding.value, tick)
+
+    def _refuse(self, finding: Finding, tick: int) -> None:
+        """React to a torque that the arm refused, engaging its brakes."""
+        refused = self.stopping.refused
+        if refused is None or finding.alarm is not refused.alarm:
+            self.findings.append(finding)
+        self.stopping.refuse(finding, tick)
+        self.brake()
+
+    def _report(self, write: Ports, sensed: Sensed, reaction: Reaction) -> None:
+        """Fill the status, and the estimate in the state; the steady fields only when they change."""
+        arm, status = self.arm, write.status
+        if self._numbers is None:
+            moving, kept = numbers(status, "position", "grip_force"), numbers(write.state, "position", "doubt")
+            self._numbers = moving, kept, self.motors.torque
+        _, _, opening, opening_velocity, _ = sensed
+        self._show_numbers(
+            *self._numbers, self.sensors.estimate, self._wanted, arm.torque, opening, opening_velocity, arm.grip_force
+        )
+        shown = (
+            *self.course(reaction),
+            arm.braked,
+            self.demand,
+            arm.clipped,
+            arm.touches,
+            arm.violations,
+            arm.pushed,
+            self.stopping.error,
+            arm.fault,
+        )
+        if shown != self._shown:
+            self._shown = SteadyStatus(*shown)
+            self._show(status, self._shown)
+
+    def _show(self, status: Message, shown: SteadyStatus) -> None:
+        """Fill the steady fields."""
+        status.echo, status.holding, status.stopped, cut, kept, status.braked = shown[:6]
+        status.demand, clipped, status.touches, status.violations, status.pushed = shown[6:11]
+        status.clipped = clipped + cut
+        if shown.fault:
+            status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, shown.fault
+        elif shown.error:
+            status.state, status.error, status.reason = State.ERROR, shown.error, kept
+        else:
+            resting = State.IDLE if shown.holding else State.EXECUTING
+            status.state = State.HOLDING if kept and self.has_work else resting
+            status.error = Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
+            status.reason = kept or (self.arm.first_violation if shown.violations else self.arm.first_touch)
+
+
+def numbers(message: Message, first: str, last: str) -> Array:
+    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one array."""
+    fields = message.record.dtype.fields
+    assert fields is not None
+    begin, end = fields[first][1], fields[last][1] + fields[last][0].itemsize
+    return np.frombuffer(message.raw[begin:end])
+
+
+@compiled
+def show(
+    status: Array,  # (5 joints + 3,): set, its fields from `position` to `grip_force`
+    state: Array,  # (3 joints,): set, its fields from `position` to `doubt`
+    begun: Array,  # (joints,), N m: set, see `ActuatorMonitor.torque`
+    estimate: Array,  # (3, joints), rad, rad/s, rad
+    wanted: Array,  # (2, joints) or more, rad, rad/s
+    torque: Array,  # (joints,), N m
+    opening: float,  # m
+    opening_velocity: float,  # m/s
+    grip_force: float,  # N
+) -> None:
+    """Fill the fields of status and state that change in every cycle."""
+    joints = len(torque)
+    for j in range(joints):
+        for row in range(3):
+            state[row * joints + j] = estimate[row, j]
+        for row in range(2):
+            status[row * joints + j], status[(3 + row) * joints + j] = estimate[row, j], wanted[row, j]
+        status[2 * joints + j] = begun[j] = torque[j]
+    status[-3], status[-2], status[-1] = opening, opening_velocity, grip_force

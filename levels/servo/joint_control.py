@@ -1,0 +1,102 @@
+"""The law of a board that servoes joints of an arm: each by itself, with the inertia and load that it is given."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload
+
+MOVED_RAD = 0.01
+"""Distance of a joint from where the loads were computed at which they are computed again."""
+AT, DUE = slice(0, 2), slice(2, 4)
+"""Rows of inertia, kg m2, and load, N m: at the beginning of an interval, and at its end."""
+
+
+class JointLoads:
+    """Inertia and load of every joint: interpolated between references; computed where there is none."""
+
+    def __init__(self, cell: Cell) -> None:
+        joints = len(cell.dof)
+        self.table = np.zeros((4, joints))  # in the rows `AT` and `DUE`
+        self._begin = self._due = 0  # tick
+        self._payload = Payload(0.0, np.zeros(3))
+        self._dynamics, self._still = Dynamics(cell), np.zeros(joints)
+        self._computed_at = np.full(joints, np.nan)  # (joints,), rad; NaN: they are those of a reference
+
+    @staticmethod
+    def are_good(command: Message) -> bool:
+        """Return whether a `JOINT_REFERENCE` has inertias and loads that a torque can rest on."""
+        return bool(
+            np.isfinite(command.load).all() and np.isfinite(command.inertia).all() and command.inertia.min() > 0
+        )
+
+    def take(self, command: Message, tick: int) -> None:
+        """Go over to those of a good `JOINT_REFERENCE` until it is due."""
+        self.table[AT] += self.part(tick) * (self.table[DUE] - self.table[AT])
+        self.table[DUE] = command.inertia, command.load
+        self._begin, self._due = tick, command.due
+        self._payload = Payload(command.payload_mass, command.payload_offset.copy())
+        self._computed_at[:] = np.nan
+
+    def part(self, tick: int) -> float:
+        """Return the part of the present interval that has passed, 0 to 1."""
+        return 1.0 if tick >= self._due else (tick - self._begin) / (self._due - self._begin)
+
+    def hold(self, position: Array) -> None:
+        """Compute them for an arm at rest at `position`, (joints,), rad, unless they were computed near it."""
+        if (np.abs(position - self._computed_at) < MOVED_RAD).all():
+            return
+        inertia, bias = self._dynamics.terms(position, self._still, self._payload)
+        self.table[AT] = self.table[DUE] = np.diagonal(inertia), bias
+        self._computed_at[:] = position
+
+
+@compiled
+def servo_joints(
+    constants: Array,  # (5, joints): rows as below
+    loads: Array,  # (4, joints): inertia, load, at the beginning of an interval and at its end
+    part: float,  # of the interval that has passed
+    cycle_s: float,  # until the torque acts
+    age_s: float,  # of the sample, then
+    arm: Array,  # (2 joints,): sampled positions, rad, and velocities, rad/s
+    wanted: Array,  # (3, joints): rad, rad/s, rad/s2, now
+    torque: Array,  # (3 joints,): set: torques, N m, targets, rad, and their velocities, rad/s
+    status: Array,  # (4 joints,): set: positions, targets, their velocities, torques
+) -> None:
+    """Set torques that make every joint's error that of a damped oscillator, from a sample taken on to when they act.
+
+    torque = inertia (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + load + dry friction
+    """
+    stiffness, damping, dry, limits = constants[0], constants[1], constants[2], constants[3]  # 1/s2, 1/s, N m, N m
+    driven = constants[4]  # 1: a joint of this board; 0: of another
+    joints = len(driven)
+    for j in range(joints):
+        status[j] = arm[j]
+        if driven[j] == 0.0:
+            continue
+        acceleration = wanted[2, j]
+        position = arm[j] + age_s * (arm[joints + j] + 0.5 * age_s * acceleration)
+        velocity = arm[joints + j] + age_s * acceleration
+        target = wanted[0, j] + cycle_s * (wanted[1, j] + 0.5 * cycle_s * acceleration)
+        target_velocity = wanted[1, j] + cycle_s * acceleration
+        inertia = loads[0, j] + part * (loads[2, j] - loads[0, j])
+        load = loads[1, j] + part * (loads[3, j] - loads[1, j])
+        damped = acceleration + damping[j] * (target_velocity - velocity)
+        needed = inertia * (damped + stiffness[j] * (target - position)) + load
+        needed += dry[j] * math.tanh(target_velocity / FRICTION_SPEED)
+        needed = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
+        torque[j], torque[joints + j], torque[2 * joints + j] = needed, target, target_velocity
+        status[joints + j], status[2 * joints + j], status[3 * joints + j] = target, target_velocity, needed
+
+
+def preload() -> None:
+    """Load this module's compiled function."""
+    numbers = np.zeros(4)
+    table = np.zeros((5, 1))
+    servo_joints.load()(table, table[:4], 0.0, 0.0, 0.0, numbers[:2], table[:3], numbers[:3], numbers)

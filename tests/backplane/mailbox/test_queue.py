@@ -1,0 +1,205 @@
+"""Queues: each message once and in order, bounded, visible by ticks, whoever is killed and whatever is damaged."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.backplane.errors import MailboxError
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
+from rack.backplane.mailbox.queue import QueueReader, QueueWriter, taken_name
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box
+from tests.backplane.bus import NAME, message_address, queue
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, exit_status, fork
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+
+
+def ends(segment: Segment) -> tuple[QueueWriter, QueueReader]:
+    writer, reader = open_writer(segment, NAME), open_reader(segment, NAME)
+    assert isinstance(writer, QueueWriter)
+    assert isinstance(reader, QueueReader)
+    return writer, reader
+
+
+def send(writer: QueueWriter, tick: int, *serials: int, now: int | None = None) -> list[bool]:
+    """Send these messages in the cycle of a tick, and write them; return the verdicts."""
+    verdicts = []
+    for serial in serials:
+        writer.message.id, writer.message.row = serial, serial
+        verdicts.append(writer.message.send())
+    writer.write(tick, now)
+    return verdicts
+
+
+def ids(reading: Reading) -> list[int]:
+    """Return the messages that a read has taken, oldest first; each must be whole."""
+    if not reading.is_new:
+        assert not reading.earlier
+        return []
+    found = [*reading.earlier, reading.value]
+    assert all((message.row == message.id).all() for message in found)
+    return [message.id for message in found]
+
+
+def test_several_messages_of_a_cycle_are_read_in_order(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(*queue(8)))
+    assert reader.read(0).verdict is Verdict.NONE
+    assert send(writer, 0, 1, 2, 3) == [True] * 3
+    assert ids(reader.read(0)) == []
+    assert ids(reader.read(1)) == [1, 2, 3]
+    again = reader.read(2)
+    assert (again.verdict, again.value.id, again.earlier) == (Verdict.OLD, 3, ())
+
+
+def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(*queue(8)))
+    send(writer, 0, 1, 2, 3, 4)
+    assert [ids(reader.take(tick, most)) for tick, most in ((1, 0), (2, 1), (3, 2), (4, -1), (5, 9))] == [
+        [],
+        [1],
+        [2, 3],
+        [],
+        [4],
+    ]
+
+
+def test_a_full_queue_is_a_verdict_and_keeps_what_it_holds(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(3))
+    writer, reader = ends(segment)
+    assert writer.message.room() == 3
+    assert send(writer, 0, 1, 2) == [True, True]
+    assert send(writer, 1, 3, 4) == [True, False]
+    assert (writer.message.room(), writer.refused) == (0, 1)
+    assert open_observer(segment, NAME).slots.box[Box.REFUSED] == 1
+    assert ids(reader.read(2)) == [1, 2, 3]
+    assert send(writer, 2, 5) == [False]
+    writer.taken = 3
+    assert send(writer, 3, 6) == [True]
+    assert ids(reader.read(4)) == [6]
+
+
+def test_messages_of_a_cycle_are_published_together_or_not_at_all(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(8))
+
+    def die() -> None:
+        writer = open_writer(segment, NAME)
+        assert isinstance(writer, QueueWriter)
+        send(writer, 0, 1, 2)
+        for serial in (3, 4):
+            writer.message.id, writer.message.row = serial, serial
+            writer.message.send()
+        for _ in writer.outgoing():
+            # Killed before they are shown.
+            writer.publish(1, 2, 1)
+
+    assert exit_status(fork(die)) == 0
+    writer, reader = ends(segment)
+    assert ids(reader.read(9)) == [1, 2]
+    assert send(writer, 9, 5) == [True]
+    assert ids(reader.read(10)) == [5]
+
+
+def test_late_messages_become_visible_at_the_next_boundary(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(*queue(8, rates=(4, 1))))
+    send(writer, 0, 1, now=6)
+    assert [ids(reader.read(tick)) for tick in (4, 7, 8)] == [[], [], [1]]
+
+
+def test_a_new_reader_continues_after_the_last(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(8))
+    writer = open_writer(segment, NAME)
+    assert isinstance(writer, QueueWriter)
+    send(writer, 0, 1, 2, 3)
+
+    def take_two() -> None:
+        reader = open_reader(segment, NAME)
+        assert isinstance(reader, QueueReader)
+        assert ids(reader.take(1, 2)) == [1, 2]
+
+    assert exit_status(fork(take_two)) == 0
+    reader = open_reader(segment, NAME)
+    assert isinstance(reader, QueueReader)
+    # The last message taken is still there as an old one.
+    first = reader.take(5, 0)
+    assert (first.verdict, first.value.id) == (Verdict.OLD, 2)
+    assert ids(reader.read(6)) == [3]
+
+
+def test_a_second_reader_is_refused(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(8))
+    reader = open_reader(segment, NAME)
+
+    def open_again() -> None:
+        with pytest.raises(MailboxError, match=r"has a writer already"):
+            open_reader(segment, NAME)
+
+    assert exit_status(fork(open_again)) == 0
+    assert isinstance(reader, QueueReader)
+    reader.close()
+
+
+def test_an_observer_takes_nothing(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(8))
+    writer, reader = ends(segment)
+    send(writer, 0, 1, 2)
+    observer = open_observer(segment, NAME)
+    assert (observer.peek().value.id, observer.read(1).value.id) == (2, 2)
+    assert ids(reader.read(1)) == [1, 2]
+    position = open_observer(segment, taken_name(NAME)).peek().value
+    assert (position.taken, position.unread) == (2, 0)
+
+
+def test_position_counts_the_messages_left(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(8))
+    writer, reader = ends(segment)
+    send(writer, 0, 1, 2, 3)
+    send(writer, 1, 4)
+    reader.take(1, 1)
+    position = open_observer(segment, taken_name(NAME)).peek().value
+    assert (position.taken, position.unread) == (1, 2)
+
+
+@pytest.mark.parametrize("at", [0, 1, 2])
+def test_a_damaged_message_is_counted_and_the_order_goes_on(make_bus: MakeBus, at: int) -> None:
+    segment = make_bus(*queue(8))
+    writer, reader = ends(segment)
+    send(writer, 0, 1, 2, 3)
+    segment.bytes[message_address(segment, at + 1)] ^= 1
+    assert ids(reader.read(1)) == [serial for serial in (1, 2, 3) if serial != at + 1]
+    assert (reader.statistics.corrupt, reader.statistics.bad_reads) == (1, 1)
+    send(writer, 1, 4)
+    assert ids(reader.read(2)) == [4]
+
+
+def test_a_lost_message_is_found_at_its_tick_even_without_a_later_one(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(*queue(1, rates=(4, 1))))
+    writer.visible_at(0, None)
+    writer.lose()
+    writer.show()
+    assert writer.message.room() == 0
+    assert [reader.read(tick).is_new or reader.statistics.lost for tick in (0, 3, 4)] == [0, 0, 1]
+    assert reader.taken == 1
+    writer.taken = reader.taken
+    assert send(writer, 8, 2) == [True]
+    assert ids(reader.read(12)) == [2]
+
+
+def test_messages_keep_the_level_own_content_for_the_next_cycle(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(*queue(8)))
+    writer.message.id, writer.message.row, writer.message.text = 1, 1, "north"
+    writer.message.send()
+    writer.message.text = "south"
+    writer.write(0)
+    assert (writer.message.id, writer.message.text) == (1, "south")
+    assert reader.read(1).value.text == "north"
+
+
+def test_messages_of_other_mailboxes_cannot_be_sent(make_bus: MakeBus) -> None:
+    writer = open_writer(make_bus(*queue(8)), taken_name(NAME))
+    with pytest.raises(MailboxError, match=r"declare the port as Output\(\.\.\., queued=True\)"):
+        writer.message.send()
+    with pytest.raises(MailboxError, match=r"only messages of a queue"):
+        writer.message.room()

@@ -1,0 +1,270 @@
+"""Queues through the ports of two tasks: fullness and order by ticks alone, alarms, and faults of messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from time import monotonic_ns
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rack.backplane import semaphores
+from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.trace import FIELDS, TraceWriter
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.words import Block
+from rack.boards.faults import messages
+from rack.boards.faults.kind import KINDS
+from rack.boards.run.ports import InputPorts, OutputPorts
+from rack.levels.level import Reading
+from tests.backplane.bus import NAME, layout, queue, task
+from tests.processes import FORKS, exit_status, fork
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
+
+
+class QueueLink:
+    """A writing task that numbers its messages, and a reading task that keeps what it takes.
+
+    `refused` are the serials that the queue did not take.
+    """
+
+    def __init__(self, segment: Segment, sends: bool = True) -> None:
+        self.segment = segment
+        self.rates = tuple(segment.layout.task(name).every for name in ("writer", "reader"))
+        self.room = 1 << 30
+        heard = AlarmWriter(segment, "reader")
+        self._sent = ("point",) if sends else ()
+        self._open_writer()
+        self.reads = InputPorts(segment, {"point": NAME}, heard, room=lambda port: self.room)
+        self._trace = TraceWriter(segment, "writer")
+        self.serial = 0
+        self.taken: list[int] = []
+        self.refused: list[int] = []
+        self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
+
+    def _open_writer(self) -> None:
+        alarms = AlarmWriter(self.segment, "writer")
+        self._inputs = InputPorts(self.segment, {}, alarms)
+        self.ports = OutputPorts(self.segment, {"point": NAME}, alarms, self._inputs, self._sent)
+
+    def restart_writer(self) -> None:
+        """Replace the writing task, as a restart does."""
+        for writer in self.ports.writers.values():
+            writer.close()
+        self._open_writer()
+
+    def write(self, tick: int, count: int) -> None:
+        """Do the writer's cycle, and send that many messages."""
+        self._inputs.read(tick)
+        message = self.ports.messages.point
+        for _ in range(count):
+            self.serial += 1
+            message.id, message.row = self.serial, self.serial
+            if not message.send():
+                self.refused.append(self.serial)
+        self.ports.write(tick, tick)
+        # A late message is one whose cycle has ended before: this is its end.
+        record = dict.fromkeys(FIELDS, 0) | {"tick": tick, "end_ns": monotonic_ns()}
+        self._trace.write(*record.values())
+
+    def read(self, tick: int) -> Reading:
+        """Do the reader's cycle."""
+        self.reads.read(tick)
+        reading: Reading = self.reads.values.point
+        if reading.is_new:
+            self.taken += [message.id for message in (*reading.earlier, reading.value)]
+        return reading
+
+    def run(self, first: int, last: int, bursts: Callable[[int], int], reader_first: bool = False) -> None:
+        """Do the ticks from `first` up to and without `last`."""
+        for tick in range(first, last):
+            steps = [lambda tick=tick: self.write(tick, bursts(tick)), lambda tick=tick: self.read(tick)]
+            due = [step for step, every in zip(steps, self.rates, strict=True) if tick % every == 0]
+            for step in reversed(due) if reader_first else due:
+                step()
+
+    def alarms(self, name: str) -> list[Alarm]:
+        """Return what a task has rung since the last call."""
+        return [Alarm(row["code"]) for row in self._rings[name].drain().rows]
+
+    def fault(self, kind: str, *parameters: float) -> FaultEntry:
+        """Write with this fault from now on."""
+        values = [p.default or 0.0 for p in KINDS[kind].parameters]
+        entry = FaultTable(self.segment).add(
+            Injection(KINDS[kind].number, 0, -1, seed=7, parameters=(*parameters, *values[len(parameters) :]))
+        )
+        self.ports.apply([(kind, entry)])
+        return entry
+
+    def close(self) -> None:
+        """Give the bus back."""
+        for writer in self.ports.writers.values():
+            writer.close()
+        for reader in self.reads.readers.values():
+            reader.close()  # type: ignore[attr-defined]
+        self.segment.close()
+        semaphores.unlink_all(self.segment.rack)
+        unlink(self.segment.rack)
+
+
+MakeQueue = Callable[..., QueueLink]
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeQueue]:
+    made: list[QueueLink] = []
+
+    def make(capacity: int = 8, rates: tuple[int, int] = (1, 1), sends: bool = True) -> QueueLink:
+        tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
+        name = f"{rack_name}-{len(made)}"
+        segment = Segment.create(layout(name, queue(capacity, rates), tasks), "")
+        semaphores.create(segment.layout)
+        made.append(QueueLink(segment, sends))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_no_message_of_a_burst_is_lost_to_a_slower_reader(link: MakeQueue) -> None:
+    # 10 Hz, three motions a cycle, a reader at 4 Hz: it would sample 9 of 27.
+    rack = link(32, rates=(10, 25))
+    rack.run(0, 90, lambda tick: 3)
+    rack.run(90, 200, lambda tick: 0)
+    assert rack.taken == [*range(1, 28)]
+    assert rack.refused == rack.alarms("writer") == rack.alarms("reader") == []
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    capacity=st.integers(1, 6),
+    rates=st.tuples(st.integers(1, 6), st.integers(1, 6)),
+    bursts=st.lists(st.integers(0, 5), min_size=1, max_size=40),
+    rooms=st.lists(st.integers(0, 4), min_size=1, max_size=12),
+)
+def test_order_and_fullness_depend_on_ticks_alone(
+    capacity: int, rates: tuple[int, int], bursts: list[int], rooms: list[int]
+) -> None:
+    runs = []
+    for reader_first in (False, True):
+        tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
+        segment = Segment.create(layout(f"test-queue-{id(bursts)}", queue(capacity, rates), tasks), "")
+        semaphores.create(segment.layout)
+        rack = QueueLink(segment)
+        try:
+            most = 0
+            for tick in range(80):
+                rack.room = rooms[tick % len(rooms)]
+                rack.run(tick, tick + 1, lambda tick: bursts[tick % len(bursts)], reader_first)
+                most = max(most, rack.serial - len(rack.refused) - len(rack.taken))
+            rack.room = 99
+            rack.run(80, 100, lambda tick: 0, reader_first)
+        finally:
+            rack.close()
+        sent = [serial for serial in range(1, rack.serial + 1) if serial not in rack.refused]
+        assert rack.taken == sent
+        assert most <= capacity
+        runs.append((rack.taken, rack.refused))
+    assert runs[0] == runs[1]
+
+
+def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
+    rack = link(2)
+    rack.room = 0
+    rack.run(0, 30, lambda tick: 1)
+    assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
+    assert rack.refused == [*range(3, 31)]
+    rack.room = 9
+    rack.run(30, 34, lambda tick: 0)
+    assert rack.taken == [1, 2]
+
+
+def test_room_comes_back_one_cycle_of_the_reader_after_it_has_taken(link: MakeQueue) -> None:
+    rack = link(1, rates=(1, 4))
+    rack.run(0, 17, lambda tick: 1)
+    # Sent at 0, taken at 4, known from 8 on.
+    assert [serial - 1 for serial in range(1, 18) if serial not in rack.refused] == [0, 8, 16]
+
+
+def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) -> None:
+    rack = link(2, sends=False)
+    for tick in range(6):
+        message = rack.ports.messages.point
+        message.id, message.row = tick + 1, tick + 1
+        rack.write(tick, 0)
+        if tick == 3:
+            rack.read(tick)
+    assert rack.taken == [1, 2]
+    assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
+    assert [rack.read(9).value.id, rack.taken] == [6, [1, 2, 5, 6]]
+
+
+def test_silence_of_the_writer_proves_nothing_but_its_loss_counts(link: MakeQueue) -> None:
+    rack = link()
+    rack.run(0, 4, lambda tick: 1)
+    rack.run(4, 200, lambda tick: 0)
+    assert not rack.read(200).is_lost
+    rack.segment.block("writer")[Block.LOST] = 201
+    assert [rack.read(200).is_lost, rack.read(201).is_lost] == [False, True]
+    assert rack.alarms("reader") == []
+
+
+FOUND = {"drop": (Alarm.GAP, (0.5,)), "corrupt": (Alarm.DAMAGED, (0.5, 3)), "delay": (Alarm.HELD_BACK, (3,))}
+
+
+@pytest.mark.parametrize("kind", FOUND)
+@pytest.mark.parametrize("rates", [(1, 1), (1, 4), (4, 1)])
+def test_a_fault_of_messages_is_found_and_the_order_goes_on(link: MakeQueue, kind: str, rates: tuple[int, int]) -> None:
+    alarm, parameters = FOUND[kind]
+    rack = link(16, rates)
+    rack.run(0, 16, lambda tick: 2)
+    rack.fault(kind, *parameters)
+    rack.run(16, 48, lambda tick: 2)
+    rack.ports.apply([])
+    rack.run(48, 96, lambda tick: 1)
+    rack.run(96, 128, lambda tick: 0)
+    assert rack.alarms("reader") == [alarm]
+    assert rack.taken == sorted(set(rack.taken))
+    assert rack.taken[-1] == rack.serial
+    lost = rack.serial - len(rack.refused) - len(rack.taken)
+    assert lost > 0 if kind != "delay" else lost == 0
+
+
+@pytest.mark.parametrize("kind", ["mute", "reorder", "babble"])
+def test_a_fault_that_nothing_would_show_does_not_strike_a_queue(link: MakeQueue, kind: str) -> None:
+    rack = link()
+    entry = rack.fault(kind)
+    rack.run(0, 8, lambda tick: 1)
+    assert (rack.taken, entry[Entry.COUNT]) == ([*range(1, 8)], 0)
+
+
+def forge(rack: QueueLink, tick: int) -> None:
+    """Publish a forged message from another process."""
+    assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
+
+
+def test_a_forged_message_is_not_read_and_takes_no_ones_place(link: MakeQueue) -> None:
+    rack = link()
+    rack.run(0, 4, lambda tick: 1)
+    forge(rack, 4)
+    rack.read(4)
+    assert rack.alarms("reader") == [Alarm.MASQUERADE]
+    rack.run(5, 8, lambda tick: 1)
+    rack.run(8, 10, lambda tick: 0)
+    assert rack.taken == [*range(1, rack.serial + 1)]
+    assert rack.alarms("writer") == [Alarm.MASQUERADE]
+
+
+def test_forged_messages_do_not_hold_up_a_new_writer(link: MakeQueue) -> None:
+    rack = link()
+    rack.run(0, 4, lambda tick: 1)
+    forge(rack, 4)
+    rack.read(4)
+    rack.restart_writer()
+    rack.run(5, 8, lambda tick: 1)
+    rack.run(8, 10, lambda tick: 0)
+    assert rack.taken == [*range(1, rack.serial + 1)]
