@@ -79,8 +79,9 @@ class MailboxSpec:
 
     `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
     become visible at multiples of `every`, counted from tick `phase`. `depth` is the number of slots, a power of two.
-    `capacity`: of a queue, the largest number of unread messages; 0: it is no queue. `exchanges` are the readers that
-    do not simply read it in every cycle.
+    `rests_on` names the mailboxes on whose information its messages rest, all read by its writer; queues, in which
+    messages wait, are not among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
+    `exchanges` are the readers that do not simply read it in every cycle.
     """
 
     name: str
@@ -94,6 +95,7 @@ class MailboxSpec:
     version: int
     size: int
     fields: tuple[FieldSpec, ...]
+    rests_on: tuple[str, ...] = ()
     capacity: int = 0
     phase: int = 0
     exchanges: tuple[ExchangeSpec, ...] = ()

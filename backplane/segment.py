@@ -25,7 +25,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 7
+VERSION = 8
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -235,8 +235,10 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
 
 def mailbox_of(entry: dict[str, Any]) -> MailboxSpec:
     """Return a mailbox from plain data, its `fields` excepted."""
+    # Recordings of earlier versions lack the last two.
+    names = {key: tuple(entry.get(key, ())) for key in ("readers", "rests_on")}
     exchanges = tuple(ExchangeSpec(**exchange) for exchange in entry.get("exchanges", ()))
-    return MailboxSpec(**{**entry, "readers": tuple(entry["readers"]), "exchanges": exchanges})
+    return MailboxSpec(**{**entry, **names, "exchanges": exchanges})
 
 
 def layout_of(entry: dict[str, Any]) -> Layout:

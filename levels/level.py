@@ -12,6 +12,7 @@ Every level
 - Use `rack.levels.algebra` in place of `@`, `np.linalg`, `exp`, `arctan2` and the like: those differ in the last bit
   between processors.
 - Every output is written at the end of every cycle, unchanged fields with the values of the cycle before.
+- An output rests on the input of its name (a command on the command above); for another, see `Output.rests_on`.
 - A `Reading` before the first message is all zeros (`is_there` is False); later it repeats the newest (`is_new` is
   False). `is_lost`: its writer is dead or silent. A level that moves the arm then holds, and reports the reason.
 
@@ -86,7 +87,7 @@ class Input(NamedTuple):
 
 
 class Output(NamedTuple):
-    """A port that a level does not write once in every cycle."""
+    """A port that a level writes; its type alone for one of every cycle that rests on the input of the same name."""
 
     type: MessageType
     cycles: int = 1
@@ -95,6 +96,10 @@ class Output(NamedTuple):
     queued: bool = False
     """The level sends its messages itself, any number in a cycle: it fills `write.port` and calls `write.port.send()`.
     False: the queue is full, and the message was not taken; `write.port.room()` says how many more it takes."""
+    rests_on: str = ""
+    """The input whose information it passes on; default: the input of the same name, if there is one. Its messages
+    carry the tick of that information, of an input that reads many the oldest, of none their own release. By these
+    ticks the response of the whole hierarchy is measured."""
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
         """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`, writes it."""

@@ -15,6 +15,7 @@ from rack.boards.config import load, shared_out
 from rack.boards.config.schema import CLOCK_SLOT, RackConfig
 from rack.boards.config.timing import with_budgets
 from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.rack import spanned
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
 from rack.tools.console.tables import print_wrapped, table, terminal_width
@@ -187,7 +188,7 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     rows = [
         [
             *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), m["protocol"]),
-            *(f"{m['delay_ms']:g}", f"{m['writer']} > {', '.join(m['readers']) or '(nobody)'}"),
+            *(f"{m['delay_ms']:g}", f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}"),
         ]
         for m in found["mailboxes"]
     ]

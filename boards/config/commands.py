@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,16 @@ def commandable(config: RackConfig) -> dict[str, Commands]:
         if any(port.source == OWN_OPERATOR for port in executor.inputs.values()):
             found[name] = executor.commands
     return found
+
+
+def setting_name(config: RackConfig, board: str, number: int) -> str:
+    """Return the name that a board's level gives to something by `number`: see `Executor.names`."""
+    return _names(board, config)[number]
+
+
+def _names(board: str, config: RackConfig) -> Sequence[str]:
+    table = config.board[board]
+    return find_class(table.executor, Executor).names(table.params)
 
 
 def asked(given: Mapping[str, Any]) -> CommandConfig:
@@ -153,8 +163,7 @@ def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mi
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
-    board = config.board[command.level]
-    known = find_class(board.executor, Executor).names(board.params)
+    known = _names(command.level, config)
     if command.name not in known:
         yield Mistake(place, command.name, f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}")
 

@@ -184,8 +184,9 @@ class Wiring:
             readers = [by_name[reader] for reader in self.readers(name)]
             slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
             depth = depth_for(max(slowest + delay, self._kept_ticks), every)
-            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, phase=writer.phase)
-            box = self._mailbox(name, output.type, sizes, spec)
+            rests_on = tuple(box for box in ports.rests_on(name.partition(".")[2]) if self.protocol(box) != "queue")
+            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, rests_on=rests_on)
+            box = self._mailbox(name, output.type, sizes, partial(spec, phase=writer.phase))
             mailboxes += self._queue(box, readers[0], writer) if box.protocol == "queue" else [box]
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
@@ -197,7 +198,8 @@ class Wiring:
         delay, slowest = reader.every * reader.within_cycles, writer.every * writer.within_cycles
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
         capacity = self.config.protocol.depth.get(box.name, UNREAD)
-        yield replace(box, capacity=capacity, depth=queue_slots(capacity, box.delay + delay, self._kept_ticks))
+        slots = queue_slots(capacity, box.every, box.delay + delay, self._kept_ticks)
+        yield replace(box, capacity=capacity, depth=slots)
         depth = depth_for(max(slowest + delay, self._kept_ticks), read.every)
         visible = (read.phase + delay) % read.every
         spec = partial(MailboxSpec, writer=reader.name, every=read.every, delay=delay, depth=depth, phase=visible)

@@ -141,16 +141,26 @@ def _board(name: str, board: BoardConfig, known: list[str]) -> Iterator[Mistake]
 
 
 def _circles(config: RackConfig) -> Iterator[Mistake]:
-    """Find circles among levels: a walk from level to level would not end."""
-    for key, end in (("below", "lowest"), ("above", "highest")):
-        links = {name: [n for n in getattr(board, key) if n != name] for name, board in config.board.items()}
-        try:
-            TopologicalSorter(links).prepare()
-        except CycleError as error:
-            # It lists a circle from the last of its members to the first.
-            circle = error.args[1][::-1]
-            why = f"the levels form a circle, {' -> '.join(circle)}; the {end} level has no {key}"
-            yield Mistake(f"board.{circle[-2]}.{key}", circle[-1], why)
+    """Find a circle among levels: a walk from level to level would not end."""
+    links = list(config.links())
+    try:
+        TopologicalSorter({name: [upper for upper, lower in links if lower == name] for name in config.board}).prepare()
+    except CycleError as error:
+        circle = error.args[1][:-1]
+        pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
+        # The link that only one of its boards names is the likely mistake.
+        upper, lower = min(reversed(pairs), key=lambda link: len(_named_by(config, *link)))
+        board, key, end = _named_by(config, upper, lower)[0]
+        at = circle.index(lower)
+        walk = " -> ".join([*circle[at:], *circle[:at], lower])
+        why = f"the levels form a circle, {walk}; the {end} level has no {key}"
+        yield Mistake(f"board.{board}.{key}", upper if board == lower else lower, why)
+
+
+def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
+    """Return board and key of every table that puts one board above another, and the end of a hierarchy without it."""
+    tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
+    return [(board, key, end) for board, key, end, other in tables if other in getattr(config.board[board], key)]
 
 
 def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:

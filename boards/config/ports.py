@@ -45,6 +45,10 @@ class TaskPorts:
         """Port and mailbox of everything that the task reads."""
         return [(port, mailbox) for port, source in self.reads.items() for mailbox in mailboxes_of(source)]
 
+    def rests_on(self, output: str) -> tuple[str, ...]:
+        """Return the mailboxes on whose information an output rests."""
+        return mailboxes_of(self.reads.get(self.outputs[output].rests_on or output, {}))
+
 
 def all_ports(config: RackConfig, mistakes: list[Mistake]) -> list[TaskPorts]:
     """Return the ports of every task whose class is found; add all mistakes to `mistakes`."""
@@ -65,6 +69,10 @@ def _wired(config: RackConfig, place: TaskPlace, mistakes: list[Mistake]) -> Tas
     except LookupError as error:
         mistakes.append(Mistake(f"board.{place.board}.{place.role}", wanted, str(error.args[0])))
         return None
+    for port, entry in outputs.items():
+        if entry.rests_on and entry.rests_on not in kind.inputs:
+            why = f"its output '{port}' rests on '{entry.rests_on}'; inputs: {', '.join(kind.inputs) or 'none'}"
+            mistakes.append(Mistake(f"board.{place.board}.{place.role}", wanted, why))
     reads = dict(_sources(config, place, kind.inputs, mistakes))
     if place.role == "executor" and config.board[place.board].exchange:
         mistakes += exchange_mistakes(config, place.board, kind.inputs)

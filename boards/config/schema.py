@@ -292,6 +292,12 @@ class RackConfig(Table):
             return config.every
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
+    def links(self) -> Iterator[tuple[str, str]]:
+        """Yield board above and board below of every two neighbours, whichever of them names the other."""
+        listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
+        listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
+        yield from (link for link in dict.fromkeys(listed) if {*link} <= self.board.keys() and link[0] != link[1])
+
     def tasks(self) -> Iterator[TaskPlace]:
         """Yield every task in order: each board's executor, then its planner."""
         for name, board in self.board.items():

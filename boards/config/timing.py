@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.layout import Layout
+from rack.backplane.layout import Layout, TickGrid
 from rack.boards.config.mistakes import PLANNER_BUDGET
 from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
 from rack.levels.timing.rack import BoardTiming, RackTiming
@@ -38,8 +38,8 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
     within_ms = None if board.budget is None else board.budget.plan_within_ms
     return BoardTiming(
         name=name,
-        above=board.above,
-        below=board.below,
+        above=tuple(upper for upper, lower in config.links() if lower == name),
+        below=tuple(lower for upper, lower in config.links() if upper == name),
         coupling=board.coupling,
         every=layout.task(name).every,
         within_cycles=board.within_cycles,
@@ -52,10 +52,16 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
         budget=budget,
         plan_within_ns=None if within_ms is None else round(within_ms * NS_PER_MS),
         phase=board.phase,
-        reads={
-            box.name: layout.read_grid(box, name) for box in layout.mailboxes if box.exchanges and name in box.readers
-        },
+        reads=_reads(layout, name),
     )
+
+
+def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
+    """Return the ticks at which an executor reads the messages of others, by writer, if not in every cycle."""
+    own = [
+        (box.writer, exchange.grid) for box in layout.mailboxes for exchange in box.exchanges if exchange.task == board
+    ]
+    return {writer: max(grid for other, grid in own if other == writer) for writer, _ in own}
 
 
 def tick_ns(config: RackConfig) -> int:

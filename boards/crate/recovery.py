@@ -30,8 +30,11 @@ class Supervision:
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self._config, self._layout = config, layout
         self._restarts: dict[str, list[int]] = defaultdict(list)
-        self._rank = {task.name: _rank(config, task.board, task.role == "planner") for task in layout.tasks}
-        self._rank[CLOCK] = (0, False)
+        self._needs: dict[str, set[str]] = {CLOCK: set()}
+        for task in layout.tasks:
+            below = _all_below(config, task.board)
+            needed = {other.name for other in layout.tasks if other.board in below}
+            self._needs[task.name] = {CLOCK, *needed} | ({task.board} if task.role == "planner" else set())
 
     def admit(self, task: str, tick: int) -> Restart | None:
         """Count one more restart of a task, lost at `tick`; return None if no more are permitted."""
@@ -45,11 +48,12 @@ class Supervision:
 
     def in_order(self, tasks: list[str]) -> list[str]:
         """Return the tasks in order of restart: the clock, then lower levels before higher, executor before planner."""
-        return sorted(tasks, key=lambda task: self._rank[task])
+        # What a task needs, needs less than it does.
+        return sorted(tasks, key=lambda task: len(self._needs[task]))
 
     def must_wait(self, task: str, absent: list[str]) -> bool:
         """Say whether a task on which this one depends is still absent: any below it, or a planner's executor."""
-        return any(self._rank[other] < self._rank[task] for other in absent)
+        return not self._needs[task].isdisjoint(absent)
 
     def _policy(self, task: str) -> tuple[int, float]:
         common = self._config.supervision
@@ -60,10 +64,10 @@ class Supervision:
         return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
 
 
-def _rank(config: RackConfig, board: str, is_planner: bool) -> tuple[int, bool]:
-    """Return the number of levels below a board, including the clock."""
-    depth = 1 + max((_rank(config, below, False)[0] for below in config.board[board].below), default=0)
-    return depth, is_planner
+def _all_below(config: RackConfig, board: str) -> set[str]:
+    """Return the boards below a board, directly or not."""
+    direct = {lower for upper, lower in config.links() if upper == board}
+    return direct.union(*(_all_below(config, lower) for lower in direct))
 
 
 class Recovery:

@@ -33,7 +33,7 @@ def all_of(port: str) -> int:
 class InputPorts:
     """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port.
 
-    `readers` holds the reader of each port that reads one mailbox, `taken` every mailbox in the order of the ports.
+    `readers` holds the reader of each mailbox, `taken` every mailbox in the order of the ports.
     """
 
     def __init__(
@@ -53,7 +53,6 @@ class InputPorts:
         """
         self.task = ReadingTask()
         self.taken: list[Taken] = []
-        self._open = partial(watched, segment, alarms=alarms, task=self.task)
         self.values = Ports()
         self.readers: dict[str, Reader] = {}
         # Where each reading goes: the ports themselves, or the dict of a port that reads many mailboxes.
@@ -71,9 +70,8 @@ class InputPorts:
                 values[key] = Reading(found.reader.message, Verdict.NONE)
                 (self._plan if mailbox == plan else self._rest).append((values, key, read))
                 self.taken.append(Taken(values, key, found.reader))
-            if isinstance(source, str):
-                self.readers[port] = self.taken[-1].reader
-            else:
+                self.readers[mailbox] = found.reader
+            if not isinstance(source, str):
                 setattr(self.values, port, by_board)
         self.reads_plan = bool(self._plan)
         self._readers = [entry.reader for entry in self.taken]
@@ -124,11 +122,29 @@ class InputPorts:
         return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
 
+class OldestOf:
+    """The basis of what rests on several mailboxes: the oldest of those that hold a message. As of a `Reader`."""
+
+    def __init__(self, readers: Sequence[Reader]) -> None:
+        self._readers = readers
+
+    @property
+    def serial(self) -> int:
+        """Serial of one of the messages; 0: there is none."""
+        return max([reader.serial for reader in self._readers])
+
+    @property
+    def basis(self) -> int:
+        """Tick of the oldest information that the last good messages rest on."""
+        return min([reader.basis for reader in self._readers if reader.serial])
+
+
 class OutputPorts:
     """The mailboxes that a task writes; `messages` holds the outgoing message of each port.
 
     Each message carries the tick of the oldest information that it rests on. A command inherits the tick of the command
-    that it follows, a status that of the status below. So the system's response time can be measured.
+    that it follows, a status that of the status below: see `Output.rests_on`. So the system's response time can be
+    measured.
     """
 
     def __init__(
@@ -142,7 +158,7 @@ class OutputPorts:
         """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level sends by itself."""
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
         self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
-        self._rests_on = {port: inputs.readers.get(port) for port in mailboxes}
+        self._rests_on = {port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()}
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
         self._queues = {
@@ -237,3 +253,9 @@ class OutputPorts:
     def _traffic(self) -> tuple[int, int]:
         writers = self.writers.values()
         return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)
+
+
+def _basis(mailboxes: Sequence[str], readers: Mapping[str, Reader]) -> Reader | OldestOf | None:
+    """Return what gives the basis of a message that rests on these mailboxes; None: it rests on nothing read."""
+    found = [readers[name] for name in mailboxes]
+    return OldestOf(found) if len(found) > 1 else next(iter(found), None)

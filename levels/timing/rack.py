@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from math import prod
 from typing import Any, Literal
 
 from rack.backplane.layout import TickGrid
@@ -20,9 +22,11 @@ Coupling = Literal["tight", "loose", "none"]
 class BoardTiming:
     """One board. `every` is its cycle, `phase` its first release, in ticks; cores are those that the config asks for.
 
+    `above` and `below` name each other: a board is above all that it lists below, and all that list it above.
+
     `is_critical` is true if the plan update is the paper's critical section: it keeps the executor waiting. `budget` is
     None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock. `reads` holds
-    the ticks at which it reads a mailbox, by mailbox, if not in every cycle.
+    the ticks at which it reads the messages of another board, by that board, if not in every cycle.
     """
 
     name: str
@@ -47,14 +51,52 @@ class BoardTiming:
         """The ticks at which its cycles begin."""
         return TickGrid(self.every, self.phase)
 
-    def reads_at(self, mailbox: str) -> TickGrid:
-        """Return the ticks at which its executor reads a mailbox."""
-        return self.reads.get(mailbox, self.releases)
+    def reads_from(self, board: str) -> TickGrid:
+        """Return the ticks at which it reads the messages of another board."""
+        return self.reads.get(board, self.releases)
 
     @property
     def is_plan_budgeted(self) -> bool:
         """Whether the budget covers its planner: in a measured run the planner may have made no plan."""
         return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
+
+
+def spanned(names: Sequence[str]) -> str:
+    """Return names as text; of three or more that are numbered in order the first and the last, "joint1 ... joint6"."""
+    rows: list[list[str]] = []
+    for name in names:
+        if rows and name == _following(rows[-1][-1]):
+            rows[-1].append(name)
+        else:
+            rows.append([name])
+    return ", ".join(f"{row[0]} ... {row[-1]}" if len(row) > 2 else ", ".join(row) for row in rows)
+
+
+def _following(name: str) -> str:
+    """Return the name that is numbered one higher; empty if the name has no number."""
+    part = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
+    return f"{part[1]}{int(part[2]) + 1}{part[3]}" if part else ""
+
+
+@dataclass(frozen=True)
+class ParallelChains:
+    """Chains of boards, highest first, of equal cycles, in ticks: every combination of the boards of each level.
+
+    A rack with a board for every joint has one chain for each, and one answer for all of them.
+    """
+
+    chains: tuple[tuple[str, ...], ...]
+    cycles: tuple[int, ...]
+
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """The boards of each level, as text."""
+        return tuple(spanned(tuple(dict.fromkeys(boards))) for boards in zip(*self.chains, strict=True))
+
+    @property
+    def text(self) -> str:
+        """All of them in one line: "trajectory > joint1 ... joint6 > arm"."""
+        return " > ".join(self.levels)
 
 
 @dataclass(frozen=True)
@@ -157,32 +199,70 @@ class RackTiming:
         for name in above:
             yield from self._chains((name, *part))
 
-    @property
-    def hierarchy(self) -> tuple[str, ...]:
-        """The chain with the longest response, from the highest board to the lowest; empty without one."""
-        return max(self.chains, key=lambda chain: self.response_ticks(chain, "command"), default=())
+    @cached_property
+    def parallel(self) -> tuple[ParallelChains, ...]:
+        """All chains: those of equal cycles together where they are every combination of their boards."""
+        by_cycles: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
+        for chain in self.chains:
+            by_cycles.setdefault(tuple(self.boards[name].every for name in chain), []).append(chain)
+        found = []
+        for cycles, chains in by_cycles.items():
+            is_every = len(chains) == prod(len(set(boards)) for boards in zip(*chains, strict=True))
+            together = [chains] if is_every else [[chain] for chain in chains]
+            found += [ParallelChains(tuple(part), cycles) for part in together]
+        return tuple(found)
 
-    def response_ticks(self, boards: Sequence[str], port: str) -> int:
-        """Return the longest response along boards that pass on what they read, by their mailboxes `port`, ticks."""
+    @property
+    def hierarchy(self) -> ParallelChains:
+        """The chains with the longest response; without levels above each other, none."""
+        return max(self.parallel, key=self.command_ticks, default=ParallelChains((), ()))
+
+    def command_ticks(self, chains: ParallelChains) -> int:
+        """Return the longest response of a command along any of these chains, ticks."""
+        return max((self.response_ticks(chain) for chain in chains.chains), default=0)
+
+    def status_ticks(self, chains: ParallelChains) -> int:
+        """Return the longest response of a status along any of these chains, ticks."""
+        return max((self.response_ticks(chain[::-1]) for chain in chains.chains), default=0)
+
+    def response_ticks(self, boards: Sequence[str]) -> int:
+        """Return the longest response along boards, in the order in which the information passes, ticks."""
         passed = [self.boards[name] for name in boards]
-        waits = [grid_wait(one.releases, other.reads_at(f"{one.name}.{port}")) for one, other in pairwise(passed)]
+        waits = [grid_wait(one.releases, other.reads_from(one.name)) for one, other in pairwise(passed)]
         return response_ticks([board.every for board in passed], waits)
+
+    @cached_property
+    def connected(self) -> tuple[frozenset[str], ...]:
+        """The boards of every hierarchy: all that are connected by chains."""
+        found: list[frozenset[str]] = []
+        for chain in self.chains:
+            joined = [boards for boards in found if not boards.isdisjoint(chain)]
+            found = [boards for boards in found if boards.isdisjoint(chain)] + [frozenset(chain).union(*joined)]
+        return tuple(found)
+
+    @cached_property
+    def ranks(self) -> tuple[tuple[str, ...], ...]:
+        """The boards of all chains by level, the highest first: each as far down as its longest chain from above."""
+        depth: dict[str, int] = {}
+        for chain in self.chains:
+            for at, name in enumerate(chain):
+                depth[name] = max(at, depth.get(name, 0))
+        return tuple(tuple(name for name in depth if depth[name] == at) for at in sorted(set(depth.values())))
 
     @cached_property
     def longest_cycles(self) -> dict[str, float]:
         """R_max by board, in ticks: the longest cycle that a level may have.
 
-        With a goal for the response it is R_s / n (eq. 3.2), otherwise the longest cycle in the board's hierarchy. A
-        board outside of all hierarchies has its own cycle.
+        With a goal for the response it is R_s / n (eq. 3.2), n being the levels of the longest chain through the board;
+        otherwise the longest cycle in its hierarchy. A board outside of all hierarchies has its own cycle.
         """
         found = {name: float(board.every) for name, board in self.boards.items()}
-        for chain in sorted(self.chains, key=len):
-            if self.response_goal_ns is None:
-                together = {name for other in self.chains if other[0] == chain[0] for name in other}
-                longest = float(max(self.boards[name].every for name in together))
-            else:
-                longest = self.response_goal_ns / self.clock_ns / len(chain)
-            found |= dict.fromkeys(chain, longest)
+        if self.response_goal_ns is None:
+            for boards in self.connected:
+                found |= dict.fromkeys(boards, float(max(self.boards[name].every for name in boards)))
+        else:
+            for chain in sorted(self.chains, key=len):
+                found |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))
         return found
 
     def level(self, board: str) -> LevelTiming:

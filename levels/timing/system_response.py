@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from rack.backplane.layout import Layout, TickGrid
+from rack.backplane.layout import Layout, MailboxSpec, TickGrid
+from rack.backplane.mailbox.queue import is_position
 from rack.levels.timing.equations import grid_wait, response_ticks, system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import RackTiming
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Response of the hierarchy `levels`, highest first, in ms of simulated time; all 0 without a hierarchy.
+    """Response of the hierarchy, in ms of simulated time; all 0 without one. `levels` are its boards by level, as text.
 
     `command_ms` and `status_ms` are the bounds down and up, with the waits for the grid. `plan_ms` is, by level, the
     time from a planner's release until its plan can be used.
@@ -28,15 +29,15 @@ class Prediction:
 
 def predict(rack: RackTiming) -> Prediction:
     """Return the system's response as it follows from the cycles alone."""
-    levels, tick_ms = rack.hierarchy, rack.clock_ns * 1e-6
-    cycles = [rack.boards[name].every for name in levels]
+    hierarchy, tick_ms = rack.hierarchy, rack.clock_ns * 1e-6
+    cycles = hierarchy.cycles
     planned = [board for board in rack.boards.values() if board.has_planner]
     return Prediction(
-        levels=levels,
+        levels=hierarchy.levels,
         bound_eq_3_2_ms=system_response_bound_ns(cycles or [0]) * tick_ms,
         sum_eq_3_3_ms=system_response_ns((), cycles) * tick_ms,
-        command_ms=rack.response_ticks(levels, "command") * tick_ms,
-        status_ms=rack.response_ticks(levels[::-1], "status") * tick_ms,
+        command_ms=rack.command_ticks(hierarchy) * tick_ms,
+        status_ms=rack.status_ticks(hierarchy) * tick_ms,
         plan_ms={board.name: board.every * board.within_cycles * tick_ms for board in planned},
     )
 
@@ -47,7 +48,7 @@ class CommandPath:
 
     `releases` are the ticks at which each level begins its cycles, `reads` those at which it reads the command of the
     one above it, the first the operator's. `delay` is the ticks until a given command can be read. `is_exact` is true
-    if every message on the path is visible by ticks: with all deadlines met, the releases below are then exact,
+    if every message on the path is of protocol time-slice: with all deadlines met, the releases below are then exact,
     otherwise bounds.
     """
 
@@ -95,22 +96,41 @@ class CommandPath:
         return self.delay + self.reads[0].every - 1 + response_ticks(self.cycles, waits)
 
 
+def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
+    """Return the mailboxes that take information from board to board, each resting on the one before.
+
+    Where the way is broken, they are those of its end: of the longest part that arrives at the last board. A queue
+    breaks it: how long its messages wait there is for their writer to decide.
+    """
+    if len(boards) < 2:
+        return ()
+    sampled = [box for box in layout.mailboxes if box.protocol != "queue" and not is_position(box)]
+    return _along(layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers})
+
+
+def _along(layout: Layout, boards: Sequence[str], taken: Collection[str]) -> tuple[MailboxSpec, ...]:
+    """Return the longest row of mailboxes, one a board, that ends with one of those `taken`."""
+    if not boards:
+        return ()
+    last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]
+    return max(((*_along(layout, boards[:-1], box.rests_on), box) for box in last), key=len, default=())
+
+
 def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
-    """Return the path from every level of the hierarchy that an operator can command, by level."""
-    levels, boxes = rack.hierarchy, {box.name: box for box in layout.mailboxes}
-    found = {}
-    for at, level in enumerate(levels):
-        passed = levels[at:]
-        names = [f"{level}.operator", *(f"{name}.command" for name in passed[:-1])]
-        if all(name in boxes for name in names):
-            boards = [rack.boards[name] for name in passed]
-            reads = tuple(board.reads_at(box) for board, box in zip(boards, names, strict=True))
-            is_exact = all(boxes[name].is_repeatable for name in names)
-            releases = tuple(board.releases for board in boards)
-            found[level] = CommandPath(passed, releases, reads, boxes[names[0]].delay, is_exact)
+    """Return the longest path from every level that an operator can command to the lowest, by level."""
+    boxes = {box.name: box for box in layout.mailboxes}
+    found: dict[str, CommandPath] = {}
+    for chain in rack.chains:
+        passed = mailboxes_along(layout, chain)
+        for at, level in enumerate(chain):
+            operator, rest = boxes.get(f"{level}.operator"), chain[at:]
+            if operator is None or len(passed) < len(rest) - 1:
+                continue
+            taken = (operator, *passed[len(passed) - len(rest) + 1 :])
+            releases = tuple(rack.boards[name].releases for name in rest)
+            reads = tuple(layout.read_grid(box, name) for box, name in zip(taken, rest, strict=True))
+            is_exact = all(box.protocol == "time-slice" and box.is_repeatable for box in taken)
+            path = CommandPath(rest, releases, reads, operator.delay, is_exact)
+            if level not in found or path.longest > found[level].longest:
+                found[level] = path
     return found
-
-
-def lowest_level(paths: Mapping[str, CommandPath]) -> str:
-    """Return the level at the end of every path, which acts on all commands."""
-    return next(iter(paths.values())).levels[-1]

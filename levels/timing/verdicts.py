@@ -6,7 +6,7 @@ loads account for levels that share a core.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import chain
 from math import inf, isfinite
@@ -14,7 +14,7 @@ from typing import Any
 
 from rack.levels.timing import equations
 from rack.levels.timing.equations import Relation
-from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.rack import LevelTiming, ParallelChains, RackTiming
 from rack.levels.timing.response_time import response_times
 
 SYSTEM = "system"
@@ -85,27 +85,31 @@ def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVer
 
 
 def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the system's response; with a goal for it, also on every cycle of its chains."""
+    """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on every cycle in them."""
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
     cycles_ns = {name: board.every * rack.tick_ns for name, board in rack.boards.items()}
-    for names in rack.chains:
-        subject = SYSTEM if len(rack.chains) == 1 else f"{SYSTEM}, {names[-1]}"
-        yield from _of_chain(subject, rack, names, goal_ns)
+    for found in rack.parallel:
+        yield from _of_chains(rack, found, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
             relation = Relation(cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns))
             yield EquationVerdict.of("3.1", name, relation, "R_i <= R_max = R_s / n")
 
 
-def _of_chain(subject: str, rack: RackTiming, names: Sequence[str], goal_ns: float | None) -> Iterator[EquationVerdict]:
-    cycles_ns = [rack.boards[name].every * rack.tick_ns for name in names]
+def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
+    """Return the subject of the system's response along these chains; where there are others, it names them."""
+    return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
+
+
+def _of_chains(rack: RackTiming, chains: ParallelChains, goal_ns: float | None) -> Iterator[EquationVerdict]:
+    subject, cycles_ns = response_subject(rack, chains), [cycle * rack.tick_ns for cycle in chains.cycles]
     bound, limit = goal_ns, "timing.response_ms"
     if bound is None:
         bound, limit = equations.system_response_bound_ns(cycles_ns), "n R_max"
     total = equations.system_response_ns((), cycles_ns)
     yield EquationVerdict.of("3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}")
-    for way, order in (("command", 1), ("status", -1)):
-        relation = Relation(rack.response_ticks(names[::order], way) * rack.tick_ns, "<=", bound)
+    for way, ticks in (("command", rack.command_ticks(chains)), ("status", rack.status_ticks(chains))):
+        relation = Relation(ticks * rack.tick_ns, "<=", bound)
         yield EquationVerdict.of("3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {limit}")
 
 

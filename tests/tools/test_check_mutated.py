@@ -196,7 +196,7 @@ def test_a_spoilt_config_is_answered_in_time_with_what_is_wrong(
 
 
 ATTACKS = {
-    "circle": ("nasrem", 'board.servo.below="primitive"', "board.primitive.below"),
+    "circle": ("nasrem", 'board.servo.below="primitive"', "board.servo.below"),
     "no clock": ("nasrem", "clock.period_ms=1e-6", "clock.period_ms"),
     "no cycle": ("fig2", "board.level.every=1000000000000", "board.level.every"),
     "much too fast": ("fig2", "clock.speed=1e300", "clock.speed"),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from rack.boards.config import RackConfig, rack_timing
-from rack.levels.timing.equations import Relation, system_response_bound_ns
+from rack.levels.timing.equations import Relation
 from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, SYSTEM, EquationVerdict, verdicts
+from rack.levels.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, verdicts
 from rack.tools.analysis.breaches import Breach, breaches
 from rack.tools.analysis.rules import cycle_ns, response_ns, slice_ns, steps_ns
 from rack.tools.console.answer import Failure
@@ -137,18 +138,17 @@ def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[Eq
         return
     # The response is in simulated time.
     wall_ns = 1e6 * rack.tick_ns / rack.clock_ns
-    cycles_ns = [rack.boards[name].every * rack.tick_ns for name in rack.hierarchy]
-    bound, limit = system_response_bound_ns(cycles_ns), "n R_max"
-    if rack.response_goal_ns is not None:
-        bound, limit = rack.response_goal_ns / rack.speed, "timing.response_ms"
-    for way in ("command", "status"):
-        if (times := response[way]["measured_ms"]) is None:
+    for found, way in product((response, *response["others"]), ("command", "status")):
+        if (times := found[way]["measured_ms"]) is None:
             continue
-        longest_ns, bound_ns = times["max"] * wall_ns, response[way]["bound_ms"] * wall_ns
+        bound, limit = found["bound_eq_3_2_ms"] * wall_ns, "n R_max"
+        if rack.response_goal_ns is not None:
+            bound, limit = rack.response_goal_ns / rack.speed, "timing.response_ms"
+        longest_ns, bound_ns = times["max"] * wall_ns, found[way]["bound_ms"] * wall_ns
         meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
-        yield EquationVerdict.of("3.2", SYSTEM, Relation(longest_ns, "<=", bound), meaning)
+        yield EquationVerdict.of("3.2", found["subject"], Relation(longest_ns, "<=", bound), meaning)
         meaning = f"R_s of a {way} <= sum of R_i and of the waits for the grid"
-        yield EquationVerdict.of("3.3", SYSTEM, Relation(longest_ns, "<=", bound_ns), meaning)
+        yield EquationVerdict.of("3.3", found["subject"], Relation(longest_ns, "<=", bound_ns), meaning)
 
 
 def _tasks(found: Mapping[str, Cycles], rack: RackTiming, percentile: float) -> Iterator[EquationVerdict]:

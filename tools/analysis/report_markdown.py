@@ -233,19 +233,26 @@ def _times_row(name: str, task: Report) -> dict[str, str]:
 def _response(response: Report | None) -> Iterator[str | Grid]:
     if response is None:
         return
-    yield from ("", "## System response, ms of simulated time", "")
+    yield from ("", "## System response, ms of simulated time")
+    for found in (response, *response["others"]):
+        yield from _response_along(found)
+
+
+def _response_along(response: Report) -> Iterator[str | Grid]:
+    yield ""
     bounds = f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
     yield f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its cycle."
     yield ""
     ways = {"command, down": response["command"], "status, up": response["status"]}
     rows = [
         [
-            way,
+            way if len(found["levels"]) == len(response["levels"]) else f"{way} from {found['levels'][0]}",
             *(figure(found["measured_ms"], key) for key in ("p50", "max")),
             f"{found['bound_ms']:g}",
             JUDGED[found["holds"]],
         ]
         for way, found in ways.items()
+        if found["levels"]
     ]
     yield Grid(("way", "measured p50", "measured max", "bound", ""), rows)
     for way, found in ways.items():

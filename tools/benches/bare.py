@@ -20,8 +20,9 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.boards.classes import find_class
-from rack.boards.wiring import TaskWiring, mailboxes_of
+from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner, Ports, Reading, Verdict
+from rack.tools.console.answer import Failure
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,17 @@ class BareTask:
     def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post], ticks: int) -> None:
         self.spec = layout.task(wiring.task)
         self._ticks = ticks
-        sources = [(port, name) for port, source in wiring.inputs.items() for name in mailboxes_of(source)]
-        self._readers = [(port, PostReader(posts[name]).read) for port, name in sources]
-        self._values = Ports(**{port: read(-1) for port, read in self._readers})
+        self._values = Ports()
+        # Where each reading goes: the ports themselves, or the dict of a port that reads many mailboxes.
+        self._readers: list[tuple[dict[str, Reading], str, Callable[[int], Reading]]] = []
+        for port, source in wiring.inputs.items():
+            if isinstance(source, str):
+                self._add(self._values.__dict__, port, posts[source])
+            else:
+                by_board: dict[str, Reading] = {}
+                setattr(self._values, port, by_board)
+                for board, mailbox in source.items():
+                    self._add(by_board, board, posts[mailbox])
         self._posts = [posts[name] for name in wiring.outputs.values()]
         self._messages = Ports(**{port: posts[name].message for port, name in wiring.outputs.items()})
         self._busy_until = 0
@@ -102,6 +111,11 @@ class BareTask:
         kind.preload()
         self.level = kind(wiring.context)
         self.cycle = self._execute if isinstance(self.level, Executor) else self._plan
+
+    def _add(self, values: dict[str, Reading], key: str, post: Post) -> None:
+        reader = PostReader(post)
+        values[key] = reader.read(-1)
+        self._readers.append((values, key, reader.read))
 
     def _execute(self, tick: int) -> None:
         self._read(tick)
@@ -123,9 +137,8 @@ class BareTask:
                 self._write(tick)
 
     def _read(self, tick: int) -> None:
-        values = self._values.__dict__
-        for port, read in self._readers:
-            values[port] = read(tick)
+        for values, key, read in self._readers:
+            values[key] = read(tick)
 
     def _write(self, tick: int) -> None:
         for post in self._posts:
@@ -133,7 +146,12 @@ class BareTask:
 
 
 def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:
-    """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it."""
+    """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it.
+
+    Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes there is none.
+    """
+    if queues := [spec.name for spec in layout.mailboxes if spec.capacity]:
+        raise Failure(f"{', '.join(queues)}: a queue; only racks without any run without mailboxes")
     posts = {spec.name: Post(spec) for spec in layout.mailboxes}
     tasks = [BareTask(layout, wiring, posts, ticks) for wiring in wirings]
     try:

@@ -151,7 +151,8 @@ class ResponseRuns:
         chosen = sorted(found, key=lambda c: [o.serial for o in found if o.level == c.level].index(c.serial))
         for command in chosen[: max(0, most)]:
             self._progress.begin(f"twin without command {command.serial} to {command.level}")
-            yield compare(self._config, run, command, scratch / f"{self._runs}-{command.serial}")
+            status = _status(response, command.level)
+            yield compare(self._config, run, command, status, scratch / f"{self._runs}-{command.serial}")
             self._progress.end(0.7 * LOCKSTEP_RUN_S, "compared", [])
 
 
@@ -197,26 +198,38 @@ def run_commands(config: RackConfig, commands: Sequence[CommandConfig], folder: 
 
 def holds_of_moving_arm(recording: Recording, response: OperatorResponse) -> list[AnsweredCommand]:
     """Return the holds given to a moving arm: it was moving around the predicted tick."""
-    ticks, velocities = (recording.signal("servo.status", name) for name in ("tick", "target_velocity"))
-    speed = dict(zip(ticks.tolist(), np.abs(velocities).max(axis=1).tolist(), strict=True))
     holds = [c for c in response.measured if c.what == "hold"]
-    return [c for c in holds if all(speed.get(c.predicted + k, 0.0) > MOVING_RAD_S for k in range(-8, 24, 8))]
+    return [c for c in holds if _is_moving(recording, _status(response, c.level), c.predicted)]
 
 
-def compare(config: RackConfig, run: CommandedRun, command: AnsweredCommand, folder: Path) -> Twin:
-    """Run the twin of a run without one of its commands, and compare the torques."""
+def _status(response: OperatorResponse, level: str) -> str:
+    """Return the mailbox that shows the response to commands to a level: the status of the lowest on its path."""
+    return f"{response.paths[level].levels[-1]}.status"
+
+
+def _is_moving(recording: Recording, status: str, tick: int) -> bool:
+    """Return whether the arm was commanded to move around a tick; a status without an arm never shows it."""
+    if not {"target_velocity", "torque"} <= recording.fields(status):
+        return False
+    ticks, velocities = (recording.signal(status, name) for name in ("tick", "target_velocity"))
+    speed = dict(zip(ticks.tolist(), np.abs(velocities).max(axis=1).tolist(), strict=True))
+    return all(speed.get(tick + k, 0.0) > MOVING_RAD_S for k in range(-8, 24, 8))
+
+
+def compare(config: RackConfig, run: CommandedRun, command: AnsweredCommand, status: str, folder: Path) -> Twin:
+    """Run the twin of a run without one of its commands, and compare the torques in the mailbox `status`."""
     before = [other for other in run.commands if other.tick is not None and other.tick < command.given]
     seconds = (command.predicted + TWIN_EXTRA_TICKS) * config.clock_ns * 1e-9
     twin = run_commands(config, before, folder, seconds)
-    differs = first_difference(run.recording, twin)
+    differs = first_difference(run.recording, twin, status)
     return Twin(command.serial, command.level, command.given, command.predicted, differs)
 
 
-def first_difference(first: Recording, second: Recording) -> int | None:
-    """Return the first tick at which the torques of two runs differ in any bit, over the ticks that both have."""
+def first_difference(first: Recording, second: Recording, status: str) -> int | None:
+    """Return the first tick at which the torques in `status` differ in any bit, over the ticks that both runs have."""
     torques = []
     for recording in (first, second):
-        ticks, values = (recording.signal("servo.status", name) for name in ("tick", "torque"))
+        ticks, values = (recording.signal(status, name) for name in ("tick", "torque"))
         torques.append({int(tick): value.tobytes() for tick, value in zip(ticks, values, strict=True)})
     common = sorted(torques[0].keys() & torques[1].keys())
     return next((tick for tick in common if torques[0][tick] != torques[1][tick]), None)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import log10
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rack.boards.config import RackConfig
 from rack.boards.config.timing import tick_ns
+from rack.levels.timing.rack import spanned
 from rack.tools.charts.letters import label_row
 from rack.tools.console.pictures import paths_of, picture
 
@@ -71,6 +72,14 @@ def placed(config: RackConfig) -> list[Placed]:
     return found
 
 
+def together(levels: Sequence[Placed]) -> list[Placed]:
+    """Return the levels, those of the same place in the figure as one: a board a joint needs one line."""
+    names: dict[Placed, list[str]] = {}
+    for level in levels:
+        names.setdefault(replace(level, level=""), []).append(level.level)
+    return [replace(place, level=spanned(found)) for place, found in names.items()]
+
+
 def region_of(cycle_s: float) -> Region:
     """Return the region of a cycle."""
     return next(r for r in REGIONS if cycle_s < r.to_s or (cycle_s == r.to_s and r is not REGIONS[0]))
@@ -78,7 +87,7 @@ def region_of(cycle_s: float) -> Region:
 
 def lines(config: RackConfig) -> Iterator[str]:
     """Yield the figure as text."""
-    found = placed(config)
+    found = together(placed(config))
     margin = max(len(level.level) for level in found) + 2
     yield f"figure 5: the levels of {config.name} among the regions of implementation, by their cycle"
     yield ""
@@ -106,7 +115,7 @@ def duration(cycle_s: float) -> str:
 
 def save(config: RackConfig, stem: Path) -> list[Path]:
     """Draw the figure with the levels of a rack into `stem`.png and .svg; return their paths."""
-    levels, paths = placed(config), paths_of(stem)
+    levels, paths = together(placed(config)), paths_of(stem)
     with picture(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
         axes = figure.subplots()
         _draw_regions(axes)

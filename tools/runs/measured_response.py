@@ -7,13 +7,17 @@ the release of the highest level to the cycle of the lowest level that acts on i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from rack.boards.config import rack_timing
-from rack.levels.timing.system_response import predict
+from rack.levels.timing.equations import system_response_bound_ns, system_response_ns
+from rack.levels.timing.rack import ParallelChains, RackTiming
+from rack.levels.timing.system_response import mailboxes_along
 from rack.levels.timing.trace_times import counts, distribution
+from rack.levels.timing.verdicts import response_subject
 from rack.tools.runs.recording import Recording
 
 LOSSES = ("died", "hang")
@@ -23,38 +27,74 @@ LOSSES = ("died", "hang")
 def system_response(recording: Recording) -> dict[str, Any] | None:
     """Return the response down (commands) and up (statuses), in ticks and ms; None without a hierarchy.
 
-    `beyond` are the responses longer than their bound, each with the delays that the run shows; `unseen`
-    counts those that cannot be measured because the recording lacks messages.
+    It is that of the chains with the longest response; `others` holds the same for all other chains of the rack.
+    `beyond` are the responses longer than their bound, each with the delays that the run shows; `unseen` counts those
+    that cannot be measured because the recording lacks messages.
     """
-    predicted = predict(rack_timing(recording.rack_config, recording.layout))
-    levels = list(predicted.levels)
-    if len(levels) < 2:
+    rack = rack_timing(recording.rack_config, recording.layout)
+    first = rack.hierarchy
+    if not first.chains:
         return None
     return {
-        "levels": levels,
-        "bound_eq_3_2_ms": predicted.bound_eq_3_2_ms,
-        "sum_eq_3_3_ms": predicted.sum_eq_3_3_ms,
-        "command": _way(recording, levels, "command", predicted.command_ms),
-        "status": _way(recording, levels[::-1], "status", predicted.status_ms),
+        **_response(recording, rack, first),
+        "others": [_response(recording, rack, chains) for chains in rack.parallel if chains != first],
     }
 
 
-def _way(recording: Recording, levels: Sequence[str], port: str, bound_ms: float) -> dict[str, Any]:
-    """Judge the response along `levels`, from the first one's release to the end of the last one's cycle.
+def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> dict[str, Any]:
+    cycles, tick_ms = chains.cycles, rack.clock_ns * 1e-6
+    return {
+        "subject": response_subject(rack, chains),
+        "levels": list(chains.levels),
+        "bound_eq_3_2_ms": system_response_bound_ns(cycles) * tick_ms,
+        "sum_eq_3_3_ms": system_response_ns((), cycles) * tick_ms,
+        "command": _way(recording, rack, chains.chains, chains.levels),
+        "status": _way(recording, rack, [boards[::-1] for boards in chains.chains], chains.levels[::-1]),
+    }
+
+
+def _way(
+    recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
+) -> dict[str, Any]:
+    """Judge the response along all of these chains, from their first board's release to the last one's cycle.
+
+    `levels` are those over which it is measured: after a level that does not pass the information on, it begins anew.
+    """
+    layout = recording.layout
+    ways = [(boards, mailboxes_along(layout, boards)) for boards in chains]
+    passed = min(len(mailboxes) for _, mailboxes in ways)
+    start = len(levels) - passed - 1 if passed else len(levels)
+    bound_ms = max(rack.response_ticks(boards[start:]) for boards in chains) * layout.clock_ns * 1e-6
+    found = [_along(recording, boards[start:], boxes[-1].name, bound_ms) for boards, boxes in ways if passed]
+    seen = np.concatenate([ms for ms, _, _ in found]) if found else np.zeros(0)
+    beyond = list(chain(*(each for _, each, _ in found)))
+    return {
+        "levels": list(levels[start:]),
+        "measured_ms": distribution(seen),
+        "bound_ms": bound_ms,
+        "holds": not beyond if len(seen) else None,
+        "beyond": beyond,
+        "unseen": sum(unseen for _, _, unseen in found),
+    }
+
+
+def _along(
+    recording: Recording, boards: Sequence[str], mailbox: str, bound_ms: float
+) -> tuple[np.ndarray, list[dict[str, Any]], int]:
+    """Return the responses along one chain by its last `mailbox`, ms, those beyond the bound, and the number unseen.
 
     The worst case is information that just misses a release whose message went all the way: it waits for the next one
     that does.
     """
     layout = recording.layout
-    first, last = (layout.task(levels[at]).every for at in (0, -1))
-    mailbox, tick_ms = f"{levels[-2]}.{port}", layout.clock_ns * 1e-6
-    read = layout.read_grid(layout.mailbox(mailbox), levels[-1])
+    first, last = (layout.task(boards[at]).every for at in (0, -1))
+    tick_ms = layout.clock_ns * 1e-6
     basis, visible_at = recording.signal(mailbox, "basis"), recording.signal(mailbox, "visible_at")
     # Until the first level's messages arrive, those of the later levels rest on their own ticks.
-    real = np.flatnonzero(basis >= first + max(layout.task(name).phase for name in levels))
+    real = np.flatnonzero(basis >= first + max(layout.task(name).phase for name in boards))
     arrived, at = np.unique(basis[real], return_index=True)
     at = real[at]
-    visible = visible_at[at[1:]]
+    visible, read = visible_at[at[1:]], layout.read_grid(layout.mailbox(mailbox), boards[-1])
     acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
     seen = np.ones(len(ms), bool)
@@ -66,17 +106,11 @@ def _way(recording: Recording, levels: Sequence[str], port: str, bound_ms: float
         {
             "tick": int(arrived[k]),
             "ms": round(float(ms[k]), 6),
-            "delayed_by": list(_delays(recording, levels, int(arrived[k]), int(acts[k]))),
+            "delayed_by": list(_delays(recording, boards, int(arrived[k]), int(acts[k]))),
         }
         for k in np.flatnonzero(seen & (ms > bound_ms + tick_ms / 2))
     ]
-    return {
-        "measured_ms": distribution(ms[seen]),
-        "bound_ms": bound_ms,
-        "holds": not beyond if seen.any() else None,
-        "beyond": beyond,
-        "unseen": int(np.count_nonzero(~seen)),
-    }
+    return ms[seen], beyond, int(np.count_nonzero(~seen))
 
 
 def _delays(recording: Recording, levels: Sequence[str], since: int, until: int) -> Iterator[str]:

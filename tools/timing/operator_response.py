@@ -16,7 +16,7 @@ import numpy as np
 
 from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
-from rack.levels.timing.system_response import CommandPath, command_paths, lowest_level
+from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
@@ -153,10 +153,11 @@ def response_of(recording: Recording) -> OperatorResponse | None:
     paths = {level: path for level, path in found.items() if f"{level}.operator" in recording.mailboxes}
     if not paths:
         return None
-    lowest = f"{lowest_level(paths)}.status"
-    statuses = _Statuses(*(recording.signal(lowest, name) for name in ("operator", "tick", "stamp_ns")))
-    commands = [one for level, path in paths.items() for one in _commands(recording, level, path)]
-    answered = [_follow(command, given_ns, statuses) for command, given_ns in commands]
+    answered = [
+        _follow(command, given_ns, _statuses(recording, path.levels[-1]))
+        for level, path in paths.items()
+        for command, given_ns in _commands(recording, level, path)
+    ]
     lockstep = config.clock.mode == "lockstep"
     if lockstep:
         answered = [replace(command, wall_ms=None) for command in answered]
@@ -192,6 +193,10 @@ class _Statuses(NamedTuple):
     serial: np.ndarray
     tick: np.ndarray
     stamp_ns: np.ndarray
+
+
+def _statuses(recording: Recording, lowest: str) -> _Statuses:
+    return _Statuses(*(recording.signal(f"{lowest}.status", name) for name in ("operator", "tick", "stamp_ns")))
 
 
 def _follow(command: AnsweredCommand, given_ns: int, statuses: _Statuses) -> AnsweredCommand:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from rack.levels.timing.forecast import Forecast
-from rack.levels.timing.rack import LevelTiming
+from rack.levels.timing.rack import LevelTiming, spanned
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
 from rack.levels.timing.verdicts import LOAD, RESPONSE_TIME, EquationVerdict
@@ -43,20 +43,29 @@ def _prediction_lines(system: Prediction) -> Iterator[str]:
 def _levels(levels: Iterable[LevelTiming], width: int | None) -> Iterator[str]:
     """Yield a line per level: its cycle, its parts, and the residual for its planner."""
     head = ["level", "coupling", "R_i", "t_exec", "t_comm", "R", "W", "C", "t_residual", "t_plan", "P", "U", "d"]
-    yield from table([*head, "d R_i"], [_level_row(level) for level in levels], width, ("C", "R", "W", "U", "P", "d"))
+    rows = _merged([_level_row(level) for level in levels], 0)
+    yield from table([*head, "d R_i"], rows, width, ("C", "R", "W", "U", "P", "d"))
 
 
 def _verdicts(verdicts: Iterable[EquationVerdict], width: int | None) -> Iterator[str]:
     """Yield a line per verdict: both sides, the margin, whether it holds."""
     head = ["eq.", "of", "left", "", "right", "margin", "", "meaning"]
-    yield from table(head, [_verdict_row(verdict) for verdict in verdicts], width, ("meaning", "margin"))
+    yield from table(head, _merged([_verdict_row(verdict) for verdict in verdicts], 1), width, ("meaning", "margin"))
 
 
 def _responses(responses: Iterable[TaskResponse], width: int | None) -> Iterator[str]:
     """Yield a line per task, core by core: its cost, its blocking, its response and its deadline."""
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
-    yield from table(head, [_response_row(response) for response in ordered], width, ("FIFO", "margin"))
+    yield from table(head, _merged([_response_row(response) for response in ordered], 1), width, ("FIFO", "margin"))
+
+
+def _merged(rows: Sequence[Sequence[str]], named: int) -> list[list[str]]:
+    """Return the rows, those that differ only in the name, in column `named`, as one: a board a joint fills no page."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for row in rows:
+        names.setdefault((*row[:named], *row[named + 1 :]), []).append(row[named])
+    return [[*rest[:named], spanned(found), *rest[named:]] for rest, found in names.items()]
 
 
 def _level_row(level: LevelTiming) -> list[str]:

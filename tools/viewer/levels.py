@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import rerun as rr
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State
 from rack.levels.messages import Verb
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Changes, RowBlock, Stream
 from rack.tools.viewer.style import STATES, style_lane, write_spans
@@ -87,16 +87,16 @@ def verb_name(verb: int) -> str:
 class Hierarchy:
     """Writes the tasks as nodes of a graph, coloured by state, whenever a state changes.
 
-    Levels are above each other, other boards to the left. Edges go down with commands, and from planners with plans.
+    Levels are above each other, other boards to the left. Edges go down the levels, and from planners with plans.
     """
 
-    def __init__(self, stream: Stream, layout: Layout, levels: tuple[str, ...]) -> None:
+    def __init__(self, stream: Stream, layout: Layout, rack: RackTiming) -> None:
         self._stream = stream
         self._tasks = [task.name for task in layout.tasks]
         self._states = dict.fromkeys(self._tasks, "idle")
-        self._positions = positions(layout, levels)
+        self._positions = positions(layout, rack)
         self._changes: list[tuple[int, int, str, str]] = []
-        downward = list(pairwise(levels))
+        downward = [(board.name, below) for board in rack.boards.values() for below in board.below]
         plans = [(task.name, task.board) for task in layout.tasks if task.role == "planner"]
         stream.static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
         self._log(0, int(stream.times.stamps_of(np.zeros(1, dtype=np.int64))[0]))
@@ -150,12 +150,15 @@ def _names(rows: np.ndarray) -> np.ndarray:
     return np.asarray(names[shown])
 
 
-def positions(layout: Layout, levels: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    """Return the places of the tasks: levels in the middle, their planners to the right, other boards to the left."""
-    others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in levels]
-    rows = {board: row for row, board in enumerate(levels)} | {board: row for row, board in enumerate(others)}
-    columns = dict.fromkeys(levels, 0) | dict.fromkeys(others, -1)
+def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
+    """Return the places of the tasks: levels in rows, their planners to the right, other boards to the left.
+
+    Boards of the same level are next to each other.
+    """
+    placed = {board: (2 * at, row) for row, boards in enumerate(rack.ranks) for at, board in enumerate(boards)}
+    others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in placed]
+    placed |= {board: (-1, row) for row, board in enumerate(others)}
     return {
-        task.name: ((columns[task.board] + (task.role == "planner")) * COLUMN, rows[task.board] * ROW)
+        task.name: ((placed[task.board][0] + (task.role == "planner")) * COLUMN, placed[task.board][1] * ROW)
         for task in layout.tasks
     }

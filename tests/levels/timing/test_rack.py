@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from rack.levels.timing.forecast import Forecast
-from rack.levels.timing.rack import BoardTiming, RackTiming
+from rack.levels.timing.rack import BoardTiming, RackTiming, spanned
 from rack.levels.timing.tasks import Budget, TimedTask
 from rack.levels.timing.verdicts import verdicts
 
@@ -53,8 +55,76 @@ def test_a_planner_has_the_ceiling_of_its_executor_only_in_a_critical_section() 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
     timing = rack(board("top", 40, below="a"), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7))
     assert timing.chains == (("top", "a"), ("top", "b"))
-    assert timing.hierarchy == ("top", "b")
+    assert timing.hierarchy.chains == (("top", "b"),)
     assert timing.longest_cycles == {"top": 60, "a": 60, "b": 60, "alone": 7}
+
+
+JOINTS = tuple(f"joint{k}" for k in range(1, 7))
+
+
+def arm_of(*joints: str, every: int = 4, goal_ns: float | None = None) -> RackTiming:
+    """A board a joint between a trajectory level, which has a planner's board above it, and the board of the arm."""
+    names = " ".join(joints)
+    boards = [board("plan", 200, below="path"), board("path", 20, "plan", names), board("arm", 2, names)]
+    return rack(*boards, *(board(name, every, "path", "arm") for name in joints), board("alone", 500), goal_ns=goal_ns)
+
+
+def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
+    timing = arm_of(*JOINTS)
+    assert timing.chains == tuple(("plan", "path", joint, "arm") for joint in JOINTS)
+    (together,) = timing.parallel
+    assert timing.hierarchy == together
+    assert together.text == "plan > path > joint1 ... joint6 > arm"
+    assert timing.ranks == (("plan",), ("path",), JOINTS, ("arm",))
+    assert set(timing.longest_cycles.values()) == {200, 500}
+    # 200 + 20 + 4 + 2 ticks of 2 ms, for all joints in one line.
+    (eq_3_3,) = [verdict for verdict in verdicts(timing) if verdict.equation == "3.3"]
+    assert (eq_3_3.subject, eq_3_3.left) == ("system", 226 * 2 * MS)
+
+
+def test_a_joint_that_is_slower_than_the_others_is_judged_by_itself() -> None:
+    timing = arm_of(*JOINTS[:3]).changed("joint3", every=30)
+    assert {chains.text for chains in timing.parallel} == {
+        "plan > path > joint1, joint2 > arm",
+        "plan > path > joint3 > arm",
+    }
+    assert timing.hierarchy.text == "plan > path > joint3 > arm"
+    subjects = [verdict.subject for verdict in verdicts(timing) if verdict.equation == "3.3"]
+    assert subjects == [f"system, {chains.text}" for chains in timing.parallel]
+
+
+def test_chains_of_equal_cycles_are_one_only_if_they_are_every_combination() -> None:
+    pairs = [board("a", 40), board("b", 4, "a"), board("c", 40), board("d", 4, "c")]
+    assert [chains.text for chains in rack(*pairs).parallel] == ["a > b", "c > d"]
+    assert [sorted(boards) for boards in rack(*pairs).connected] == [["a", "b"], ["c", "d"]]
+    crossed = rack(*pairs[:3], board("d", 4, "a c"))
+    assert [chains.text for chains in crossed.parallel] == ["a > b", "a > d", "c > d"]
+    assert [sorted(boards) for boards in crossed.connected] == [["a", "b", "c", "d"]]
+
+
+def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
+    boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
+    found = rack(*boards, goal_ns=60 * 2.0 * MS).longest_cycles
+    assert found == {"top": 20, "middle": 20, "low": 20}
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (("joint1", "joint2", "joint3"), "joint1 ... joint3"),
+        (("joint9", "joint10", "joint11"), "joint9 ... joint11"),
+        (("j1.planner", "j2.planner", "j3.planner"), "j1.planner ... j3.planner"),
+        (("joint1", "joint2"), "joint1, joint2"),
+        (("joint1", "joint2", "joint4"), "joint1, joint2, joint4"),
+        (("joint2", "joint1", "joint3"), "joint2, joint1, joint3"),
+        (("a1", "b2", "c3"), "a1, b2, c3"),
+        (("joint1", "joint2", "joint3", "arm"), "joint1 ... joint3, arm"),
+        (("servo",), "servo"),
+        ((), ""),
+    ],
+)
+def test_numbered_names_are_shortened_only_if_none_is_left_out(names: tuple[str, ...], text: str) -> None:
+    assert spanned(names) == text
 
 
 def test_a_goal_for_the_response_is_divided_among_the_levels() -> None:

@@ -82,8 +82,8 @@ SECOND = "executor = 'two_levels:Lower', above = 'upper', reads = { plan = 'lowe
 def test_every_chain_of_levels_is_judged_and_has_one_longest_cycle(judge: Judge) -> None:
     # A board a joint: the second joint is slower than the level above.
     judged = judge(f"board.joint={{ slot = 9, core = 2, every = 16, {SECOND} }}")
-    assert sides(judged, "3.3", "system, lower") == [(30, "<=", 40, True)]
-    assert sides(judged, "3.3", "system, joint") == [(60, "<=", 80, True)]
+    assert sides(judged, "3.3", "system, upper > lower") == [(30, "<=", 40, True)]
+    assert sides(judged, "3.3", "system, upper > joint") == [(60, "<=", 80, True)]
     assert {sides(judged, "3.4", board)[0][2] for board in ("upper", "lower", "joint")} == {40}
 
 

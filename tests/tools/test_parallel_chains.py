@@ -1,0 +1,122 @@
+"""A board a joint, as a user sees it: one line for all joints, and the response of all chains measured."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import load, resolve
+from rack.tools.analysis.analysis import Analysis
+from rack.tools.analysis.report import write_report
+from rack.tools.benches.apart import apart
+from rack.tools.benches.bare import run_bare
+from rack.tools.benches.lockstep import differences
+from rack.tools.benches.response import run_commands
+from rack.tools.charts.figure5 import lines
+from rack.tools.runs.display import Display
+from rack.tools.runs.launch import run_rack
+from rack.tools.runs.recording import Recording
+from rack.tools.timing.operator_response import response_of
+from rack.tools.viewer.reading import read
+from tests.boards.commanded_racks import commands
+from tests.boards.vector_racks import JOINTED, NAMES
+from tests.tools.command_line import rack
+
+TOGETHER = "path > joint1 ... joint3 > arm"
+
+
+@pytest.fixture
+def jointed(tmp_path: Path) -> Path:
+    """The rack as a file."""
+    path = tmp_path / "jointed.toml"
+    path.write_text(JOINTED)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recorded run in lockstep in which an operator held the highest level."""
+    path = tmp_path_factory.mktemp("jointed")
+    (path / "jointed.toml").write_text(JOINTED)
+    held = commands("level = 'path', what = 'hold', tick = 101", "level = 'path', what = 'resume', tick = 160")
+    config = load(path / "jointed.toml", [f"name=test-{path.name}", held])
+    assert run_rack(config, 1.0, path / "run", Display()).recording == "complete"
+    return path / "run"
+
+
+def test_a_check_has_one_line_for_boards_with_equal_figures(jointed: Path) -> None:
+    done = rack("check", jointed)
+    assert done.returncode == 0, done.stdout
+    text = done.stdout
+    assert f"system response, {TOGETHER}:" in text
+    assert [line.split()[:4] for line in text.splitlines() if line.startswith("3.1")] == [
+        ["3.1", "path", "0.7", "<="],
+        ["3.1", "joint1", "...", "joint3"],
+        ["3.1", "arm", "0.45", "<="],
+    ]
+    assert sum(line.startswith("3.3") for line in text.splitlines()) == 1
+    found = json.loads(rack("check", jointed, "--json").stdout)["timing"]
+    assert {v["subject"] for v in found["verdicts"] if v["equation"] == "3.1"} == {"path", *NAMES, "arm"}
+
+
+def test_a_joint_that_does_not_fit_is_repaired_without_the_others(jointed: Path) -> None:
+    done = rack("check", jointed, "--fix", "--set", "board.joint2.budget.process_ms=2.0", "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode == 0
+    assert [step[0]["board"] for step in found["steps"]] == ["joint2", "arm"]
+
+
+def test_figure_5_has_one_line_for_boards_of_one_cycle(jointed: Path) -> None:
+    rows = [line for line in lines(load(jointed)) if line.rstrip().endswith("no planner to couple")]
+    assert [row.rpartition(" ms:")[0] for row in rows] == ["joint1 ... joint3, arm, 2.5", "path, 20"]
+
+
+def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
+    report, text = write_report(folder)
+    response = report["system_response"]
+    assert (response["levels"], response["others"]) == (["path", "joint1 ... joint3", "arm"], [])
+    # 20 + 2.5 + 2.5 ms down; up, a status waits for up to 7 ticks more.
+    assert [response[way]["measured_ms"]["max"] for way in ("command", "status")] == [25.0, 42.5]
+    assert [response[way]["holds"] for way in ("command", "status")] == [True, True]
+    assert f"{TOGETHER}: eq. 3.2 bound 60, eq. 3.3 sum 25" in text
+
+
+def test_a_slower_joint_has_a_response_of_its_own(jointed: Path, rack_name: str, tmp_path: Path) -> None:
+    config = load(jointed, [f"name={rack_name}", "board.joint2.rate_hz=100"])
+    recording = run_commands(config, (), tmp_path / "run", 1.0)
+    first = write_report(recording.folder)[0]["system_response"]
+    (other,) = first["others"]
+    assert first["levels"] == ["path", "joint2", "arm"]
+    assert other["levels"] == ["path", "joint1, joint3", "arm"]
+    assert [found["command"]["measured_ms"]["max"] for found in (first, other)] == [32.5, 25.0]
+    assert first["command"]["holds"]
+    assert other["command"]["holds"]
+    subjects = {pair.subject for pair in Analysis.of(recording).pairs if pair.equation == "3.3" and pair.measured}
+    assert subjects == {"system, path > joint2 > arm", "system, path > joint1, joint3 > arm"}
+
+
+def test_a_hold_acts_at_its_predicted_tick_through_every_joint(folder: Path) -> None:
+    response = response_of(Recording(folder))
+    assert response is not None
+    # Read at 104, by the joints at 112, by the arm at 113.
+    assert [(c.sampled, c.predicted, c.acts) for c in response.commands] == [(104, 113, 113), (168, 177, 177)]
+    assert response.held
+    assert response.paths["path"].levels == ("path", "joint1", "arm")
+
+
+def test_the_levels_alone_write_what_they_write_in_the_rack(jointed: Path, rack_name: str, tmp_path: Path) -> None:
+    config = load(jointed, [f"name={rack_name}"])
+    recording = run_commands(config, (), tmp_path / "run", 0.5)
+    resolved = resolve(config)
+    bare = apart(run_bare, resolved.layout, resolved.tasks, 200)
+    assert list(differences(recording, bare)) == []
+
+
+def test_the_graph_of_boards_has_a_row_for_every_level(folder: Path) -> None:
+    names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
+    places = read(folder / "run.rrd", "/hierarchy", "GraphNodes:positions").values[0].reshape(-1, 2).tolist()
+    rows = {name: row for name, (_, row) in zip(names, places, strict=True)}
+    assert rows["path"] < rows["joint1"] == rows["joint2"] == rows["joint3"] < rows["arm"]
+    assert len({tuple(place) for place in places}) == len(names)
