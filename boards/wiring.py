@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rack.backplane.layout import ExchangeSpec
@@ -11,6 +11,10 @@ from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
 """What a port reads: a mailbox, or mailboxes by board."""
+
+
+Entries = Mapping[str, Sequence[tuple[int, bytes]]]
+"""What a bus adapter wrote in a recorded run, by port: ticks and messages, oldest first."""
 
 
 def mailboxes_of(source: Source) -> tuple[str, ...]:
@@ -34,8 +38,8 @@ class TaskWiring:
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
     task is one of the fastest and watches the clock. `sent`: the ports whose messages the level sends itself.
-    `fails_self_test`: a fault in the config. `exchange`: the ports that are not simply read in every cycle; it makes
-    the task write its mailbox `<board>.exchange`.
+    `fails_self_test`: a fault in the config. `entries`: for a bus adapter in a replay. `exchange`: the ports that are
+    not simply read in every cycle; it makes the task write its mailbox `<board>.exchange`.
     """
 
     task: str
@@ -47,8 +51,21 @@ class TaskWiring:
     guards_clock: bool = False
     sent: tuple[str, ...] = ()
     fails_self_test: bool = False
+    entries: Entries | None = None
     transfer: BusTimes = field(default_factory=BusTimes)
     exchange: Mapping[str, ExchangeSpec] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class HostWiring:
+    """One host board: its program's class, and the mailbox of each port. External: a prompt runs it, not the rack."""
+
+    board: str
+    target: str
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]
+    context: LevelContext
+    is_external: bool = False
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,8 @@ def strict_mistakes(config: RackConfig) -> Iterator[Mistake]:
     for mailbox, protocol in config.protocol.mailbox.items():
         if protocol not in BY_TICKS:
             yield Mistake(f"protocol.mailbox.{mailbox}", protocol, f"{why}: {', '.join(BY_TICKS)}")
+    for name in config.host:
+        yield Mistake(f"host.{name}", None, f"a board without real time {why}: boards with a rate")
     for name, board in config.board.items():
         for port, entry in board.exchange.items():
             if entry.asynchronous:
