@@ -18,6 +18,7 @@ from rack.boards.exchange import EXCHANGE, PortAge, ages_of
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
 from rack.tools.runs.host_side import EntryRow, HostRow, entry_rows, host_rows
+from rack.tools.runs.queues import QueueFill, Queues
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
@@ -71,8 +72,8 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them,
-    `exchanges` the messages in use of boards with an exchange, by port.
+    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
+    `queues` are all of them, empty ones too; `exchanges` the messages in use of boards with an exchange, by port.
     """
 
     rack: str
@@ -88,6 +89,7 @@ class Snapshot:
     holds: tuple[Hold, ...] = ()
     hosts: tuple[HostRow, ...] = ()
     entries: tuple[EntryRow, ...] = ()
+    queues: tuple[QueueFill, ...] = ()
     exchanges: Mapping[str, Mapping[str, PortAge]] = field(default_factory=dict)
 
 
@@ -99,6 +101,7 @@ class RackMonitor:
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
         self._holds = Holds(segment)
+        self._queues = Queues(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
@@ -132,6 +135,7 @@ class RackMonitor:
             holds=self._holds.look(),
             hosts=host_rows(self._segment),
             entries=entry_rows(self._segment),
+            queues=self._queues.look(),
             exchanges={
                 board: ages_of(reading.value)
                 for board, reader in self._exchanges.items()
