@@ -161,7 +161,7 @@ class MoveTable(StateTableExecutor):
 
     def _is_at(self, world: Message, row: int) -> bool:
         """Return whether an object is where the newest motion aims."""
-        return norm(world.position[row] - self._aim) <= self.table.plan.moved
+        return bool(norm(world.position[row] - self._aim) <= self.table.plan.moved)
 
     def do_move(self, pose: str) -> None:
         """Send the arm to a pose."""

@@ -89,7 +89,7 @@ class PrimitiveTable(StateTableExecutor):
             "hold": Condition(YES_NO, "whether an operator or the level above holds this one, or its board is lost"),
             "arm": Condition(
                 ("arrived", "resting", "moving", "away"),
-                "arrived: at rest where the newest motion ends; resting: elsewhere; away: the boards below do not follow",
+                "arrived: at rest where the newest motion ends; resting: elsewhere; away: the joints do not follow",
             ),
             "gripper": Condition(("moving", "open", "empty", "holds"), "empty: closed on nothing"),
         },
