@@ -27,7 +27,7 @@ OPERATOR_HEAD_SIZE = LINE
 OPERATOR_ENTRIES = 128
 CLOCK = "clock"
 """The system controller, in slot 1: its window holds the fault table, the operator table and operators' mailboxes."""
-MAILBOX_HEAD_SIZE = LINE
+MAILBOX_HEAD_SIZE = 2 * LINE
 SLOT_HEAD_SIZE = 64
 ALARM_SIZE = LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
 """Bytes of one alarm ring: a line for its head, then the records."""

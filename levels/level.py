@@ -240,7 +240,7 @@ class Executor(ABC):
         """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
 
     def room(self, port: str) -> int:
-        """Return how many messages to take from the queue that `port` reads, asked before each read. Default: all."""
+        """Return how many messages to take from each queue that `port` reads, asked before each read. Default: all."""
         return ALL
 
     def close(self) -> None:
@@ -272,7 +272,7 @@ class Planner(ABC):
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
 
     def room(self, port: str) -> int:
-        """Return how many messages to take from the queue that `port` reads, asked before each read. Default: all."""
+        """Return how many messages to take from each queue that `port` reads, asked before each read. Default: all."""
         return ALL
 
     def wanted(self, read: Ports, tick: int) -> bool:

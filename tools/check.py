@@ -121,7 +121,8 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
     """Return the inventory of a config as plain data; addresses and sizes in bytes.
 
     Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox `delay_ms` the same;
-    `depth` is the number of a mailbox's slots, `size` the bytes of one message.
+    `depth` is the number of a mailbox's slots, `size` the bytes of one message, `capacity` the most unread ones in a
+    queue (0: no queue).
     """
     places, tick_ms = AddressMap(layout), layout.clock_ns * 1e-6
     tasks = [
@@ -145,6 +146,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
             "size": mailbox.size,
             "depth": mailbox.depth,
             "protocol": mailbox.protocol,
+            "capacity": mailbox.capacity,
             "writer": mailbox.writer,
             "readers": mailbox.readers,
             "delay_ms": mailbox.delay * tick_ms,
@@ -211,7 +213,7 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     yield from table(head, [clock, *rows], width, ("trace at", "slice, ms"))
     rows = [
         [
-            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), m["protocol"]),
+            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), _protocol(m)),
             *(f"{m['delay_ms']:g}", f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}"),
         ]
         for m in found["mailboxes"]
@@ -223,6 +225,11 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     yield ""
     windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
     yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+
+
+def _protocol(mailbox: dict[str, Any]) -> str:
+    """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
+    return f"{mailbox['protocol']} of {mailbox['capacity']}" if mailbox["capacity"] else str(mailbox["protocol"])
 
 
 def _hex(address: int) -> str:

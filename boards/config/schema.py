@@ -132,7 +132,9 @@ class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
     default: Sampled = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
-    mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
+    mailbox: dict[MailboxName, Protocol] = Field(
+        {}, description="protocol by mailbox; queue: its one reader gets every message, in order"
+    )
     depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
         {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
     )

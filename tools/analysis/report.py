@@ -31,6 +31,7 @@ from rack.tools.faults.judge import faults
 from rack.tools.runs.history import counted, first_difference, frequency, holds, misses, steal
 from rack.tools.runs.host_side import entries_of
 from rack.tools.runs.measured_response import system_response
+from rack.tools.runs.queues import queues
 from rack.tools.runs.recording import Recording
 
 Report = dict[str, Any]
@@ -75,6 +76,7 @@ def report_of(recording: Recording) -> Report:
         "entries": _entries(recording),
         "task": _task_outcome(recording),
         "motion": _motion(recording),
+        "queues": queues(recording),
         "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
     }
@@ -84,7 +86,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
         *("misses", "steal", "frequency_mhz", "notes", "holds", "faults", "unexplained", "restarts"),
-        *("system_response", "entries", "task", "motion", "rows_lost"),
+        *("system_response", "entries", "task", "motion", "queues", "rows_lost"),
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}

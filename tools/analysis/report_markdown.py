@@ -84,6 +84,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])
+    yield from _queues(report["queues"])
     yield from _holds(report)
     yield from _times(report)
     yield from _faults(report)
@@ -217,6 +218,15 @@ def _motion(motion: Report | None) -> Iterator[str]:
             f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS, {motion['tracking_peak_mrad']:.3f} peak; "
             f"{motion['touches']} touches, {motion['clipped_cycles']} cycles clipped; "
             f"limits exceeded in {motion['violations']} substeps, by a push from outside in {motion['pushed']}."
+        )
+
+
+def _queues(queues: Sequence[Report]) -> Iterator[str]:
+    for queue in queues:
+        refused = f", {queue['refused']} refused" if queue["refused"] else ""
+        yield (
+            f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at most "
+            f"{queue['waiting']} waiting, room for {queue['capacity']}{refused}."
         )
 
 

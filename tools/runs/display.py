@@ -129,7 +129,7 @@ def display_for(silent: bool) -> Iterator[Display]:
 
 @dataclass(frozen=True)
 class RackView:
-    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, active faults, holds, progress."""
+    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults, holds, progress."""
 
     snapshot: Snapshot
 
@@ -143,6 +143,7 @@ class RackView:
         for rows in (snapshot.hosts, snapshot.entries):
             yield from _host_side(rows, width)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
+        yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             why, *release = hold.parts

@@ -22,6 +22,7 @@ from rack.tools.faults.ending import Strike, strikes
 from rack.tools.runs.display import Display
 from rack.tools.runs.folder import EventLog
 from rack.tools.runs.holds import Standstill
+from rack.tools.runs.queues import Queues
 from rack.tools.runs.recorder_process import RecorderProcess
 from rack.tools.runs.snapshot import RackMonitor
 from rack.tools.runs.window import ViewerWindow, free_port, url
@@ -42,7 +43,8 @@ News = Callable[[], list[str]]
 class RunResult:
     """A finished run: its outcome, the counts of every task's control block, and the faults injected into it.
 
-    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events.
+    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events. `refused`: messages
+    that full queues refused, by queue.
     """
 
     rack: str
@@ -53,6 +55,7 @@ class RunResult:
     recording: str
     faults: tuple[Strike, ...]
     clock_offset_ns: int
+    refused: dict[str, int]
 
     @property
     def worked(self) -> bool:
@@ -132,6 +135,7 @@ def run_rack(
             recording=recording,
             faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
             clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+            refused={queue.mailbox: queue.refused for queue in Queues(segment).look()},
         )
         log.end(result.document())
     return result

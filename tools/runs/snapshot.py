@@ -17,6 +17,7 @@ from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
 from rack.tools.runs.host_side import EntryRow, HostRow, entry_rows, host_rows
+from rack.tools.runs.queues import QueueFill, Queues
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
@@ -70,7 +71,8 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them.
+    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
+    `queues` are all of them, empty ones too.
     """
 
     rack: str
@@ -86,6 +88,7 @@ class Snapshot:
     holds: tuple[Hold, ...] = ()
     hosts: tuple[HostRow, ...] = ()
     entries: tuple[EntryRow, ...] = ()
+    queues: tuple[QueueFill, ...] = ()
 
 
 class RackMonitor:
@@ -96,6 +99,7 @@ class RackMonitor:
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
         self._holds = Holds(segment)
+        self._queues = Queues(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
@@ -126,6 +130,7 @@ class RackMonitor:
             holds=self._holds.look(),
             hosts=host_rows(self._segment),
             entries=entry_rows(self._segment),
+            queues=self._queues.look(),
         )
 
     def _active_faults(self) -> Iterator[str]:
