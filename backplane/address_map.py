@@ -54,7 +54,7 @@ class AddressMap:
         self.faults = HEAD_SIZE
         self.operator = HEAD_SIZE + FAULT_ENTRIES * FAULT_ENTRY_SIZE
         address = self._place_clock(HEAD_SIZE, layout)
-        for board in dict.fromkeys(task.board for task in layout.tasks):
+        for board in dict.fromkeys(task.board for task in layout.processes):
             address = self._place_board(board, layout, address)
         self.size = address
 
@@ -66,7 +66,7 @@ class AddressMap:
 
     def _place_board(self, board: str, layout: Layout, start: int) -> int:
         address = start
-        tasks = [task for task in layout.tasks if task.board == board]
+        tasks = [task for task in layout.processes if task.board == board]
         for task in tasks:
             self.blocks[task.name] = address
             self.traces[task.name] = address + BLOCK_SIZE

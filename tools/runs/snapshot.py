@@ -16,6 +16,7 @@ from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
+from rack.tools.runs.host_side import EntryRow, HostRow, entry_rows, host_rows
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
@@ -69,7 +70,7 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work.
+    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them.
     """
 
     rack: str
@@ -83,6 +84,8 @@ class Snapshot:
     tasks: tuple[TaskRow, ...]
     progress: TaskProgress | None
     holds: tuple[Hold, ...] = ()
+    hosts: tuple[HostRow, ...] = ()
+    entries: tuple[EntryRow, ...] = ()
 
 
 class RackMonitor:
@@ -121,6 +124,8 @@ class RackMonitor:
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
             holds=self._holds.look(),
+            hosts=host_rows(self._segment),
+            entries=entry_rows(self._segment),
         )
 
     def _active_faults(self) -> Iterator[str]:
