@@ -48,6 +48,8 @@ class System(IntEnum):
     EMERGENCY_STOP = 50
     REQUESTED = 51  # commands put into the operator table so far
     COMMANDED = 52  # serial of the newest command issued; written by the clock
+    HOLD_AT = 53  # 1 + tick before which lockstep holds, for single steps; 0: it does not. Written by the host
+    HELD = 54  # 1 + tick before which it holds now; 0: it does not. Written by the clock
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 
@@ -115,7 +117,8 @@ class Box(IntEnum):
     OWNER = 4  # the same for the critical section of protocol lock; value: its owner's process id, 0: none
     CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
     REFUSED = 6  # of a queue: messages refused because it was full
-    SENT = 7  # of a queue: serial of the newest message of its own writer; HEAD is greater while another has published
+    TAKEN = 7  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
+    SENT = 8  # of a queue: serial of the newest message of its own writer; HEAD is greater while another has published
 
 
 class Slot(IntEnum):

@@ -59,7 +59,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
@@ -68,11 +68,11 @@ from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.faults import Fault
-from rack.levels.operator import Commands
+from rack.levels.operator import Commands, Operation
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 
 __all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
-__all__ += ["Ports", "Program", "Reading", "Verdict"]
+__all__ += ["MadePorts", "Ports", "Program", "Reading", "Verdict"]
 
 
 class Input(NamedTuple):
@@ -84,6 +84,8 @@ class Input(NamedTuple):
     wire the port elsewhere."""
     many: bool = False
     """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order, in place of one."""
+    optional: bool = False
+    """With `many`: the level also works without any such neighbour."""
 
 
 class Output(NamedTuple):
@@ -104,6 +106,14 @@ class Output(NamedTuple):
     def is_due(self, tick: int, every: int) -> bool:
         """Return whether the cycle released at `tick`, one of those every `every` ticks, writes it."""
         return (tick + every) % (self.cycles * every) == 0
+
+
+class MadePorts(NamedTuple):
+    """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some are unknown."""
+
+    inputs: Mapping[str, Input] = MappingProxyType({})
+    outputs: Mapping[str, Output] = MappingProxyType({})
+    is_whole: bool = True
 
 
 class Ports(SimpleNamespace):
@@ -208,6 +218,16 @@ class Executor(ABC):
         The parameters of all boards concerned are valid, each by itself.
         """
         return ()
+
+    @classmethod
+    def wording(cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig) -> Sequence[str]:
+        """Return the names that an operator may give with an operation; see `rack.levels.operator.NAMED`."""
+        return cls.names(params)
+
+    @classmethod
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+        """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that classes declare."""
+        return MadePorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""

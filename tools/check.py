@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ import typer
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.config import load, shared_out
-from rack.boards.config.schema import CLOCK_SLOT, RackConfig
+from rack.boards.config.schema import CLOCK_SLOT, HostConfig, RackConfig
 from rack.boards.config.timing import with_budgets
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.rack import spanned
@@ -162,9 +162,36 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
         "segment_bytes": places.size,
         "windows": {window.board: window.address for window in places.windows},
         "tasks": tasks,
+        "hosts": [_host(name, host, layout) for name, host in config.host.items()],
         "mailboxes": mailboxes,
         "notes": notes,
     }
+
+
+def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:
+    return {
+        "board": name,
+        "program": host.program,
+        "external": host.external,
+        "writes": [mailbox.name for mailbox in layout.mailboxes if mailbox.writer == name],
+        "reads": [mailbox.name for mailbox in layout.mailboxes if name in mailbox.readers],
+    }
+
+
+def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[str]:
+    """Yield the boards of the host side: they have no rate, and the timing model leaves them out."""
+    if hosts:
+        rows = [
+            [
+                h["board"],
+                "rack prompt" if h["external"] else h["program"],
+                ", ".join(h["writes"]),
+                ", ".join(h["reads"]),
+            ]
+            for h in hosts
+        ]
+        yield ""
+        yield from table(["host side", "program", "writes", "reads"], rows, width, ("program",))
 
 
 def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator[str]:
@@ -191,6 +218,7 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
         ]
         for m in found["mailboxes"]
     ]
+    yield from _host_lines(found["hosts"], width)
     head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
     yield ""
     yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))

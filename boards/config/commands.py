@@ -19,9 +19,9 @@ from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.levels.algebra import norm
-from rack.levels.errors import RobotError
+from rack.levels.errors import LevelError, RobotError
 from rack.levels.level import Executor
-from rack.levels.operator import SETTINGS, Commands, Goal, goal_names, listed
+from rack.levels.operator import NAMED, Commands, Goal, goal_names, listed
 
 OWN_OPERATOR = "own.operator"
 DOWN = (0.0, 0.0, -1.0)
@@ -158,12 +158,16 @@ def _key(goal: Goal) -> str:
 
 
 def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
-    """Check that a setting, and nothing else, names something that its level has."""
-    if command.said not in SETTINGS:
+    """Check that an operation that gives a name, and no other, gives one that its level knows."""
+    if command.said not in NAMED:
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
-    known = _names(command.level, config)
+    board = config.board[command.level]
+    try:
+        known = find_class(board.executor, Executor).wording(command.said, board.params, config.scene)
+    except LevelError:
+        return  # reported elsewhere
     if command.name not in known:
         yield Mistake(place, command.name, f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}")
 

@@ -18,12 +18,15 @@ from rack.backplane.layout import Protocol, Role, Sampled, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
-from rack.levels.operator import Goal, Operation
+from rack.levels.operator import NAME_BYTES, Goal, Operation
 from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
 LAST_SLOT = 21
+OUTSIDE = 0
+"""Stands for the slot of a host board, which has none."""
+ANY_CORE = -1
 
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
@@ -192,13 +195,26 @@ class BoardConfig(Table):
     )
 
 
+class HostConfig(Table):
+    """`[host.<name>]`: one board of the host side, without slot, rate and priority: see `rack.levels.host_program`."""
+
+    program: ClassName = Field(description="class of the program, package.module:Class")
+    external: bool = Field(False, description="the rack does not start it: it is run by 'rack prompt'")
+    below: Neighbours = Field((), description="bus adapter through which it reaches the levels; or a list")
+    reads: dict[str, Sources] = Field({}, description="mailbox by port; overrides the program's own")
+    params: dict[str, Any] = Field({}, description="parameters of the program, declared by its class")
+    restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board")
+    restarts_within_s: Positive | None = Field(None, description="overrides supervision.within_s for this board, s")
+
+
 class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal["hold", "resume", "setpoint", "goto", "modify"] = Field(
+    what: Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do"] = Field(
         description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify: put "
-        "a control modification in or take it out"
+        "a control modification in or take it out; table: decide by another state table; do: do one of the level's own "
+        "commands"
     )
     tick: int | None = Field(
         None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"
@@ -215,7 +231,10 @@ class CommandConfig(Table):
         None, description="goal: direction of the tool's z axis, rotation about it left free; default: down"
     )
     home: bool = Field(False, description="goal: the arm's start position")
-    name: str | None = Field(None, description="control modification to put in or take out")
+    name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = Field(
+        None,
+        description="control modification to put in or take out; name of a table; command to do, as in pick block1",
+    )
     on: bool | None = Field(None, description="true: put it in; false: take it out")
 
     @property
@@ -259,6 +278,7 @@ class RackConfig(Table):
     scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
     task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")
     board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
+    host: dict[str, HostConfig] = Field({}, description="boards of the host side by name, without real time")
     supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of lost boards")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
     command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at its tick")
@@ -289,6 +309,11 @@ class RackConfig(Table):
                 slot = board.slot if board.planner_slot is None else board.planner_slot
                 core = board.core if board.planner_core is None else board.planner_core
                 yield TaskPlace(f"{name}.planner", name, "planner", slot, core, board.planner_priority)
+
+    def hosts(self) -> Iterator[TaskPlace]:
+        """Yield every board of the host side, outside the crate: it has no slot, and runs on any core."""
+        for name in self.host:
+            yield TaskPlace(name, name, "host", OUTSIDE, ANY_CORE, 0)
 
     def text(self) -> str:
         """Return the config as self-contained TOML that loads to the same config."""

@@ -13,7 +13,7 @@ from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.joint_messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS, JOINT_TORQUE
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Verdict
+from rack.levels.level import Executor, Input, LevelContext, Ports, Verdict
 from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
@@ -51,7 +51,7 @@ class JointServo(Executor):
         "status": Input(ARM_STATUS, "below.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"torque": Output(JOINT_TORQUE, rests_on="command"), "status": JOINT_STATUS}
+    outputs = {"command": JOINT_TORQUE, "status": JOINT_STATUS}
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
@@ -137,7 +137,7 @@ class JointServo(Executor):
         self._servo(*times, self._sample, wanted.table, *self._shown_numbers)
         if self._modified.exists:
             self._modify(times, wanted, tick)
-        torque = write.torque
+        torque = write.command
         torque.sampled, torque.id = sampled, torque.id + 1
         if self._grip is not None:
             torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
@@ -163,7 +163,7 @@ class JointServo(Executor):
 
     def _meet(self, is_there: bool, arm: Message, write: Ports) -> bool:
         """Begin with the first status of the arm; return whether there is one."""
-        status, torque = write.status, write.torque
+        status, torque = write.status, write.command
         self._met = is_there
         if not is_there:
             torque.sampled = -1
@@ -188,7 +188,7 @@ class JointServo(Executor):
             self._offered = command
             if self._grip is not None:
                 self._grip.take(command)
-                write.torque.payload_mass, write.torque.payload_offset = command.payload_mass, command.payload_offset
+                write.command.payload_mass, write.command.payload_offset = command.payload_mass, command.payload_offset
 
     def _take_loads(self, arm: Message, tick: int, stopped: bool) -> None:
         """Take over inertia and load of the reference that is followed; compute them while none is."""

@@ -14,7 +14,8 @@ from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
-from rack.levels.messages import SERVO_STATUS, TASK_STATUS
+from rack.levels.joint_messages import DRIVING
+from rack.levels.messages import TASK_STATUS
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
     communication_ns,
@@ -28,11 +29,13 @@ from rack.levels.timing.trace_times import (
 from rack.tools.analysis.report_markdown import markdown
 from rack.tools.faults.judge import faults
 from rack.tools.runs.history import counted, first_difference, frequency, holds, misses, steal
+from rack.tools.runs.host_side import entries_of
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.queues import queues
 from rack.tools.runs.recording import Recording
 
 Report = dict[str, Any]
+ENTRY_COUNTS = ("passed", "refused", "overtaken", "full", "waiting")
 
 
 def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
@@ -70,6 +73,7 @@ def report_of(recording: Recording) -> Report:
         **faults(recording.events, layout),
         "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
         "system_response": system_response(recording),
+        "entries": _entries(recording),
         "task": _task_outcome(recording),
         "motion": _motion(recording),
         "queues": queues(recording),
@@ -82,7 +86,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
         *("misses", "steal", "frequency_mhz", "notes", "holds", "faults", "unexplained", "restarts"),
-        *("system_response", "task", "motion", "queues", "rows_lost"),
+        *("system_response", "entries", "task", "motion", "queues", "rows_lost"),
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
@@ -170,6 +174,19 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: 
     }
 
 
+def _entries(recording: Recording) -> list[Report]:
+    """Return the entries of all bus adapters: their counts at the end, and the ages of what passed, ms."""
+    found, tick_ms = [], recording.layout.clock_ns * 1e-6
+    for mailbox, entry, source in entries_of(recording.layout, recording.config):
+        if mailbox in recording.mailboxes:
+            ages = recording.signal(mailbox, f"{entry}.age")
+            counts = {name: int(recording.signal(mailbox, f"{entry}.{name}")[-1]) for name in ENTRY_COUNTS}
+            name = f"{mailbox.partition('.')[0]}.{entry}"
+            ages_ms = distribution(ages[ages >= 0] * tick_ms)
+            found.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
+    return found
+
+
 def _task_outcome(recording: Recording) -> Report | None:
     """Return the last status of the level that reports on the whole task."""
     mailbox = _mailbox_of(recording, TASK_STATUS.name)
@@ -185,7 +202,7 @@ def _task_outcome(recording: Recording) -> Report | None:
 
 def _motion(recording: Recording) -> Report | None:
     """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set points, or None."""
-    mailbox = _mailbox_of(recording, SERVO_STATUS.name)
+    mailbox = _mailbox_of(recording, *DRIVING)
     if mailbox is None:
         return None
     error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
@@ -197,7 +214,7 @@ def _motion(recording: Recording) -> Report | None:
     }
 
 
-def _mailbox_of(recording: Recording, message: str) -> str | None:
-    """Return the first mailbox with messages of a type; None when it is empty, or there is none."""
-    name = next((m.name for m in recording.layout.mailboxes if m.message == message), None)
+def _mailbox_of(recording: Recording, *messages: str) -> str | None:
+    """Return the first mailbox with messages of one of these types; None when it is empty, or there is none."""
+    name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return name if name in recording.mailboxes else None

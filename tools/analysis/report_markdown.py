@@ -90,6 +90,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _faults(report)
     yield from _misses(report)
     yield from _response(report["system_response"])
+    yield from _entries(report["entries"])
 
 
 def _times(report: Report) -> Iterator[str | Grid]:
@@ -273,3 +274,16 @@ def _response_along(response: Report) -> Iterator[str | Grid]:
             yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
         if found["unseen"]:
             yield from ("", f"{way}: {found['unseen']} not measured: messages are missing in the recording.")
+
+
+def _entries(entries: list[Report]) -> Iterator[str | Grid]:
+    """Yield what passed between the two sides; nothing for a rack without bus adapters."""
+    if not entries:
+        return
+    yield from ("", "## Bus adapters, ages in ms of simulated time", "")
+    counts = ("entry", "source", "passed", "refused", "overtaken", "full", "waiting")
+    rows = [
+        [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ("p50", "p99", "max"))]
+        for row in entries
+    ]
+    yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("overtaken", "waiting", "source"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.events import Event, Outcome
+from rack.boards.wiring import Entries
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, strikes
@@ -87,11 +88,13 @@ def run_rack(
     view: bool = False,
     share: bool = True,
     crate: CrateLine | None = None,
+    step: bool = False,
+    entries: Mapping[str, Entries] | None = None,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder` unless that is None.
 
-    With `view`, open a viewer on what the recorder serves; it may be closed at any time. `share` and `crate`
-    are as in `Rack`.
+    With `view`, open a viewer on what the recorder serves; it may be closed at any time. With `step`, in lockstep, hold
+    before tick 0 until the rack is stepped. `share`, `crate` and `entries` are as in `Rack`.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that fails does not
     change how the run ends.
@@ -104,7 +107,8 @@ def run_rack(
             recorder = None if folder is None else RecorderProcess()
             if recorder is not None:
                 stack.callback(recorder.finish)
-            rack = stack.enter_context(Rack(config, log.add, share, crate))
+            rack = stack.enter_context(Rack(config, log.add, share, crate, entries))
+            rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())

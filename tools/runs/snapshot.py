@@ -10,18 +10,21 @@ from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import State
+from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
+from rack.tools.runs.host_side import EntryRow, HostRow, entry_rows, host_rows
 from rack.tools.runs.queues import QueueFill, Queues
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
 DEAD = "dead"
 """State of a run whose launcher is gone: 'rack clean' removes it."""
+HELD = "HELD: 'rack step {}' lets it go on"
+"""Line of a rack in lockstep that is single-stepped."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports the progress of the whole task."""
 
@@ -30,7 +33,7 @@ TASK_STATUS = "task_status"
 class TaskRow:
     """One task now. Times are the longest of the newest cycles, in ms; None before the first.
 
-    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling.
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `row` is what fired of a state table.
     """
 
     task: str
@@ -48,6 +51,7 @@ class TaskRow:
     exec_ms: float | None
     lateness_ms: float | None
     reason: str
+    row: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,8 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work; `queues` are all of them, empty ones too.
+    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
+    `queues` are all of them, empty ones too.
     """
 
     rack: str
@@ -81,6 +86,8 @@ class Snapshot:
     tasks: tuple[TaskRow, ...]
     progress: TaskProgress | None
     holds: tuple[Hold, ...] = ()
+    hosts: tuple[HostRow, ...] = ()
+    entries: tuple[EntryRow, ...] = ()
     queues: tuple[QueueFill, ...] = ()
 
 
@@ -121,6 +128,8 @@ class RackMonitor:
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
             holds=self._holds.look(),
+            hosts=host_rows(self._segment),
+            entries=entry_rows(self._segment),
             queues=self._queues.look(),
         )
 
@@ -135,7 +144,8 @@ class RackMonitor:
         lines = self._lines
         held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
         single = {"ACFAIL": lines.acfail, "SYSRESET": lines.sysreset, "EMERGENCY STOP": lines.emergency_stop}
-        return held + [name for name, asserted in single.items() if asserted] + self._without_priority()
+        stepped = [HELD.format(self._segment.rack)] if self._segment.words[System.HELD] else []
+        return held + [name for name, asserted in single.items() if asserted] + self._without_priority() + stepped
 
     def _without_priority(self) -> list[str]:
         """Return a warning when tasks were refused their real-time priority."""
@@ -147,11 +157,12 @@ class RackMonitor:
     def _row(self, task: TaskSpec) -> TaskRow:
         block = self._segment.block(task.name)
         exec_ms, lateness_ms = self._times_ms(task.name)
-        state, reason = TaskState(block[Block.STATE]).name.lower(), ""
+        state, reason, row = TaskState(block[Block.STATE]).name.lower(), "", ""
         if block[Block.LOST]:
             state = LOST
         elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
             state, reason = State(status.value.state).name.lower(), status.value.reason
+            row = fired(status.value)
         return TaskRow(
             task=task.name,
             slot=task.slot,
@@ -168,6 +179,7 @@ class RackMonitor:
             exec_ms=exec_ms,
             lateness_ms=lateness_ms,
             reason=reason,
+            row=row,
         )
 
     def _restarts(self, task: str) -> int:
@@ -188,6 +200,14 @@ class RackMonitor:
             return None
         at = status.value
         return TaskProgress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
+
+
+def fired(status: Message) -> str:
+    """Return what fired of a state table in a level's newest cycle, as text; empty for a level without one."""
+    if "fired" not in (status.record.dtype.names or ()):
+        return ""
+    what = f"row {status.row} '{status.fired}'" if status.row else "no row"
+    return f"{what}, now in '{status.in_state}', table {status.table}"
 
 
 def joint_names(config: str) -> tuple[str, ...]:
