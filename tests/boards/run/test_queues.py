@@ -181,6 +181,10 @@ def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
     rack.room = 9
     rack.run(30, 34, lambda tick: 0)
     assert rack.taken == [1, 2]
+    rack.run(34, 80, lambda tick: tick % 2)
+    rack.room = 0
+    rack.run(80, 90, lambda tick: 1)
+    assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
 
 
 def test_room_comes_back_one_cycle_of_the_reader_after_it_has_taken(link: MakeQueue) -> None:
