@@ -6,8 +6,8 @@
     cancel()                      drop everything; the arm ramps to rest
     done(), wait()                whether all is done; wait until it is
 
-A call returns as soon as its request is on its way: requests are queued, and blended. It waits only while that is full.
-A request that is lost, with a board that died as it held it, is sent again by the next call that waits.
+A call returns as soon as its request is on its way: requests are queued, and blended. It waits only while the queue is
+full. A request that is lost, with a board that died as it held it, is sent again by the next call that waits.
 """
 
 from __future__ import annotations
