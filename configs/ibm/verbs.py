@@ -15,7 +15,7 @@ from rack.levels.level import Input
 from rack.levels.trajectory.commands import Motions
 from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS
 
-PRESSED, WINDOW = 3.0, 12
+PRESSED, WINDOW = 6.0, 12
 """Change of a joint's torque that counts as touch, N m, and the samples within which it must happen."""
 STEADY = 0.15
 """Part of a guarded move that it needs to reach its speed."""

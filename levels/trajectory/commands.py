@@ -138,7 +138,7 @@ class Motions:
 
 
 class ScriptParams(Table):
-    """`[host.<name>.params]`."""
+    """`[host.<name>.params]`: the script of a command environment."""
 
     script: str = Field(description="Python script to run, in a folder of python_path")
 
