@@ -88,7 +88,8 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     wanted = name.strip("[]")
     start, _, rest = wanted.partition(".")
     board, _, rest = rest.partition(".")
-    if start in ("board", "host") and board in (*getattr(config, start), "<name>") and not _within(wanted, known):
+    is_own = bool(rest) and bool(_within(wanted, known))
+    if start in ("board", "host") and board in (*getattr(config, start), "<name>") and not is_own:
         wanted = f"{start}.{rest}" if rest else start
     found = [known[wanted]] if wanted in known else [known[name] for name in _within(wanted, known)]
     if not found:
