@@ -98,7 +98,7 @@ class Recording:
         """The rack's layout, without the fields of its messages: see `fields` and `signal`."""
         with _naming(self.folder / "signals.parquet"):
             text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
-            boxes = [MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": ()}) for m in text["mailboxes"]]
+            boxes = [MailboxSpec(**{**m, **_tuples(m), "fields": ()}) for m in text["mailboxes"]]
             tasks = tuple(TaskSpec(**task) for task in text["tasks"])
             return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes))
 
@@ -195,3 +195,8 @@ def _event(line: str, place: str) -> dict[str, Any]:
 
 def _note(text: str) -> None:
     print(text, file=sys.stderr)
+
+
+def _tuples(mailbox: dict[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return the names of tasks and mailboxes in a record of a mailbox; an earlier version did not record them all."""
+    return {key: tuple(mailbox.get(key, ())) for key in ("readers", "rests_on")}
