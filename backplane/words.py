@@ -48,6 +48,8 @@ class System(IntEnum):
     EMERGENCY_STOP = 50
     REQUESTED = 51  # commands put into the operator table so far
     COMMANDED = 52  # serial of the newest command issued; written by the clock
+    HOLD_AT = 53  # 1 + tick before which lockstep holds, for single steps; 0: it does not. Written by the host
+    HELD = 54  # 1 + tick before which it holds now; 0: it does not. Written by the clock
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 

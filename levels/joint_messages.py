@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from rack.backplane.message import Field, command, status
 from rack.backplane.words import Demand
+from rack.levels.messages import JOINT_SET_POINT, SERVO_STATUS
 from rack.levels.operator import ANSWER, RESTS_ON
 
 JOINT_REFERENCE = command(
@@ -79,3 +80,8 @@ ARM_STATUS = status(
     Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
 )
 """From the board of the arm to those that servo joints; a servo level's status without set points of its own."""
+
+DRIVING = (SERVO_STATUS.name, ARM_STATUS.name)
+"""Names of the statuses of levels that drive an arm."""
+STREAMED = (JOINT_SET_POINT.name, JOINT_REFERENCE.name, JOINT_TORQUE.name)
+"""Names of commands that change in every cycle."""

@@ -68,7 +68,7 @@ from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.faults import Fault
-from rack.levels.operator import Commands
+from rack.levels.operator import Commands, Operation
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 
 __all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
@@ -84,6 +84,8 @@ class Input(NamedTuple):
     wire the port elsewhere."""
     many: bool = False
     """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order, in place of one."""
+    optional: bool = False
+    """With `many`: the level also works without any such neighbour."""
 
 
 class Output(NamedTuple):
@@ -208,6 +210,11 @@ class Executor(ABC):
         The parameters of all boards concerned are valid, each by itself.
         """
         return ()
+
+    @classmethod
+    def wording(cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig) -> Sequence[str]:
+        """Return the names that an operator may give with an operation; see `rack.levels.operator.NAMED`."""
+        return cls.names(params)
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""

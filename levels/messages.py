@@ -45,6 +45,7 @@ class Error(IntEnum):
     OVERLOAD = 13  # more than motors or gripper can carry
     STALLED = 14  # nothing has moved for the time that the task permits
     MOTORS = 15  # a motor did not give its torque, however often it was retried
+    TABLE = 16  # a state table came to a row with status error
 
 
 class Verb(IntEnum):

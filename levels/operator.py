@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MAX_JOINTS = 16
 """Most joints of an arm: an operator's mailbox is the same in every rack."""
-NAME_BYTES = 32
+NAME_BYTES = 64
 """Longest name that a command can give."""
 
 
@@ -35,6 +35,8 @@ class Operation(IntEnum):
     SETPOINT = 3  # bring the joints to positions, and stay until RESUME
     GOTO = 4  # move to a goal by the level's own planning, and stay until RESUME
     MODIFY = 5  # put the control modification `name` in, or take it out
+    TABLE = 6  # decide by the state table `name` from now on
+    DO = 7  # do the level's own command `name` in place of those of the level above, and stay until RESUME
 
 
 class Goal(IntEnum):
@@ -49,8 +51,10 @@ class Goal(IntEnum):
     OFF = 6
 
 
-SETTINGS = (Operation.MODIFY,)
+SETTINGS = (Operation.MODIFY, Operation.TABLE)
 """Operations that are done at once and leave the command in force as it is; each names what it sets."""
+NAMED = (*SETTINGS, Operation.DO)
+"""Operations that give a name: see `Executor.wording`."""
 
 
 class Answer(IntEnum):
@@ -72,7 +76,7 @@ OPERATOR_COMMAND = command(
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
     Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
     Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
-    Field("name", f"S{NAME_BYTES}", "ASCII", "what a setting sets"),
+    Field("name", f"S{NAME_BYTES}", "ASCII", "what a setting sets, or the level's own command to do"),
 )
 
 RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or above, that this rests on; 0: none")
@@ -87,7 +91,12 @@ ANSWER = (
 
 Commands = Mapping[Operation, Sequence[Goal]]
 
-EFFECTS = {Operation.HOLD: "held", Operation.SETPOINT: "kept at a set point", Operation.GOTO: "diverted"}
+EFFECTS = {
+    Operation.HOLD: "held",
+    Operation.SETPOINT: "kept at a set point",
+    Operation.GOTO: "diverted",
+    Operation.DO: "commanded",
+}
 """Effects of a standing command on a level, in words."""
 HELD_FROM_ABOVE = "held by the level above"
 """Reason of a level that is held from above; the level above does not pass it on."""
@@ -123,7 +132,7 @@ class Orders:
 
     def __init__(self, commands: Commands) -> None:
         self._commands = commands
-        self.standing = Operation.NONE  # in force: HOLD, SETPOINT or GOTO; NONE: the level does its own work
+        self.standing = Operation.NONE  # in force: one of `EFFECTS`; NONE: the level does its own work
         self.serial = 0  # of the newest command; 0: none yet
         self.basis = 0  # of the newest command that was not refused; 0: none yet
         self.answer = Answer.NONE

@@ -5,6 +5,8 @@ An arm is data: an MJCF file, and in `[robot]` the rest. `rack.levels.robot` bui
 
 from __future__ import annotations
 
+import importlib
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -39,6 +41,7 @@ def _tuple(value: Any) -> Any:
 
 
 Params = TypeVar("Params", bound=Table)
+T = TypeVar("T")
 
 
 def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
@@ -50,6 +53,22 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
         key = ".".join(str(part) for part in first["loc"])
         valid = ", ".join(kind.model_fields)
         raise LevelError(f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}") from error
+
+
+def named_class(reference: str, base: type[T]) -> type[T]:
+    """Return the class that "package.module:Class" names. Raises `ValueError`: it is missing, or no whole `base`."""
+    module, _, name = reference.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except (Exception, SystemExit) as error:  # importing a user's module may raise anything
+        raise ValueError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
+    if found is None:
+        raise ValueError(f"module '{module}' has no class '{name}'")
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f"'{name}' is not a subclass of {base.__module__}.{base.__name__}")
+    if inspect.isabstract(found):
+        raise ValueError(f"class '{name}' lacks: {', '.join(sorted(getattr(found, '__abstractmethods__', ())))}")
+    return found
 
 
 class SensorConfig(Table):

@@ -12,18 +12,19 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
-DONE_AT_ONCE = ("resume", "modify")
+DONE_AT_ONCE = ("resume", "modify", "table")
 """Commands that leave none in force."""
 
 Level = Annotated[
     str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own")
 ]
-What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto or modify")]
+What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, modify, table or do")]
 Goals = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="GOAL",
-        help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify: NAME on|off",
+        help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify: NAME on|off; for "
+        "table: NAME; for do: the level's command",
     ),
 ]
 Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
@@ -54,9 +55,11 @@ def command(
     resume    let the level continue its own work
     modify    put a control modification of the servo level in, or take it out,
               between two samples and without a step in the torque
+    table     decide by another state table from now on
+    do        do one of the level's own commands, in place of the level above
 
-    All but `modify` stay in force until `resume`. They survive a restart of the level's board. An emergency stop takes
-    precedence.
+    All but `modify` and `table` stay in force until `resume`. They survive a restart of the level's board. An emergency
+    stop takes precedence.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did not answer in time;
     2 usage.
@@ -70,6 +73,8 @@ def command(
       rack command nasrem task goto position=0.45,0.1,0.95
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
       rack command brown joints modify friction on --at 2.5
+      rack command nist-state-table task table careful
+      rack command nist-state-table elemental_move do pick block1 --wait
     """
     from rack.tools.console.tables import terminal_width
     from rack.tools.runs.desk import LiveDesk
@@ -94,14 +99,16 @@ def command(
 
 
 def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
-    """Return what follows the verb, typed as `home`, key=numbers or NAME on|off, as in a `[[command]]` table.
+    """Return what follows the verb, as in a `[[command]]` table.
 
-    Raises `Failure`.
+    Typed as `home`, key=numbers, NAME on|off, or the name of a table or command. Raises `Failure`.
     """
     if what == "modify":
         if len(words) != 2 or words[1] not in ("on", "off"):
             raise Failure(f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2)
         return {"name": words[0], "on": words[1] == "on"}
+    if what in ("table", "do"):
+        return {"name": " ".join(words)}
     goal: dict[str, Any] = {}
     for word in words:
         key, is_given, values = word.partition("=")

@@ -32,6 +32,9 @@ Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run
 Share = Annotated[
     bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: both will be late")
 ]
+Step = Annotated[
+    bool, typer.Option("--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on")
+]
 NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
 
 
@@ -39,6 +42,7 @@ def run(
     context: typer.Context,
     config: ConfigName,
     lockstep: Lockstep = False,
+    step: Step = False,
     seconds: Seconds = None,
     speed: Speed = None,
     settings: Settings = [],  # noqa: B006  typer copies it
@@ -63,6 +67,7 @@ def run(
       rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
       rack run nasrem --faults bad-sensors --out runs/sensors
       rack run nasrem --set clock.speed=2 --view
+      rack run nist-state-table --lockstep --step
     """
     if view and no_record:
         raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
@@ -77,11 +82,13 @@ def run(
     from rack.tools.runs.launch import NO_TIME, run_rack
 
     found = validated(tables)
+    if step and found.clock.mode != "lockstep":
+        raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
     # From the start of the run to the end of its report; during the launch a signal ends the command at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:
-            result = run_rack(found, seconds, folder, display, view=view, share=share, crate=crate)
+            result = run_rack(found, seconds, folder, display, view=view, share=share, crate=crate, step=step)
         _report(found, folder, result, as_json)
     if not result.worked:
         # On stderr and last, where it is seen in any case.

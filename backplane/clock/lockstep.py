@@ -25,6 +25,9 @@ SLOW_S = 30.0
 """Bound of the wait for a recorder that runs but reads no rows: a new one may still be importing its libraries."""
 # Plain integers for the hot path.
 _FOLLOWER_PID, _FOLLOWER_TICK = int(System.FOLLOWER_PID), int(System.FOLLOWER_TICK)
+_HOLD_AT = int(System.HOLD_AT)
+LOOK_S = 0.001
+"""Time between looks at what posts no semaphore: recorder and host, which must not be able to disturb the clock."""
 
 
 class LockstepDriver(ClockDriver):
@@ -47,7 +50,7 @@ class LockstepDriver(ClockDriver):
         tick = self.first_tick
         last = tick - 1
         self.words[System.STATE] = Run.RUNNING
-        while not self.is_over(tick) and self._wait_for_follower(tick):
+        while self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick):
             if self.begin(tick):
                 if not self._step(tick, last):
                     break
@@ -126,6 +129,19 @@ class LockstepDriver(ClockDriver):
                 words[_FOLLOWER_PID] = 0
             if words[System.STOP_REQUEST] or not self.launcher_is_alive:
                 return False
-            # Polled, since the recorder posts no semaphore: it must not be able to disturb the clock in real time.
-            time.sleep(0.001)
+            time.sleep(LOOK_S)
+        return True
+
+    def _wait_for_step(self, tick: int) -> bool:
+        """Hold before `tick` while the host steps the rack; False when the launcher is gone."""
+        words = self.words
+        if not 0 < words[_HOLD_AT] <= tick + 1:
+            return True
+        self.settle()
+        words[System.HELD] = tick + 1
+        while 0 < words[_HOLD_AT] <= tick + 1 and not words[System.STOP_REQUEST]:
+            if not self.launcher_is_alive:
+                return False
+            time.sleep(LOOK_S)
+        words[System.HELD] = 0
         return True

@@ -72,6 +72,7 @@ class Alarm(IntEnum):
     RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
+    MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,9 @@ from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.levels.algebra import norm
-from rack.levels.errors import RobotError
+from rack.levels.errors import LevelError, RobotError
 from rack.levels.level import Executor
-from rack.levels.operator import SETTINGS, Commands, Goal, goal_names, listed
+from rack.levels.operator import NAMED, Commands, Goal, goal_names, listed
 
 OWN_OPERATOR = "own.operator"
 DOWN = (0.0, 0.0, -1.0)
@@ -38,6 +38,16 @@ def commandable(config: RackConfig) -> dict[str, Commands]:
         if any(port.source == OWN_OPERATOR for port in executor.inputs.values()):
             found[name] = executor.commands
     return found
+
+
+def setting_name(config: RackConfig, board: str, number: int) -> str:
+    """Return the name that a board's level gives to something by `number`: see `Executor.names`."""
+    return _names(board, config)[number]
+
+
+def _names(board: str, config: RackConfig) -> Sequence[str]:
+    table = config.board[board]
+    return find_class(table.executor, Executor).names(table.params)
 
 
 def asked(given: Mapping[str, Any]) -> CommandConfig:
@@ -148,13 +158,16 @@ def _key(goal: Goal) -> str:
 
 
 def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
-    """Check that a setting, and nothing else, names something that its level has."""
-    if command.said not in SETTINGS:
+    """Check that an operation that gives a name, and no other, gives one that its level knows."""
+    if command.said not in NAMED:
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
     board = config.board[command.level]
-    known = find_class(board.executor, Executor).names(board.params)
+    try:
+        known = find_class(board.executor, Executor).wording(command.said, board.params, config.scene)
+    except LevelError:
+        return  # reported elsewhere
     if command.name not in known:
         yield Mistake(place, command.name, f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}")
 

@@ -89,7 +89,19 @@ def anchor(tables: Tables, folder: Path) -> Tables:
         anchored["robot"] = {**robot, "model": str(_find(robot["model"], folder) or folder / robot["model"])}
     if isinstance(own, list) and all(isinstance(item, str) for item in own):
         anchored["python_path"] = [str((folder / item).resolve()) for item in own]
+    boards = tables.get("board")
+    if isinstance(boards, dict):
+        anchored["board"] = {name: _with_tables(board, folder) for name, board in boards.items()}
     return anchored
+
+
+def _with_tables(board: Any, folder: Path) -> Any:
+    """Return a board with absolute paths of its level's state tables."""
+    params = board.get("params") if isinstance(board, dict) else None
+    if not isinstance(params, dict) or not isinstance(files := params.get("tables"), dict):
+        return board
+    paths = {name: str(_find(file, folder) or folder / file) for name, file in files.items() if isinstance(file, str)}
+    return {**board, "params": {**params, "tables": {**files, **paths}}}
 
 
 def portable(model: Path) -> str:

@@ -195,7 +195,9 @@ class Wiring:
         """Yield a queue with its size, and the mailbox in which its reader writes its position for the writer."""
         delay, slowest = reader.every * reader.within_cycles, writer.every * writer.within_cycles
         capacity = self.config.protocol.depth.get(box.name, UNREAD)
-        yield replace(box, capacity=capacity, depth=queue_slots(capacity, box.delay + delay, self._kept_ticks))
+        yield replace(
+            box, capacity=capacity, depth=queue_slots(capacity, box.every, box.delay + delay, self._kept_ticks)
+        )
         depth = depth_for(max(slowest + delay, self._kept_ticks), reader.every)
         spec = partial(MailboxSpec, writer=reader.name, every=reader.every, delay=delay, depth=depth)
         position = self._mailbox(taken_name(box.name), TAKEN, {}, spec)

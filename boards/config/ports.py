@@ -107,7 +107,9 @@ def _sources(
         boards = neighbours.get(start, (start,))
         found = wired.get(port, tuple(f"{board}.{rest}" for board in boards))
         at, given = (f"{key}.{port}", list(found)) if port in wired else (start, list(boards))
-        if not found:
+        if not found and entry.many and entry.optional:
+            yield port, {}
+        elif not found:
             mistakes.append(Mistake(f"board.{name}.{start}", None, f"missing; port '{port}' of the {role} needs it"))
         elif not entry.many and len(found) > 1:
             why = f"port '{port}' of the {role} reads one mailbox, not {len(found)}"

@@ -12,6 +12,9 @@ from rack.boards.errors import Mistake
 if TYPE_CHECKING:
     from rack.boards.config.layout import Wiring
 
+SUSTAINED = 4
+"""Messages a cycle of the writer, on average, of which a recorder loses none however deep the queue is."""
+
 
 def queue_mistakes(wiring: Wiring) -> Iterator[Mistake]:
     """Yield every mistake in the queues of a rack."""
@@ -39,17 +42,18 @@ def _wired(wiring: Wiring, mailbox: str) -> Iterator[Mistake]:
         yield Mistake(f"mailbox {taken_name(mailbox)}", None, why)
     readers = [f"{task.task} ({port})" for task in wiring.tasks for port, box in task.sources if box == mailbox]
     if len(readers) > 1:
-        why = "a queue gives each message once, so it has one reader"
-        yield Mistake(f"mailbox {mailbox}", ", ".join(readers), why)
+        why = f"a queue gives each message once, so it has one reader, not {len(readers)}: {', '.join(readers)}"
+        yield Mistake(f"mailbox {mailbox}", None, why)
     elif not readers and not wiring.has_unknown:
         why = "no task reads this queue, so it would fill and stay full; permitted: one reader"
         yield Mistake(f"mailbox {mailbox}", None, why)
 
 
-def queue_slots(capacity: int, cycle: int, kept: int) -> int:
-    """Return the slots of a queue that keep all messages of the last `kept` ticks.
+def queue_slots(capacity: int, every: int, cycle: int, kept: int) -> int:
+    """Return the slots of a queue that keep the messages of the last `kept` ticks.
 
     In `cycle` ticks, from a release of the writer until it can know that the reader has taken the messages, no more
-    than the capacity can be sent.
+    than the capacity can be sent. A deep queue keeps fewer: `SUSTAINED` messages in each of the writer's cycles.
     """
-    return depth_for(capacity * (1 + kept // cycle), 1)
+    most = capacity * (1 + kept // cycle)
+    return depth_for(min(most, 2 * capacity + SUSTAINED * kept // every), 1)

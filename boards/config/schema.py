@@ -18,7 +18,7 @@ from rack.backplane.layout import Protocol, Role, Sampled, Wake
 from rack.boards.config.files import portable
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
-from rack.levels.operator import Goal, Operation
+from rack.levels.operator import NAME_BYTES, Goal, Operation
 from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
 
 CLOCK_SLOT = 1
@@ -194,9 +194,10 @@ class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal["hold", "resume", "setpoint", "goto", "modify"] = Field(
+    what: Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do"] = Field(
         description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify: put "
-        "a control modification in or take it out"
+        "a control modification in or take it out; table: decide by another state table; do: do one of the level's own "
+        "commands"
     )
     tick: int | None = Field(
         None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"
@@ -213,7 +214,10 @@ class CommandConfig(Table):
         None, description="goal: direction of the tool's z axis, rotation about it left free; default: down"
     )
     home: bool = Field(False, description="goal: the arm's start position")
-    name: str | None = Field(None, description="control modification to put in or take out")
+    name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = Field(
+        None,
+        description="control modification to put in or take out; name of a table; command to do, as in pick block1",
+    )
     on: bool | None = Field(None, description="true: put it in; false: take it out")
 
     @property

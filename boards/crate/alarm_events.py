@@ -16,6 +16,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
+from rack.boards.config.commands import setting_name
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, EventKind
 from rack.boards.faults.describe import board_of, joint_name, subject_of
@@ -23,7 +24,7 @@ from rack.boards.faults.describe import describe as describe_fault
 from rack.boards.operator import describe, level_of, message_of
 from rack.levels.operator import Operation
 
-About = Literal["task", "mailbox", "joint", "geom", "nothing"]
+About = Literal["task", "mailbox", "joint", "geom", "name", "nothing"]
 EMERGENCY_STOP = "emergency stop"
 
 KIND_OF: Mapping[Alarm, EventKind] = {
@@ -68,6 +69,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.BRAKES_OPENED: ("nothing", "brakes released after {span}"),
     Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
+    Alarm.MODIFICATION: ("name", "control modification '{subject}' failed and was taken out"),
     Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
 }
 
@@ -91,7 +93,7 @@ class AlarmWatch:
         else:
             # The cell is built at the first collision.
             geom = partial(geom_name, robot, config.scene, config.clock_ns)
-            self._events = AlarmEvents(segment, robot.joints, geom)
+            self._events = AlarmEvents(segment, robot.joints, geom, partial(setting_name, config))
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:
@@ -107,11 +109,20 @@ class AlarmWatch:
 
 
 class AlarmEvents:
-    """Turns a rack's alarms into events. `joints` are the robot's; `geom` returns the name of a geom of the cell."""
+    """Turns a rack's alarms into events.
 
-    def __init__(self, segment: Segment, joints: Sequence[str] = (), geom: Callable[[int], str] = str) -> None:
+    `joints` are the robot's; `geom` returns the name of a geom of the cell, `name` one of `Executor.names` of a board.
+    """
+
+    def __init__(
+        self,
+        segment: Segment,
+        joints: Sequence[str] = (),
+        geom: Callable[[int], str] = str,
+        name: Callable[[str, int], str] = lambda board, number: str(number),
+    ) -> None:
         self._layout, self._faults, self._operator = segment.layout, FaultTable(segment), OperatorTable(segment)
-        self._joints, self._geom = joints, geom
+        self._joints, self._geom, self._name = joints, geom, name
 
     def of(self, row: np.void, owner: str) -> Event:
         """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring of task `owner`.
@@ -138,13 +149,13 @@ class AlarmEvents:
         elif alarm == Alarm.BRAKES_CLOSED:
             subject, text = "", f"brakes engaged: no torque for {self._span(value)}" if value else "brakes engaged"
         else:
-            subject, text = self._described(alarm, row)
+            subject, text = self._described(alarm, row, owner)
             board = subject if alarm == Alarm.REJOINED else owner
         realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
         return Event(realtime_ns, int(row["tick"]), kind, board, text, code, fault, subject, value, int(since))
 
-    def _described(self, alarm: Alarm, row: np.void) -> tuple[str, str]:
-        """Return the name of an alarm's subject, and its text."""
+    def _described(self, alarm: Alarm, row: np.void, owner: str) -> tuple[str, str]:
+        """Return the name of the subject of an alarm from `owner`, and its text."""
         about, text = TEXTS[alarm]
         number, value, layout = int(row["subject"]), float(row["value"]), self._layout
         subject = writer = ""
@@ -152,6 +163,8 @@ class AlarmEvents:
             subject = self._task(number, CLOCK)
         elif about == "joint":
             subject = joint_name(number, self._joints)
+        elif about == "name":
+            subject = self._name(owner, number)
         elif about == "geom":
             subject, writer = self._geom(number), self._geom(int(value))
         elif about == "mailbox":

@@ -44,7 +44,7 @@ class Heartbeat:
             if block[Block.DONE] != self._seen[name][0] or idle:
                 self._seen[name] = block[Block.DONE], now
                 self._reported.discard(name)
-        if self._words[System.TICK] != self._seen[CLOCK][0]:
+        if self._words[System.TICK] != self._seen[CLOCK][0] or self._words[System.HELD]:
             self._seen[CLOCK] = self._words[System.TICK], now
             self._reported.discard(CLOCK)
         late = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]

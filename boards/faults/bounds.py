@@ -116,6 +116,15 @@ def cycles(count: int) -> Bound:
     return Bound(_counted(count, "cycle") if count else "the same cycle", lambda case: count * case.cycle)
 
 
+def cycles_and_time(count: int, time_ns: int) -> Bound:
+    """Return a bound of `count` cycles of the task, but at least a time, in which a controller's gains take effect."""
+
+    def ticks(case: BoundCase) -> int:
+        return max(count * case.cycle, ceil(time_ns / case.layout.clock_ns))
+
+    return Bound(f"{_counted(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", ticks)
+
+
 def clock_ticks(count: int) -> Bound:
     """Return a bound of `count` ticks."""
     return Bound(_counted(count, "tick"), lambda case: count)

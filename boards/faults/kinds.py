@@ -322,8 +322,8 @@ KINDS.add(
         # At first this looks like an external load; it shows once the commanded torque rises and the motor's does not.
         # Each cycle the joint loop commands 0.3 of the missing torque more (twice its bandwidth, 60 rad/s, times the
         # cycle), of which a sound motor delivers at least 0.3. In the worst case reversing dry friction hides all of
-        # the missing torque at first: 1 / (0.3 * 0.3) cycles.
-        bound=bounds.cycles(12),
+        # the missing torque at first: 1 / (0.3 * 0.3) cycles. In shorter cycles the command rises by less in each.
+        bound=bounds.cycles_and_time(12, 30_000_000),
         lasts=draw.seconds(0.05, 0.4),
     ),
     _torque(

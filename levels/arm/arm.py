@@ -9,7 +9,6 @@ restarted as after any crash; report a broken arm in `fault` instead.
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
@@ -22,7 +21,7 @@ from rack.levels.arm.poses import poses, show
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.tables import SceneConfig
+from rack.levels.tables import SceneConfig, named_class
 
 PATIENCE_CYCLES = 2
 """Torque cycles for which motors keep the last command when none comes; then the brakes engage."""
@@ -162,15 +161,4 @@ class Arm(ABC):
 
 def find_arm(reference: str) -> type[Arm]:
     """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing or no whole `Arm`."""
-    module, _, name = reference.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name, None)
-    except (Exception, SystemExit) as error:  # importing a user's module may raise anything
-        raise ValueError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
-    if found is None:
-        raise ValueError(f"module '{module}' has no class '{name}'")
-    if not (isinstance(found, type) and issubclass(found, Arm)):
-        raise ValueError(f"'{name}' is not a subclass of rack.levels.arm.Arm")
-    if missing := sorted(found.__abstractmethods__):
-        raise ValueError(f"class '{name}' lacks: {', '.join(missing)}")
-    return found
+    return named_class(reference, Arm)

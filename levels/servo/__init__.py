@@ -2,7 +2,19 @@
 
 from rack.levels.servo.arm_executor import ArmExecutor
 from rack.levels.servo.executor import ServoExecutor
+from rack.levels.servo.gateway import JointGateway
 from rack.levels.servo.joint_servo import JointServo
+from rack.levels.servo.modification import Hook, LawContext, LawSample, Modification
 from rack.levels.servo.planner import ServoPlanner
 
-__all__ = ["ArmExecutor", "JointServo", "ServoExecutor", "ServoPlanner"]
+__all__ = [
+    "ArmExecutor",
+    "Hook",
+    "JointGateway",
+    "JointServo",
+    "LawContext",
+    "LawSample",
+    "Modification",
+    "ServoExecutor",
+]
+__all__ += ["ServoPlanner"]

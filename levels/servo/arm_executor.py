@@ -34,7 +34,7 @@ class ArmExecutor(ArmDriver):
     """
 
     inputs = {
-        "torques": Input(JOINT_TORQUE, "above.torque", many=True),
+        "torques": Input(JOINT_TORQUE, "above.command", many=True),
         "before": Input(ARM_STATE, "own.state"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
@@ -49,6 +49,7 @@ class ArmExecutor(ArmDriver):
         self.orders = Orders(self.commands)
         rest_s = float(np.max(limits.velocity / limits.acceleration))
         self._rest_ticks = round(rest_s / context.tick_s) + max(self.joints.oldest.values(), default=0)
+        self._defied = False  # the boards above have not brought it to rest in that time
         self._rest_by: int | None = None  # tick by which the arm must have come to rest; None: it need not
         self._braked_at: int | None = None  # tick of the first status that said so; None: not braked, or not yet said
         self._torques: Mapping[str, Reading] = {}
@@ -73,8 +74,9 @@ class ArmExecutor(ArmDriver):
                 yield "above", list(wanted), f"joint '{joint}' must be commanded by one board; {_by(boards)}"
         grips = [other.board for other in above if other.params.get("gripper", False)]
         if len(grips) != (context.robot.gripper is not None):
-            permitted = "the arm has none" if context.robot.gripper is None else "must be driven by one board"
-            yield "above", list(wanted), f"gripper: {permitted}; {_by(grips)}"
+            is_bare = context.robot.gripper is None
+            must = "the arm has no gripper" if is_bare else "the gripper must be commanded by one board"
+            yield "above", list(wanted), f"{must}; {_by(grips)}"
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
@@ -90,9 +92,11 @@ class ArmExecutor(ArmDriver):
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return where the boards above want the arm; None: not all of them drive it."""
         if self.arm.braked and self._braked_at is None:
-            self._waiting = "cycles were missed: the arm has engaged its brakes by itself"
+            self._waiting = "braked until the boards above have seen it"
             return None
-        if reaction is Reaction.STOP and self.abandoned:
+        stops = reaction > 0 or self.orders.standing is Operation.HOLD
+        self._defied = self._defied and stops
+        if self._defied or (reaction is Reaction.STOP and self.abandoned):
             return None
         since = 0 if self._braked_at is None else self._braked_at
         self._waiting = self.joints.missing(self._torques, tick, since)
@@ -100,24 +104,22 @@ class ArmExecutor(ArmDriver):
             return None
         self.joints.add_up()
         self.rests_on = self.joints.rests_on
-        if self._must_rest(reaction, tick) and self.joints.moves:
-            self._waiting = "stopped, and not brought to rest in time: braked"
+        self._defied = self._must_rest(stops, tick) and self.joints.moves
+        if self._defied:
+            self._waiting = "braked: the boards above did not bring it to rest"
             return None
         self._braked_at = None
+        if self.orders.standing is Operation.HOLD and not self.joints.moves:
+            self.orders.done()
         return self.joints.wanted
 
-    def _must_rest(self, reaction: Reaction, tick: int) -> bool:
-        """Return whether the boards above have had enough time to bring the arm to rest."""
-        if not self.stops(reaction):
+    def _must_rest(self, stops: bool, tick: int) -> bool:
+        """Return whether the arm `stops`, and the boards above have had enough time to bring it to rest."""
+        if not stops:
             self._rest_by = None
-            return False
-        if self._rest_by is None:
+        elif self._rest_by is None:
             self._rest_by = tick + self._rest_ticks
-        return tick >= self._rest_by
-
-    def stops(self, reaction: Reaction) -> bool:
-        """Return whether the boards above must bring the arm to rest."""
-        return reaction > 0 or self.orders.standing is Operation.HOLD
+        return self._rest_by is not None and tick >= self._rest_by
 
     def brake(self) -> None:
         """Brake, until the boards above have seen it."""
@@ -148,9 +150,9 @@ class ArmExecutor(ArmDriver):
         """Return what the status says of the torques from above."""
         held = self.orders.standing is Operation.HOLD
         kept = self.stopping.reason or self._waiting or (HELD if held else "")
-        return 0, self.abandoned or not self.joints.moves, self.abandoned or self.stops(reaction), 0, kept
+        return 0, self.abandoned or not self.joints.moves, self.abandoned or reaction > 0 or held, 0, kept
 
 
 def _by(boards: Sequence[str]) -> str:
     named = ", ".join(f"'{board}'" for board in boards)
-    return f"commanded by {named}" if boards else "commanded by none"
+    return f"it is commanded by {named or 'none'}"

@@ -16,6 +16,7 @@ from rack.levels.compiled import compiled
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
+from rack.levels.servo.modification import ModifiableParams
 from rack.levels.tables import GripperConfig, Positive, Table
 
 Reacting = Literal["hold", "stop", "brake"]
@@ -56,7 +57,7 @@ class ArmParams(Table):
         return reference
 
 
-class ServoParams(ArmParams, LoopGains):
+class ServoParams(ArmParams, LoopGains, ModifiableParams):
     """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
 
 

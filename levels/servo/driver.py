@@ -45,6 +45,7 @@ class SteadyStatus(NamedTuple):
     pushed: int
     error: Error  # latched
     fault: str  # of the arm
+    note: str  # the rest of what the status says
 
 
 class ArmDriver(Executor):
@@ -128,6 +129,11 @@ class ArmDriver(Executor):
     def has_work(self) -> bool:
         """Whether the level has work from which it can be kept. Default: once there was a command."""
         return self.command > 0
+
+    @property
+    def note(self) -> str:
+        """What the status says while there is nothing worse to say. Default: nothing."""
+        return ""
 
     def started(self) -> None:
         """React to the start of a board whose arm was restored from its last state. Default: nothing."""
@@ -238,6 +244,7 @@ class ArmDriver(Executor):
             arm.pushed,
             self.stopping.error,
             arm.fault,
+            self.note,
         )
         if shown != self._shown:
             self._shown = SteadyStatus(*shown)
@@ -256,7 +263,8 @@ class ArmDriver(Executor):
             resting = State.IDLE if shown.holding else State.EXECUTING
             status.state = State.HOLDING if kept and self.has_work else resting
             status.error = Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
-            status.reason = kept or (self.arm.first_violation if shown.violations else self.arm.first_touch)
+            broken = self.arm.first_violation if shown.violations else self.arm.first_touch
+            status.reason = kept or broken or shown.note
 
 
 def numbers(message: Message, first: str, last: str) -> Array:

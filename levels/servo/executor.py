@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
@@ -13,6 +18,8 @@ from rack.levels.servo import control, reference
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver
+from rack.levels.servo.modification import misfits_of, names_of
+from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.servo.stopping import Reaction
@@ -32,7 +39,12 @@ class ServoExecutor(ArmDriver):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENES}
-    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
+    commands = {
+        Operation.HOLD: (),
+        Operation.RESUME: (),
+        Operation.SETPOINT: (Goal.JOINTS,),
+        Operation.MODIFY: (Goal.ON, Goal.OFF),
+    }
     params = ServoParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -41,9 +53,23 @@ class ServoExecutor(ArmDriver):
         cell = self.cell
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)  # set points, interpolated
         self._loop = ComputedTorque(cell, params, self.arm.dynamics)
-        self.operator = OperatorControl(self.commands, context.robot.joints, cell.limits.position)
+        self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
+        joints, modify = context.robot.joints, self._modified.obey
+        self.operator = OperatorControl(self.commands, joints, cell.limits.position, modify=modify)
         self.orders = self.operator.orders
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
+
+    @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return the names of its control modifications."""
+        return names_of(params)
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield control modifications that do not suit the law."""
+        return misfits_of(context)
 
     @classmethod
     def preload(cls) -> None:
@@ -89,12 +115,29 @@ class ServoExecutor(ArmDriver):
         """Return the torques, N m, and the grip force, N."""
         grip = self._grip
         grip_force = 0.0 if grip is None else grip.force(sensed.opening, sensed.opening_velocity)
-        return self._loop.torque(wanted, self.sensors.state, terms), grip_force
+        return self._torque(wanted, terms), grip_force
+
+    def _torque(self, wanted: Motion, terms: Terms) -> Array:
+        loop, state, modified = self._loop, self.sensors.state, self._modified
+        if not modified.exists:
+            return loop.torque(wanted, state, terms)
+        given = LawInputs(wanted, state, np.diagonal(terms.inertia), terms.bias, self.arm.tick)
+        return modified.torque(lambda motion, seen: loop.torque(motion, seen, terms), given)
+
+    def brake(self) -> None:
+        """Brake, and abandon set points and torques."""
+        super().brake()
+        self._modified.interrupt()
 
     @property
     def holds(self) -> bool:
         """Whether the gripper holds a part, by the plan."""
         return self._loop.holds
+
+    @property
+    def note(self) -> str:
+        """How the law is modified."""
+        return self._modified.reason
 
     def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
         """Return what the status says of set points."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,15 +13,18 @@ from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.joint_messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS, JOINT_TORQUE
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Verdict
+from rack.levels.level import Executor, Input, LevelContext, Ports, Verdict
 from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import build_cell
 from rack.levels.servo import joint_control, reference
 from rack.levels.servo.control import Grip, LoopGains
+from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import numbers
-from rack.levels.servo.joint_control import JointLoads, servo_joints
+from rack.levels.servo.joint_control import AT, DUE, JointLoads, servo_joints
+from rack.levels.servo.modification import ModifiableParams, misfits_of, names_of
+from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.tables import read_params
@@ -29,7 +32,7 @@ from rack.levels.tables import read_params
 ARM_LOST = "no status from the board of the arm: waiting for it"
 
 
-class JointServoParams(LoopGains):
+class JointServoParams(LoopGains, ModifiableParams):
     """`[board.<name>.params]`: the joints that a board servoes, and the gains of their loop."""
 
     joints: tuple[str, ...] | None = Field(None, description="joints of `robot.joints` that it servoes; default: all")
@@ -48,8 +51,13 @@ class JointServo(Executor):
         "status": Input(ARM_STATUS, "below.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"torque": Output(JOINT_TORQUE, rests_on="command"), "status": JOINT_STATUS}
-    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.SETPOINT: (Goal.JOINTS,)}
+    outputs = {"command": JOINT_TORQUE, "status": JOINT_STATUS}
+    commands = {
+        Operation.HOLD: (),
+        Operation.RESUME: (),
+        Operation.SETPOINT: (Goal.JOINTS,),
+        Operation.MODIFY: (Goal.ON, Goal.OFF),
+    }
     params = JointServoParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -65,7 +73,10 @@ class JointServo(Executor):
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self.loads = JointLoads(cell)
         self._servo = partial(servo_joints.load(), constants, self.loads.table)
-        self.operator = OperatorControl(self.commands, robot.joints, cell.limits.position, self._driven)
+        self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
+        modify = self._modified.obey
+        self.operator = OperatorControl(self.commands, robot.joints, cell.limits.position, self._driven, modify=modify)
+        self._unmodified: Array = np.zeros(7 * len(robot.joints))  # what the law sets for its modifications
         self._grip = Grip(robot.gripper) if params.gripper and robot.gripper is not None else None
         below = max(pace.every for pace in context.below.values())
         self._oldest = (1 + PATIENCE_CYCLES) * below  # ticks, of a status
@@ -83,10 +94,15 @@ class JointServo(Executor):
             module.preload()
 
     @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return the names of its control modifications."""
+        return names_of(params)
+
+    @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield joints that the arm lacks or that are named twice, and a board that drives nothing."""
+        """Yield joints that the arm lacks or that are named twice, an idle board, and modifications that do not fit."""
         params, known = read_params(JointServoParams, context.params), context.robot.joints
         named = known if params.joints is None else params.joints
         for joint in dict.fromkeys(named):
@@ -96,6 +112,7 @@ class JointServo(Executor):
                 yield "params.joints", joint, "named twice"
         if not named and not params.gripper:
             yield "params.joints", [], "it drives no joint, and not the gripper"
+        yield from misfits_of(context)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Interpolate, and compute the torques that act from the next cycle on."""
@@ -108,6 +125,7 @@ class JointServo(Executor):
         stopped = away or bool(arm.stopped)
         if away or (stopped and arm.braked):
             reference.start(arm.position, arm.velocity, tick)
+            self._modified.interrupt()
         if stopped:
             wanted = reference.rest(tick)
         else:
@@ -115,8 +133,11 @@ class JointServo(Executor):
         self._take_loads(arm, tick, stopped or operator.stands)
         tick_s = self.context.tick_s
         age_s = min(tick + every - sampled, self._oldest + every) * tick_s
-        self._servo(self.loads.part(tick), every * tick_s, age_s, self._sample, wanted.table, *self._shown_numbers)
-        torque = write.torque
+        times = self.loads.part(tick), every * tick_s, age_s
+        self._servo(*times, self._sample, wanted.table, *self._shown_numbers)
+        if self._modified.exists:
+            self._modify(times, wanted, tick)
+        torque = write.command
         torque.sampled, torque.id = sampled, torque.id + 1
         if self._grip is not None:
             torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
@@ -124,9 +145,25 @@ class JointServo(Executor):
         self._report(write.status, arm, away, stopped)
         operator.orders.report(write.status, self._rests_on)
 
+    def _modify(self, times: tuple[float, float, float], wanted: Motion, tick: int) -> None:
+        """Replace the torques just set by those of the modified law."""
+        joints, table, part = len(self._driven), self.loads.table, times[0]
+        given, shown = self._shown_numbers
+        torque, status = self._unmodified[: 3 * joints], self._unmodified[3 * joints :]
+
+        def law(motion: Motion, state: Array) -> Array:
+            self._servo(*times, state.reshape(-1), motion.table, torque, status)
+            return torque[:joints]
+
+        inertia, load = table[AT] + part * (table[DUE] - table[AT])
+        inputs = LawInputs(wanted, self._sample.reshape(2, joints), inertia, load, tick)
+        modified = self._modified.torque(law, inputs)
+        np.copyto(given[:joints], modified, where=self._driven)
+        np.copyto(shown[3 * joints :], modified, where=self._driven)
+
     def _meet(self, is_there: bool, arm: Message, write: Ports) -> bool:
         """Begin with the first status of the arm; return whether there is one."""
-        status, torque = write.status, write.torque
+        status, torque = write.status, write.command
         self._met = is_there
         if not is_there:
             torque.sampled = -1
@@ -151,7 +188,7 @@ class JointServo(Executor):
             self._offered = command
             if self._grip is not None:
                 self._grip.take(command)
-                write.torque.payload_mass, write.torque.payload_offset = command.payload_mass, command.payload_offset
+                write.command.payload_mass, write.command.payload_offset = command.payload_mass, command.payload_offset
 
     def _take_loads(self, arm: Message, tick: int, stopped: bool) -> None:
         """Take over inertia and load of the reference that is followed; compute them while none is."""
@@ -170,7 +207,8 @@ class JointServo(Executor):
         elif stopped:
             kept = f"arm: {arm.reason}"
             error = Error(arm.error) if arm.state == State.ERROR else Error.NONE
-        shown = self._command, holding, stopped or operator.stands, self._due, kept, error
+        note = kept or self._modified.reason
+        shown = self._command, holding, stopped or operator.stands, self._due, note, error
         if shown == self._shown:
             return
         self._shown = shown

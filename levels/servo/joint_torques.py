@@ -47,21 +47,21 @@ class JointTorques:
         return Payload(float(self._sum[-4]), self._offset)
 
     def missing(self, torques: Mapping[str, Reading], tick: int, since: int) -> str:
-        """Return which board gives no fresh torque at `tick` that rests on the arm's status of `since`; empty: none."""
+        """Return why torques are missing at `tick`; empty: all are fresh, and rest on a status of `since` or later."""
+        all_know = True
         for board, oldest in self.oldest.items():
             value, verdict, is_lost, _ = torques[board]
             if is_lost:
-                return f"board '{board}' is lost: the arm is braked until it is back"
+                return f"board '{board}' is lost: braked until it is back"
             sampled = -1 if verdict is Verdict.NONE else value.sampled
             if sampled < 0:
                 return f"no torque from board '{board}' yet"
             if tick - sampled > oldest:
                 return f"torque of board '{board}' is stale: it rests on a status more than {oldest} ticks old"
-            if sampled < since:
-                return f"board '{board}' has not yet seen that the arm is braked"
+            all_know = all_know and sampled >= since
             if self._messages.get(board) is not value:
                 self._see(board, value)
-        return ""
+        return "" if all_know else "braked until the boards above have seen it"
 
     def add_up(self) -> None:
         """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +24,24 @@ class OperatorControl:
     the arm on its path. A restarted board has lost these places: the level above then continues from where the arm is.
     """
 
-    def __init__(self, commands: Commands, joints: Sequence[str], ranges: Array, driven: Mask | None = None) -> None:
-        """Permit set points of the joints `driven`, (joints,), default all, within `ranges` (joints, 2), rad."""
+    def __init__(
+        self,
+        commands: Commands,
+        joints: Sequence[str],
+        ranges: Array,
+        driven: Mask | None = None,
+        *,
+        modify: Callable[[Message], str],
+    ) -> None:
+        """Permit set points of the joints `driven`, (joints,), default all, within `ranges` (joints, 2), rad.
+
+        `modify` obeys a command to modify the law, or returns why not.
+        """
         self.orders = Orders(commands)
         self.stands = False  # the level follows the operator, not the level above
         self._driven = np.full(len(joints), True) if driven is None else driven
         self._joints = [joint for joint, own in zip(joints, self._driven, strict=True) if own]
-        self._ranges = ranges[self._driven]
+        self._ranges, self._modify = ranges[self._driven], modify
         self._position = np.zeros(len(joints))  # (joints,), rad: of the arm, at the newest command
         self._goal: Array | None = None  # (joints,), rad
         self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
@@ -55,8 +66,11 @@ class OperatorControl:
         return f"{what} by the operator; `resume` releases it"
 
     def _judge(self, command: Message) -> None:
-        """Take the goal of a set point, or refuse it."""
-        if self.orders.standing is Operation.SETPOINT:
+        """Take the goal of a set point, or refuse it; modify the law."""
+        if command.what == Operation.MODIFY:
+            if why := self._modify(command):
+                self.orders.refuse(why)
+        elif self.orders.standing is Operation.SETPOINT:
             try:
                 own = joints_of(command, self._joints, self._ranges)
             except ValueError as error:

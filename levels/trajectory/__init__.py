@@ -1,1 +1,6 @@
-"""A trajectory level that follows a queue of motion requests: segments in joint or Cartesian space, blended."""
+"""A trajectory level that follows a queue of motion requests, and the planning level that queues them."""
+
+from rack.levels.trajectory.executor import TrajectoryExecutor
+from rack.levels.trajectory.planner import RequestExecutor, RequestPlanner
+
+__all__ = ["RequestExecutor", "RequestPlanner", "TrajectoryExecutor"]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Field, command, status
+from rack.backplane.message import Field, MessageType, command, status
 from rack.levels.operator import ANSWER, RESTS_ON
 
-REQUESTS = 32
-"""Motion requests that a queue holds."""
+HELD = 16
+"""Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than these are open."""
 ENDED = 8
 """Ended requests that a status lists."""
 
@@ -44,12 +44,25 @@ MOTION_REQUEST = command(
     Field("quaternion", "f8", "1", "goal of POSE: tool orientation, in the frame of `body`", (4,)),
     Field("body", "i2", "1", "row of the body in the world model in whose frame the goal is; -1: the world"),
     Field("live", "u1", "1", "1: the goal follows the body; 0: its frame is copied when the request begins"),
-    Field("acceleration", "f8", "s", "half the time of the blend into this request"),
+    Field("acceleration", "f8", "s", "half the time of the blend into this request; 0: the level's default"),
     Field("segment", "f8", "s", "time for the request; 0: from the speed limits; too short: stretched"),
     Field("opening", "f8", "m", "gripper joint position to go to, for GRIP"),
     Field("force", "f8", "N", "largest gripper force, for GRIP"),
 )
-"""`id` numbers requests, rising by one from 1 in the order of the queue."""
+"""`id` numbers requests, rising by one from 1 in the order of the queue; one not above those taken is a repetition."""
+
+MOTION_STATE = MessageType(
+    "motion_state",
+    1,
+    (
+        Field("begun", "u1", "1", "1: the first of `requests` is under way"),
+        Field("passed", "f8", "s", "time that it has stayed or gripped"),
+        Field("goal", MOTION_REQUEST, "", "the request at whose goal the arm is, or to which it goes; id 0: none"),
+        Field("count", "u2", "1", "requests that follow"),
+        Field("requests", MOTION_REQUEST, "", "taken and not ended, oldest first", (HELD,)),
+    ),
+)
+"""What a restarted trajectory level needs, in addition to its status, to neither repeat nor lose a request."""
 
 MOTION_STATUS = status(
     "motion_status",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rack.backplane.message import State
@@ -14,13 +12,13 @@ from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 
 AWAY_RAD = 0.15
-"""How far every joint moves away from home."""
-PERIOD_S = 1.2
-"""Time to move away and back."""
+"""Distance of every joint from home at the other end."""
+LASTS_S = 0.4
+"""Time from one end to the other."""
 
 
 class Swing(Executor):
-    """Moves all joints away from home and back, while no board below says that it is stopped; else it stays there."""
+    """Moves all joints away from home and back by minimum-jerk motions; waits while a board below is stopped."""
 
     inputs = {"statuses": Input(JOINT_STATUS, "below.status", many=True)}
     outputs = {"command": JOINT_REFERENCE, "status": PRIMITIVE_STATUS}
@@ -28,30 +26,31 @@ class Swing(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self._home, self._dynamics = cell.home, Dynamics(cell)
-        self._begun: int | None = None  # tick at which the present motion began
-        self._from = cell.home.copy()
+        self._dynamics = Dynamics(cell)
+        self._from, self._to = cell.home.copy(), cell.home + AWAY_RAD
+        self._next = cell.home.copy()
+        self._begun: int | None = None  # tick; None: waiting
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Write the set point due two cycles later."""
-        command, status, due = write.command, write.status, tick + 2 * self.context.every
-        statuses = [reading.value for reading in read.statuses.values() if reading.is_there]
-        held = len(statuses) < len(read.statuses) or any(one.stopped for one in statuses)
-        held = held or any(reading.is_lost for reading in read.statuses.values())
-        status.state = State.HOLDING if held else State.EXECUTING
-        status.reason = "a board below has stopped" if held else ""
+        command, due = write.command, tick + 2 * self.context.every
+        readings = read.statuses.values()
+        held = any(not one.is_there or one.is_lost or one.value.stopped for one in readings)
+        write.status.state = State.HOLDING if held else State.EXECUTING
+        write.status.reason = "a board below is stopped" if held else ""
+        command.opening, command.force = 0.04, 20.0
         if held:
             self._begun, command.due = None, 0
             return
         if self._begun is None:
-            self._begun, self._from = due, statuses[0].position.copy()
-        phase = 2.0 * math.pi * (due - self._begun) * self.context.tick_s / PERIOD_S
-        rate = 2.0 * math.pi / PERIOD_S
+            self._begun, self._from = due, np.array(next(iter(readings)).value.position)
+        elif (due - self._begun) * self.context.tick_s > LASTS_S:
+            self._begun, self._from, self._to, self._next = due, self._to, self._next, self._to
+        u, way = (due - self._begun) * self.context.tick_s / LASTS_S, self._to - self._from
         command.id += 1
         command.due = due
-        command.position = self._from + AWAY_RAD * 0.5 * (1.0 - math.cos(phase))
-        command.velocity = np.full(len(self._home), AWAY_RAD * 0.5 * rate * math.sin(phase))
-        command.acceleration = np.full(len(self._home), AWAY_RAD * 0.5 * rate**2 * math.cos(phase))
-        inertia, bias = self._dynamics.terms(command.position, command.velocity)
-        command.inertia, command.load = np.diagonal(inertia), bias
-        command.opening, command.force = 0.04, 20.0
+        command.position = self._from + way * u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+        command.velocity = way * 30.0 * u * u * (1.0 - u) ** 2 / LASTS_S
+        command.acceleration = way * 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / LASTS_S**2
+        inertia, command.load = self._dynamics.terms(command.position, command.velocity)
+        command.inertia = np.diagonal(inertia)

@@ -66,6 +66,12 @@ def test_a_fault_must_be_detected_within(
     assert bound(config, fault, reader) == ticks
 
 
+def test_a_weak_motor_of_a_fast_board_is_detected_within_the_time_that_its_gains_need(config: MakeConfig) -> None:
+    weak = {"kind": "actuator-saturated", "board": "driven"}
+    rates = [f"board.{name}.rate_hz=1000" for name in ("wave", "watch", "driven")]
+    assert bound(config, weak, None, "clock.period_ms=1.0", *rates) == 30
+
+
 def test_a_held_lock_is_detected_within_the_bound_of_a_wait(config: MakeConfig) -> None:
     # 2 ms of 2.5 ms ticks, and the cycle of the first reader.
     assert bound(config, {"kind": "lock-held", "board": "wave"}, None, "protocol.default=lock") == 1 + 4

@@ -31,8 +31,8 @@ class BoardSpec:
     executor: type[Executor]
     planner: type[Planner] | None = None
     within_cycles: int = 1
-    above: str = ""
-    below: str = ""
+    above: str | tuple[str, ...] = ""
+    below: str | tuple[str, ...] = ""
     params: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -43,7 +43,11 @@ class Task:
         self, level: Executor | Planner, spec: BoardSpec, boxes: Mapping[str, Box], outputs: Mapping[str, Box]
     ) -> None:
         self.level, self.spec, self.due = level, spec, 0
-        self._inputs = {port: boxes[source(port_, spec)] for port, port_ in level.inputs.items()}
+        # A port that reads many has an input for each board, by (port, board).
+        self._inputs: dict[str | tuple[str, str], Box] = {}
+        for port, input_ in level.inputs.items():
+            names = sources(input_, spec)
+            self._inputs |= {(port, name.partition(".")[0]) if input_.many else port: boxes[name] for name in names}
         self._values = {port: Message(box.dtype) for port, box in self._inputs.items()}
         self._seen = dict.fromkeys(self._inputs, 0)
         self._has = dict.fromkeys(self._inputs, False)
@@ -52,7 +56,12 @@ class Task:
 
     def release(self, tick: int, demand: Demand = Demand.NONE) -> None:
         """Run one cycle, under a demand on the arm."""
-        read, span = Ports(**{port: self._read(port, tick) for port in self._inputs}), self.spec.every
+        read, span = Ports(), self.spec.every
+        for port in self._inputs:
+            if isinstance(port, str):
+                setattr(read, port, self._read(port, tick))
+            else:
+                read.__dict__.setdefault(port[0], {})[port[1]] = self._read(port, tick)
         if isinstance(self.level, Executor):
             self.level.demand = demand
             self.level.process(read, self.write, tick)
@@ -77,7 +86,7 @@ class Task:
         for box in self._outputs.values():
             box.lost = False
 
-    def _read(self, port: str, tick: int) -> Reading:
+    def _read(self, port: str | tuple[str, str], tick: int) -> Reading:
         box = self._inputs[port]
         serial, data = box.at(tick)
         value, seen, is_lost = self._values[port], self._seen[port], box.is_lost(tick)
@@ -134,8 +143,8 @@ class Lockstep:
                 scene=scene,
                 task=task or {},
                 sizes=self.sizes,
-                above={b.above: paces[b.above]} if b.above in paces else {},
-                below={b.below: paces[b.below]} if b.below in paces else {},
+                above={name: paces[name] for name in listed(b.above) if name in paces},
+                below={name: paces[name] for name in listed(b.below) if name in paces},
                 params=b.params,
             )
             for b in boards
@@ -214,10 +223,16 @@ class Lockstep:
         return self.tick * self._clock_ns * 1e-9
 
 
-def source(port: Input, board: BoardSpec) -> str:
-    """Return the mailbox that a port reads."""
+def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Return neighbours as a tuple."""
+    return (boards,) if isinstance(boards, str) else boards
+
+
+def sources(port: Input, board: BoardSpec) -> list[str]:
+    """Return the mailboxes that a port reads."""
     place, _, rest = port.source.partition(".")
-    return {"own": board.name, "above": board.above, "below": board.below}.get(place, place) + "." + rest
+    neighbours = {"own": board.name, "above": board.above, "below": board.below}
+    return [f"{name}.{rest}" for name in listed(neighbours.get(place, place))]
 
 
 class Operator:
@@ -238,6 +253,13 @@ class Operator:
         """Send the tool somewhere, m, with its z axis in a direction; return the serial."""
         message = self._message(level, Operation.GOTO, Goal.DIRECTION)
         message.position, message.direction = position, direction
+        self._rack.write(f"{level}.operator", message)
+        return self.serial
+
+    def modify(self, level: str, name: str, is_on: bool) -> int:
+        """Put a control modification in now, or take it out; return the serial."""
+        message = self._message(level, Operation.MODIFY, Goal.ON if is_on else Goal.OFF)
+        message.name = name
         self._rack.write(f"{level}.operator", message)
         return self.serial
 

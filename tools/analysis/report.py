@@ -14,7 +14,8 @@ from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
-from rack.levels.messages import SERVO_STATUS, TASK_STATUS
+from rack.levels.joint_messages import DRIVING
+from rack.levels.messages import TASK_STATUS
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
     communication_ns,
@@ -183,7 +184,7 @@ def _task_outcome(recording: Recording) -> Report | None:
 
 def _motion(recording: Recording) -> Report | None:
     """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set points, or None."""
-    mailbox = _mailbox_of(recording, SERVO_STATUS.name)
+    mailbox = _mailbox_of(recording, *DRIVING)
     if mailbox is None:
         return None
     error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
@@ -195,7 +196,7 @@ def _motion(recording: Recording) -> Report | None:
     }
 
 
-def _mailbox_of(recording: Recording, message: str) -> str | None:
-    """Return the first mailbox with messages of a type; None when it is empty, or there is none."""
-    name = next((m.name for m in recording.layout.mailboxes if m.message == message), None)
+def _mailbox_of(recording: Recording, *messages: str) -> str | None:
+    """Return the first mailbox with messages of one of these types; None when it is empty, or there is none."""
+    name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return name if name in recording.mailboxes else None

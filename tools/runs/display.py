@@ -128,7 +128,7 @@ def display_for(silent: bool) -> Iterator[Display]:
 
 @dataclass(frozen=True)
 class RackView:
-    """A snapshot, for rich to draw: head line, tasks, their complaints, active faults, holds, progress."""
+    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, active faults, holds, progress."""
 
     snapshot: Snapshot
 
@@ -138,6 +138,7 @@ class RackView:
         yield _head(snapshot)
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
         yield grid(list(COLUMNS), cells, width, DROPPED, _style)
+        yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:

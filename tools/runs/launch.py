@@ -84,11 +84,12 @@ def run_rack(
     view: bool = False,
     share: bool = True,
     crate: CrateLine | None = None,
+    step: bool = False,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder` unless that is None.
 
-    With `view`, open a viewer on what the recorder serves; it may be closed at any time. `share` and `crate`
-    are as in `Rack`.
+    With `view`, open a viewer on what the recorder serves; it may be closed at any time. With `step`, in lockstep, hold
+    before tick 0 until the rack is stepped. `share` and `crate` are as in `Rack`.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that fails does not
     change how the run ends.
@@ -102,6 +103,7 @@ def run_rack(
             if recorder is not None:
                 stack.callback(recorder.finish)
             rack = stack.enter_context(Rack(config, log.add, share, crate))
+            rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "config.toml").write_text(config.text())

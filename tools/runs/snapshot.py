@@ -10,7 +10,7 @@ from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import State
+from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
@@ -21,6 +21,8 @@ LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
 DEAD = "dead"
 """State of a run whose launcher is gone: 'rack clean' removes it."""
+HELD = "HELD: 'rack step {}' lets it go on"
+"""Line of a rack in lockstep that is single-stepped."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports the progress of the whole task."""
 
@@ -29,7 +31,7 @@ TASK_STATUS = "task_status"
 class TaskRow:
     """One task now. Times are the longest of the newest cycles, in ms; None before the first.
 
-    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling.
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `row` is what fired of a state table.
     """
 
     task: str
@@ -47,6 +49,7 @@ class TaskRow:
     exec_ms: float | None
     lateness_ms: float | None
     reason: str
+    row: str = ""
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,8 @@ class RackMonitor:
         lines = self._lines
         held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
         single = {"ACFAIL": lines.acfail, "SYSRESET": lines.sysreset, "EMERGENCY STOP": lines.emergency_stop}
-        return held + [name for name, asserted in single.items() if asserted] + self._without_priority()
+        stepped = [HELD.format(self._segment.rack)] if self._segment.words[System.HELD] else []
+        return held + [name for name, asserted in single.items() if asserted] + self._without_priority() + stepped
 
     def _without_priority(self) -> list[str]:
         """Return a warning when tasks were refused their real-time priority."""
@@ -143,11 +147,12 @@ class RackMonitor:
     def _row(self, task: TaskSpec) -> TaskRow:
         block = self._segment.block(task.name)
         exec_ms, lateness_ms = self._times_ms(task.name)
-        state, reason = TaskState(block[Block.STATE]).name.lower(), ""
+        state, reason, row = TaskState(block[Block.STATE]).name.lower(), "", ""
         if block[Block.LOST]:
             state = LOST
         elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
             state, reason = State(status.value.state).name.lower(), status.value.reason
+            row = fired(status.value)
         return TaskRow(
             task=task.name,
             slot=task.slot,
@@ -164,6 +169,7 @@ class RackMonitor:
             exec_ms=exec_ms,
             lateness_ms=lateness_ms,
             reason=reason,
+            row=row,
         )
 
     def _restarts(self, task: str) -> int:
@@ -184,6 +190,14 @@ class RackMonitor:
             return None
         at = status.value
         return TaskProgress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
+
+
+def fired(status: Message) -> str:
+    """Return what fired of a state table in a level's newest cycle, as text; empty for a level without one."""
+    if "fired" not in (status.record.dtype.names or ()):
+        return ""
+    what = f"row {status.row} '{status.fired}'" if status.row else "no row"
+    return f"{what}, now in '{status.in_state}', table {status.table}"
 
 
 def joint_names(config: str) -> tuple[str, ...]:

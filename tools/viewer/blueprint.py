@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
-from rack.levels.messages import SERVO_STATUS
+from rack.levels.joint_messages import DRIVING
 from rack.levels.robot.cell import Cell
 from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
@@ -35,7 +35,7 @@ ENDLESS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 
 def blueprint(layout: Layout, config: RackConfig, cell: Cell | None, live: bool) -> rrb.Blueprint:
     """Return the blueprint of a rack: its cell in 3D, curves, lanes, log; `live` follows the newest data."""
-    has_arm = cell is not None and any(mailbox.message == SERVO_STATUS.name for mailbox in layout.mailboxes)
+    has_arm = cell is not None and any(mailbox.message in DRIVING for mailbox in layout.mailboxes)
     names = config.robot.joints if config.robot is not None and has_arm else ()
     doing = lanes_view("levels and events, whole run", [_all(EVENTS), _all(LEVELS)])
     below = rrb.Horizontal(doing, _graph(layout, config), column_shares=[3, 2])

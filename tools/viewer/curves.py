@@ -22,7 +22,7 @@ _COMMANDED = {"position": "target", "velocity": "target_velocity"}
 
 
 class Joints:
-    """Writes `SERVO_STATUS`es: measured against commanded, the limits, the tracking error and the gripper."""
+    """Writes the status of what drives the arm: measured and commanded, limits, tracking error and gripper."""
 
     def __init__(self, stream: Stream, names: tuple[str, ...], cell: Cell, has_gripper: bool) -> None:
         self._stream, self._names, self._has_gripper = stream, names, has_gripper
@@ -44,7 +44,7 @@ class Joints:
             stream.static((GRIPPER, "force"), rr.SeriesLines(names=["force, N"]))
 
     def write(self, block: RowBlock) -> None:
-        """Write every cycle of the servo level."""
+        """Write every cycle of that level."""
         messages, times = block.messages, block.times
         for quantity in QUANTITIES:
             measured = messages[quantity]

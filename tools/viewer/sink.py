@@ -14,13 +14,12 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System
 from rack.boards.config import RackConfig, loads, rack_timing
+from rack.levels.joint_messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.messages import (
     ARM_STATE,
-    JOINT_SET_POINT,
     MOVE_PLAN,
     MOVE_STATUS,
     SCENE,
-    SERVO_STATUS,
     TASK_PLAN,
     WORLD_MODEL,
 )
@@ -146,11 +145,11 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
     parts: list[ViewPart] = []
     if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
         parts.append(Activity(stream, mailbox).write)
-    elif mailbox.name.endswith(".command") and "id" in names and mailbox.message != JOINT_SET_POINT.name:
+    elif mailbox.name.endswith(".command") and "id" in names and mailbox.message not in STREAMED:
         parts.append(Commanded(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
         parts.append(Moves(stream, mailbox).write)
-    if mailbox.message not in (*SHOWN_IN_3D, SERVO_STATUS.name):
+    if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name):
         parts.append(Fields(stream, mailbox).write)
     return parts
 
@@ -161,7 +160,7 @@ def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell
     match mailbox.message:
         case ARM_STATE.name:
             return [Poses(stream, cell, config.clock_ns).write]
-        case SERVO_STATUS.name:
+        case driving if driving in DRIVING:
             return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
         case MOVE_PLAN.name:
             return [PlannedPath(stream, cell).write]

@@ -164,6 +164,14 @@ def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
     assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; acted 1 time")
 
 
+def test_a_modification_that_failed_is_named_by_its_board(segment: Segment) -> None:
+    AlarmWriter(segment, "wave").ring(400, Alarm.MODIFICATION, 1)
+    row = alarm_ring(segment, "wave").drain().rows[-1]
+    event = AlarmEvents(segment, JOINTS, str, lambda board, number: f"{board} {number}").of(row, "wave")
+    assert (event.kind, event.code, event.subject) == ("detection", "modification", "wave 1")
+    assert event.text == "control modification 'wave 1' failed and was taken out"
+
+
 def test_a_collision_names_both_geoms(segment: Segment) -> None:
     config = load("crossing")
     assert config.robot is not None

@@ -120,7 +120,7 @@ def test_a_torque_that_is_nan_is_refused_by_every_arm(rig: ServoRig) -> None:
     [
         ("nobody:Arm", "cannot import 'nobody': ModuleNotFoundError: No module named 'nobody'"),
         ("tests.levels.arm.test_own_arm:Missing", "module 'tests.levels.arm.test_own_arm' has no class 'Missing'"),
-        ("rack.levels.arm:Sensed", "'Sensed' is not a subclass of rack.levels.arm.Arm"),
+        ("rack.levels.arm:Sensed", "'Sensed' is not a subclass of rack.levels.arm.arm.Arm"),
         ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, drive, step"),
     ],
 )

@@ -10,6 +10,8 @@ import pytest
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 from rack.levels.servo import (
+    ArmExecutor,
+    JointServo,
     ServoExecutor,
     actuator_monitor,
     control,
@@ -21,6 +23,7 @@ from rack.levels.servo import (
     sensor_monitor,
 )
 from tests.levels.arms import config
+from tests.levels.servo.joint_rig import APART, JointRig
 from tests.levels.servo.rig import Course, ServoRig
 
 JOINTS = 7
@@ -126,9 +129,14 @@ def test_compiled_code_gives_the_bits_of_numpy(name: str) -> None:
     assert len(verdicts) == VERDICTS.get(name, 1)
 
 
+def signatures() -> dict[str, list[Any]]:
+    """Return the types that the functions are compiled for."""
+    return {name: list(f.load().signatures) for name, f in FUNCTIONS.items()}  # type: ignore[attr-defined]
+
+
 def test_no_cycle_waits_for_a_compiler() -> None:
     ServoExecutor.preload()
-    loaded = {name: list(f.load().signatures) for name, f in FUNCTIONS.items()}  # type: ignore[attr-defined]
+    loaded = signatures()
     rig = ServoRig(*config("puma560"))
     home = np.array(config("puma560")[0].home)
     move = Course(home, home + 0.2, 1.0)
@@ -141,4 +149,15 @@ def test_no_cycle_waits_for_a_compiler() -> None:
     rig.run(50, move.at)
     rig.restart()
     rig.run(50)
-    assert {name: list(f.load().signatures) for name, f in FUNCTIONS.items()} == loaded  # type: ignore[attr-defined]
+    assert signatures() == loaded
+
+
+def test_no_cycle_of_an_arm_on_a_board_of_its_own_waits_for_a_compiler() -> None:
+    for level in (ArmExecutor, JointServo):
+        level.preload()
+    loaded = signatures()
+    rig = JointRig(APART)
+    rig.run(100)
+    rig.rack.lose("servo_j2", ticks=10)
+    rig.run(60)
+    assert signatures() == loaded

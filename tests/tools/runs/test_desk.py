@@ -114,7 +114,7 @@ REFUSED = {
         "--timeout needs --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
-    "nothing that is said": (("upper", "halt"), "'setpoint', 'goto' or 'modify'"),
+    "nothing that is said": (("upper", "halt"), "'setpoint', 'goto', 'modify', 'table' or 'do'"),
     "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
     "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
     "no word": (("upper", "goto", "hom"), "'hom': not a goal; permitted: home, joints=..., position=..."),

@@ -1,0 +1,185 @@
+"""Legs: motions from rest to rest, straight in joint space or of the tool, as functions of time.
+
+A leg of segment time T and half blend time a lasts T + 2a: its speed rises over 2a, stays, and falls over 2a. Its bends
+take at most half the acceleration of every joint, so a leg that begins while the one before it slows down keeps the
+limits. This is the straight path with polynomial transitions of RCCL [recalled]: two legs in sequence, the second begun
+a before the first ends, are one motion with matched position, velocity and acceleration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from rack.levels.algebra import Array, norm
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.pose import Pose
+from rack.levels.robot.limits import Limits
+
+BLEND_PART = 0.5
+"""Part of the acceleration limits that one leg takes: two blended ones take all."""
+PEAK = 0.75
+"""Greatest acceleration of a change of speed by 1 over 2a, times a."""
+STEP_M, STEP_RAD = 0.04, 0.1
+"""Distance and turn between the poses of a tool path that are tried before it begins."""
+MAX_STEPS = 40
+SAMPLED = 1.15
+"""Factor on speeds and bends of a tool path that were found at its tried poses: between them they may be greater."""
+
+
+class Unfit(Exception):
+    """A motion that the arm cannot make; its text says why."""
+
+
+class Times(NamedTuple):
+    """Times that a request wants, s."""
+
+    segment: float  # 0: from the limits
+    half_blend: float
+
+
+class TimeLaw:
+    """The part of the way done, 0 to 1, by the time since the begin."""
+
+    def __init__(self, segment_s: float, half_blend_s: float) -> None:
+        self.segment_s = segment_s
+        self.half_blend_s = half_blend_s
+        self.leaving_s = half_blend_s  # half the time in which the speed falls at the end
+
+    @property
+    def nominal_s(self) -> float:
+        """Time at which the goal would be reached at full speed: the middle of a blend into another leg."""
+        return self.half_blend_s + self.segment_s
+
+    @property
+    def ends_s(self) -> float:
+        """Time at which the leg rests at its goal."""
+        return self.nominal_s + self.leaving_s
+
+    def leave_within(self, half_blend_s: float) -> None:
+        """Slow down over twice `half_blend_s`; at most the leg's own half blend time, and more than none."""
+        self.leaving_s = min(half_blend_s, self.half_blend_s)
+
+    def part(self, time_s: float) -> float:
+        """Return the part done after `time_s`."""
+        if time_s <= 0.0:
+            return 0.0
+        a, left = self.half_blend_s, self.ends_s - time_s
+        if left <= 0.0:
+            return 1.0
+        if left < 2.0 * self.leaving_s:
+            return 1.0 - _ramp(left, self.leaving_s) / self.segment_s
+        return (_ramp(time_s, a) if time_s < 2.0 * a else time_s - a) / self.segment_s
+
+
+def _ramp(time_s: float, half_s: float) -> float:
+    """Return the way after `time_s` of a smooth rise of speed from 0 to 1 over 2 `half_s`."""
+    h = time_s / (2.0 * half_s)
+    return 2.0 * half_s * h * h * h * (1.0 - 0.5 * h)
+
+
+class Leg(Protocol):
+    """One motion."""
+
+    law: TimeLaw
+    least_s: float  # least half blend time in which the leg may slow down
+    live: bool  # the goal moves
+
+    def at(self, time_s: float) -> Array:
+        """Return joint positions (joints,), rad, `time_s` after the begin. Raises `Unfit`."""
+
+
+class JointLeg:
+    """A straight line in joint space."""
+
+    live = False
+
+    def __init__(self, start: Array, goal: Array, times: Times, limits: Limits) -> None:
+        self._start, self._way = start.copy(), goal - start
+        self.law, self.least_s = timed(times, np.abs(self._way), np.zeros(len(goal)), limits)
+
+    def at(self, time_s: float) -> Array:
+        """Return joint positions (joints,), rad, `time_s` after the begin."""
+        return np.asarray(self._start + self.law.part(time_s) * self._way)
+
+
+class ToolLeg:
+    """A straight line of the tool that turns at a constant rate, to a goal that may move.
+
+    The goal is asked for its pose once for every sample. Inverse kinematics stays on the branch of the start.
+    """
+
+    def __init__(
+        self, start: Array, goal: Callable[[], Pose], live: bool, times: Times, solver: tuple[InverseKinematics, Limits]
+    ) -> None:
+        """Prepare the way from the joint positions `start`. Raises `Unfit`."""
+        self._ik, limits = solver
+        self._from, self._goal, self.live = self._ik.tool_at(start), goal, live
+        self._last = start.copy()
+        speed, bend = self._try_out(start, goal())
+        self.law, self.least_s = timed(times, speed, bend, limits)
+
+    def at(self, time_s: float) -> Array:
+        """Return joint positions (joints,), rad, `time_s` after the begin. Raises `Unfit`."""
+        part = self.law.part(time_s)
+        self._last = self._solve(self._from.towards(self._goal(), part), self._last, part)
+        return self._last
+
+    def _solve(self, pose: Pose, near: Array, part: float) -> Array:
+        found = self._ik.nearby(pose, near)
+        if found is None:
+            x, y, z = pose.position
+            raise Unfit(f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f}, {part:.0%} of the way")
+        return found
+
+    def _try_out(self, start: Array, goal: Pose) -> tuple[Array, Array]:
+        """Return the greatest first and second derivative of the joints by the part of the way, (joints,) each."""
+        way, turn = norm(goal.position - self._from.position), self._from.angle_to(goal)
+        steps = min(max(ceil(way / STEP_M), ceil(turn / STEP_RAD), 4), MAX_STEPS)
+        points = [start]
+        for k in range(1, steps + 1):
+            points.append(self._solve(self._from.towards(goal, k / steps), points[-1], k / steps))
+        first = np.diff(points, axis=0) * steps
+        second = np.diff(first, axis=0) * steps
+        return SAMPLED * np.abs(first).max(axis=0), SAMPLED * np.abs(second).max(axis=0)
+
+
+def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> tuple[TimeLaw, float]:
+    """Return the time law of a leg, and the least half blend time in which it may slow down.
+
+    `speed` and `bend` are the first and second derivatives of joint positions by the part of the way, (joints,) each. A
+    segment time that is too short for a limit, or for two blends, is stretched.
+    """
+    half, most = times.half_blend, BLEND_PART * limits.acceleration
+    slope = PEAK * speed / half
+    needed = np.maximum(speed / limits.velocity, (slope + np.sqrt(slope * slope + 4.0 * most * bend)) / (2.0 * most))
+    segment = max(float(needed.max()), times.segment, 2.0 * half)
+    room = most - bend / (segment * segment)
+    return TimeLaw(segment, half), min(half, float((PEAK * speed / segment / room).max()))
+
+
+class Settling:
+    """A ramp to rest of every joint by itself: matched position, velocity and acceleration, then rest."""
+
+    def __init__(self, state: tuple[Array, Array, Array], most: Array, least_s: float) -> None:
+        """Begin at `state`, rad, rad/s, rad/s2, within the accelerations `most`, in `least_s` or more."""
+        self._position, self._velocity, acceleration = state
+        # The peak is at most 1.5 |v| / T + |a| / 3, and |a| at the begin.
+        self._acceleration = np.clip(acceleration, -most, most)
+        room = most - np.abs(self._acceleration) / 3.0
+        self._time_s = np.maximum(1.5 * np.abs(self._velocity) / room, least_s)
+        self.ends_s = float(self._time_s.max())
+        self.end = self.at(self.ends_s)  # (joints,), rad: where the joints come to rest
+
+    def at(self, time_s: float) -> Array:
+        """Return joint positions (joints,), rad, `time_s` after the begin."""
+        t = self._time_s
+        h = np.minimum(time_s / t, 1.0)
+        by_velocity = h - h * h * h * (1.0 - 0.5 * h)
+        by_acceleration = h * h * (0.5 - h * (2.0 / 3.0 - 0.25 * h))
+        return np.asarray(
+            self._position + t * (self._velocity * by_velocity + self._acceleration * t * by_acceleration)
+        )

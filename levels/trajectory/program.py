@@ -1,0 +1,129 @@
+"""A program of motion requests, in `[task]`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from rack.levels.errors import ProgramError
+from rack.levels.level import Program
+from rack.levels.tables import Finite, NotNegative, Positive, RobotConfig, SceneConfig, Table
+
+MAX_REQUESTS = 200
+
+Place = tuple[Finite, Finite, Finite]
+Turn = tuple[Finite, Finite, Finite, Finite]
+
+
+class MotionStep(Table):
+    """Base of the steps that move the arm."""
+
+    segment: NotNegative = Field(0.0, description="time of the segment, s; 0: from the limits; too short: stretched")
+    acceleration: NotNegative = Field(0.0, description="half the time of the blend into it, s; 0: the level's default")
+
+
+class HomeStep(MotionStep):
+    """Move the joints to where the arm starts."""
+
+    do: Literal["home"] = Field("home", description="the kind of step")
+
+
+class MoveStep(MotionStep):
+    """Move straight in joint space, to joint positions or to where the tool has a pose."""
+
+    do: Literal["move"] = Field("move", description="the kind of step")
+    joints: tuple[Finite, ...] | None = Field(None, description="joint positions, rad")
+    position: Place | None = Field(None, description="of the tool, m")
+    quaternion: Turn | None = Field(None, description="of the tool, as w, x, y, z; as at home when not given")
+
+    @model_validator(mode="after")
+    def _one_goal(self) -> MoveStep:
+        if (self.position is None) == (self.joints is None):
+            raise ValueError("a move has either position or joints")
+        if self.quaternion is not None and (self.position is None or not any(self.quaternion)):
+            raise ValueError("a quaternion belongs to a position, and is not all zero")
+        return self
+
+
+class LineStep(MotionStep):
+    """Move the tool along a straight line, to a pose in the world or in the frame of a body, which it may follow."""
+
+    do: Literal["line"] = Field("line", description="the kind of step")
+    position: Place = Field(description="of the tool, m, in the frame of `body`")
+    quaternion: Turn | None = Field(
+        None, description="of the tool, as w, x, y, z, in that frame; as at home by default"
+    )
+    body: str | None = Field(
+        None, description="object or obstacle in whose frame the goal is; the world when not given"
+    )
+    live: bool = Field(False, description="true: the goal follows the body; false: it is copied when the motion begins")
+
+    @model_validator(mode="after")
+    def _follows_a_body(self) -> LineStep:
+        if self.live and self.body is None:
+            raise ValueError("a live goal needs a body that it follows")
+        if self.quaternion is not None and not any(self.quaternion):
+            raise ValueError("quaternion is all zero; its length must not be zero")
+        return self
+
+
+class StayStep(Table):
+    """Stay at the goal before it; if that is live, follow it."""
+
+    do: Literal["stay"] = Field("stay", description="the kind of step")
+    seconds: Positive = Field(description="for how long, s")
+
+
+class GripStep(Table):
+    """Bring the gripper to an opening, at rest."""
+
+    do: Literal["grip"] = Field("grip", description="the kind of step")
+    opening: Finite = Field(description="gripper joint position, m or rad")
+    force: Positive | None = Field(None, description="largest force, N or N m; that of the gripper when not given")
+    seconds: NotNegative = Field(0.0, description="time that it takes, s; 0: the level's default")
+
+
+class CancelStep(Table):
+    """Cancel what is under way or queued; the arm ramps to rest."""
+
+    do: Literal["cancel"] = Field("cancel", description="the kind of step")
+    after: NotNegative = Field(description="time after the step before it was taken by the level below, s")
+
+
+Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | CancelStep
+
+
+class MotionProgram(Program):
+    """Steps in their order: step k becomes request k + 1."""
+
+    step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field(
+        (), max_length=MAX_REQUESTS, description="steps, done in their order"
+    )
+
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
+        """Yield key, value and reason of everything that the arm or the scene lacks."""
+        if robot is None:
+            return
+        for k, step in enumerate(self.step):
+            if isinstance(step, MoveStep) and step.joints is not None and len(step.joints) != len(robot.joints):
+                why = f"{len(step.joints)} values; permitted: {len(robot.joints)}, one per joint"
+                yield f"step[{k}].joints", list(step.joints), why
+            if isinstance(step, LineStep) and step.body is not None and step.body not in scene.bodies:
+                why = f"not in the scene; bodies: {', '.join(scene.bodies) or 'none'}"
+                yield f"step[{k}].body", step.body, why
+            if isinstance(step, GripStep) and robot.gripper is None:
+                yield f"step[{k}].do", step.do, "the robot has no gripper"
+
+
+def read_motions(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> tuple[Step, ...]:
+    """Return the steps in the `[task]` table. Raises `ProgramError`, with one line per mistake."""
+    try:
+        program = MotionProgram.model_validate(table)
+    except ValidationError as error:
+        lines = [f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
+        raise ProgramError("\n".join(lines)) from error
+    if misfits := [f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)]:
+        raise ProgramError("\n".join(misfits))
+    return program.step

@@ -1,0 +1,186 @@
+"""Control modifications on real boards: switched at their ticks, without a step, and repeated bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.history import MailboxRing
+from rack.boards import Rack
+from rack.boards.config import load, wire
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError
+from rack.boards.events import Event
+from tests.boards.commanded_racks import commands
+
+TEXT = f"""
+name = "modified"
+extends = ["robots/puma560.toml"]
+python_path = ["{Path(__file__).parent}"]
+robot.substeps = 2
+
+[clock]
+period_ms = 1.0
+mode = "lockstep"
+
+[board.arm]
+slot = 2
+core = 1
+rate_hz = 1000
+above = ["shoulder", "wrist"]
+executor = "rack.levels.servo:ArmExecutor"
+
+[board.shoulder]
+slot = 3
+rate_hz = 1000
+above = "swing"
+below = "arm"
+executor = "rack.levels.servo:JointServo"
+params.joints = ["j1", "j2", "j3"]
+params.modifications.pd.class = "rack.levels.servo.common_modifications:JointPd"
+params.modifications.lean.class = "law_modifications:Lean"
+params.modifications.breaks.class = "law_modifications:Breaks"
+
+[board.wrist]
+slot = 4
+rate_hz = 1000
+above = "swing"
+below = "arm"
+executor = "rack.levels.servo:JointServo"
+params = {{ joints = ["j4", "j5", "j6"], gripper = true }}
+
+[board.swing]
+slot = 5
+rate_hz = 50
+below = ["shoulder", "wrist"]
+executor = "joint_levels:Swing"
+"""
+SECONDS = 0.7
+LARGEST_STEP = 1.5 / 50 * 4.0
+"""N m: of a difference of 4 N m that decays in 50 ticks."""
+
+
+def switch(name: str, is_on: bool, tick: int) -> str:
+    return f"level='shoulder', what='modify', name='{name}', on={str(is_on).lower()}, tick={tick}"
+
+
+SWITCHED = commands(
+    switch("lean", True, 300), switch("lean", False, 400), switch("pd", True, 450), switch("breaks", True, 550)
+)
+
+
+class Ran(NamedTuple):
+    """A run: its digest, its events, and the statuses of the board of the shoulder by tick."""
+
+    digest: str
+    events: list[Event]
+    rows: np.ndarray
+
+    def torque(self, tick: int) -> np.ndarray:
+        """Return the board's torque of a cycle, N m."""
+        return np.asarray(self.rows["message"]["torque"][self.rows["tick"] == tick][0])
+
+    def reason(self, tick: int) -> str:
+        """Return what its status says in a cycle."""
+        return str(self.rows["message"]["reason"][self.rows["tick"] == tick][0].decode())
+
+
+@pytest.fixture(scope="module")
+def rack_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RackConfig]:
+    path = tmp_path_factory.mktemp("modified") / "modified.toml"
+    path.write_text(TEXT)
+    return lambda *settings: load(path, list(settings))
+
+
+@pytest.fixture(scope="module")
+def run(rack_of: Callable[..., RackConfig]) -> Callable[..., Ran]:
+    def run(*settings: str) -> Ran:
+        with Rack(rack_of(*settings)) as rack:
+            outcome = rack.run(SECONDS)
+            return Ran(outcome.digest, rack.events, MailboxRing(rack.segment, "shoulder.status").drain().rows)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def switched(run: Callable[..., Ran]) -> Ran:
+    return run(SWITCHED)
+
+
+def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(switched: Ran) -> None:
+    for tick, reason in ((300, ""), (301, "modified by lean"), (400, "modified by lean"), (401, "")):
+        assert switched.reason(tick) == reason
+    for tick in (301, 401, 451):
+        assert switched.torque(tick) == pytest.approx(switched.torque(tick - 1), abs=1e-12)
+    steps = np.abs(np.diff([switched.torque(tick) for tick in range(200, 640)], axis=0))
+    assert steps[100:].max() < steps[:100].max() + LARGEST_STEP
+
+
+def test_a_run_with_its_switches_repeats_and_is_that_of_a_board_without_modifications_up_to_the_first(
+    switched: Ran, run: Callable[..., Ran]
+) -> None:
+    again, without = run(SWITCHED), run("board.shoulder.params.modifications={}")
+    assert again.digest == switched.digest != without.digest
+    assert (again.rows["message"] == switched.rows["message"]).all()
+    differs = [tick for tick in range(100, 400) if (without.torque(tick) != switched.torque(tick)).any()]
+    assert differs[0] == 301
+
+
+def test_one_that_fails_is_taken_out_with_its_reason_in_status_and_events_and_the_arm_goes_on(switched: Ran) -> None:
+    assert switched.reason(649) == "modified by pd, breaks"
+    assert switched.reason(650) == "modification 'breaks' taken out: KeyError: 'nothing left'; modified by pd"
+    found = [event for event in switched.events if event.kind == "detection"]
+    assert [(e.tick, e.board, e.subject, e.code) for e in found] == [(650, "shoulder", "breaks", "modification")]
+    assert found[0].text == "control modification 'breaks' failed and was taken out"
+    assert not (switched.rows["message"]["stopped"][-50:]).any()
+
+
+MISTAKES = {
+    "no such class": (
+        "modifications.pd.class=rack.levels.servo.common_modifications:Pd",
+        "board.shoulder.params.modifications.pd.class = ",
+        "has no class 'Pd'",
+    ),
+    "no suitable parameter": (
+        "modifications.notch={class='rack.levels.servo.common_modifications:Notch', params={frequency=600.0}}",
+        "board.shoulder.params.modifications.notch",
+        "params.frequency = 600 Hz: permitted: below half the law's rate, 500 Hz",
+    ),
+    "no class given": ("modifications.notch={on=true}", "board.shoulder.params.modifications.notch.class", "missing"),
+    "no name": (
+        "modifications.No={class='law_modifications:Lean'}",
+        "board.shoulder.params.modifications",
+        "should match pattern",
+    ),
+}
+
+
+@pytest.mark.parametrize(("setting", "place", "why"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_in_a_modification_is_one_line(
+    rack_of: Callable[..., RackConfig], setting: str, place: str, why: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        wire(rack_of(f"board.shoulder.params.{setting}"))
+    assert len(caught.value.mistakes) == 1
+    assert str(caught.value).startswith(place)
+    assert why in str(caught.value)
+
+
+def test_a_name_given_twice_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "twice.toml"
+    table = '[board.shoulder.params.modifications.it]\nclass = "law_modifications:Lean"\n'
+    path.write_text(f"{TEXT}\n{table}{table}")
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_command_names_a_modification_of_its_board(rack_of: Callable[..., RackConfig]) -> None:
+    with pytest.raises(ConfigError, match="modify of 'shoulder' knows: pd, lean, breaks"):
+        wire(rack_of(commands(switch("leans", True, 1))))
+    with pytest.raises(ConfigError, match="modify of 'wrist' knows: none"):
+        wire(rack_of(commands("level='wrist', what='modify', name='lean', on=true")))

@@ -1,0 +1,218 @@
+"""Racks with queues: nothing lost or repeated, killed boards, repeatable runs, and what `rack check` refuses."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+
+import pytest
+
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.words import Block
+from rack.boards import Rack
+from rack.boards.config import wire
+from rack.boards.errors import ConfigError
+from rack.boards.faults.config import FaultConfig
+from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
+from tests.boards.messages import Written
+
+QUEUES = f"""{CLOCK}
+[board.upper]
+slot = 2
+core = 1
+rate_hz = 10
+executor = "queue_levels:Asking"
+params = {{ burst = 3 }}
+
+[board.lower]
+slot = 3
+rate_hz = 4
+above = "upper"
+executor = "queue_levels:Answering"
+"""
+FAST = ("board.upper.rate_hz=100", "board.lower.rate_hz=50", "protocol.depth={ 'upper.requests' = 512 }")
+PLANNING = f"""{CLOCK}
+[board.wave]
+slot = 2
+rate_hz = 50
+executor = "queue_levels:Steady"
+planner = "queue_levels:Stepping"
+coupling = "tight"
+within_cycles = 2
+params = {{ burst = 5 }}
+"""
+
+
+def counts(rack: Rack, board: str) -> dict[str, int]:
+    """Return the counts in the newest status of a board."""
+    status = open_observer(rack.segment, f"{board}.status").peek().value
+    names = status.record.dtype.names
+    return {name: int(status.record[name]) for name in names if status.record[name].dtype.kind != "S"}
+
+
+def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        wire(config(*settings, text=text))
+    return str(caught.value).splitlines()
+
+
+def test_a_slower_reader_gets_every_request_of_a_burst(config: MakeConfig) -> None:
+    with Rack(config("board.upper.params.until=360", text=QUEUES)) as rack:
+        rack.run(2.0)
+        assert counts(rack, "upper")["sent"] == 27
+        assert counts(rack, "lower") | {"taken": 27, "newest": 27, "repeated": 0, "missing": 0} == counts(rack, "lower")
+
+
+def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> None:
+    faults = tuple(FaultConfig(kind="kill", board=board, tick=tick) for board, tick in (("upper", 97), ("lower", 501)))
+    found = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES).model_copy(update={"fault": faults})
+    digests = set()
+    for _ in range(3):
+        with Rack(found) as rack:
+            digests.add(rack.run(4.0).digest)
+            assert counts(rack, "upper")["refused"] > 0
+            assert counts(rack, "lower")["repeated"] == 0
+            assert [e.text for e in rack.events if e.code == "queue_full"]
+    assert len(digests) == 1
+
+
+def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
+    depth = "protocol.depth={ 'upper.requests' = 7 }"
+    runs = []
+    for mode in ("lockstep", "realtime"):
+        with Rack(config(f"clock.mode={mode}", "board.lower.params.most=4", depth, text=QUEUES)) as rack:
+            rack.run(1.5)
+            runs.append(Written.on(rack.segment))
+    exact, real = runs
+    same = real.first_miss(600)
+    assert same > 0
+    assert real.until(same) == exact.until(same)
+
+
+def kill_often(rack: Rack, board: str, times: int, rng: random.Random) -> None:
+    """Kill a board's process that often, at random instants, and wait until it cycles again."""
+    block = rack.segment.block(board)
+    for _ in range(times):
+        cycles = block[Block.CYCLES]
+        while block[Block.LOST] or block[Block.CYCLES] < cycles + 3:
+            assert rack.watch(0.01)
+        rack.watch(rng.uniform(0.0, 0.03))
+        os.kill(block[Block.PID], signal.SIGKILL)
+        while not block[Block.LOST]:
+            assert rack.watch(0.005)
+
+
+REALTIME = ("clock.mode=realtime", "supervision.restarts=100", *FAST)
+
+
+def test_a_killed_reader_repeats_nothing_and_loses_at_most_the_cycle_it_died_in(config: MakeConfig) -> None:
+    with Rack(config(*REALTIME, "board.lower.params.most=8", text=QUEUES)) as rack:
+        rack.start(60.0)
+        kill_often(rack, "lower", 3, random.Random(1))
+        found = settle(rack, "lower")
+        assert found["repeated"] == 0
+        assert found["missing"] <= 3 * 8
+        assert found["taken"] + found["missing"] == found["newest"]
+        assert counts(rack, "upper")["refused"] == 0
+
+
+def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfig) -> None:
+    with Rack(config(*REALTIME, text=QUEUES)) as rack:
+        rack.start(60.0)
+        kill_often(rack, "upper", 3, random.Random(2))
+        found = settle(rack, "lower")
+        rows, lost = MailboxRing(rack.segment, "upper.requests").drain()
+    assert not lost
+    ids, ticks = rows["message"]["id"].tolist(), rows["tick"].tolist()
+    assert ids == sorted(set(ids))
+    assert [ids[at : at + 3] for at in range(0, len(ids), 3)] == [[at, at + 1, at + 2] for at in ids[::3]]
+    assert [ticks.count(tick) for tick in set(ticks)] == [3] * len(set(ticks))
+    assert found["repeated"] == 0
+    assert found["missing"] % 3 == 0
+    assert len(set(rows["epoch"].tolist())) == 4
+
+
+def settle(rack: Rack, board: str) -> dict[str, int]:
+    """Let a rack run on until the board has cycled again, then stop it; return the board's counts."""
+    block = rack.segment.block(board)
+    while block[Block.LOST]:
+        assert rack.watch(0.01)
+    assert rack.watch(0.3)
+    rack.stop("the test has seen enough")
+    while rack.watch(0.1):
+        continue
+    return counts(rack, board)
+
+
+def test_a_plan_may_be_a_queue(config: MakeConfig) -> None:
+    digests = set()
+    for _ in range(2):
+        with Rack(config("protocol.depth={ 'wave.plan' = 8 }", text=PLANNING)) as rack:
+            digests.add(rack.run(1.0).digest)
+            found = counts(rack, "wave")
+            assert found["taken"] == found["newest"] > 50
+    assert len(digests) == 1
+
+
+def test_a_mailbox_is_a_queue_if_the_config_says_so(config: MakeConfig) -> None:
+    with Rack(config("protocol.mailbox={ 'wave.status' = 'queue' }", text=PLAIN)) as rack:
+        rack.run(0.5)
+        taken = open_observer(rack.segment, "wave.status_taken").peek().value
+        box, position = (rack.segment.layout.mailbox(name) for name in ("wave.status", "wave.status_taken"))
+    assert (box.protocol, box.capacity) == ("queue", 32)
+    assert (position.writer, position.readers, position.every) == ("watch", ("wave",), 8)
+    # At tick 192 the messages of all earlier ticks were visible.
+    assert (taken.taken, taken.unread) == (192, 0)
+
+
+def test_a_queue_keeps_what_a_recorder_may_be_behind(config: MakeConfig) -> None:
+    box = wire(config("protocol.depth={ 'upper.requests' = 5 }", text=QUEUES)).mailbox("upper.requests")
+    # 40 ticks and 100 are the least time in which 5 messages can be sent and taken; 800 ticks are 2 s.
+    assert box.depth >= 5 * (800 // 140 + 1)
+    assert box.capacity == 5
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (
+            ("board.third={ slot = 4, every = 1, above = 'upper', executor = 'queue_levels:Answering' }",),
+            "mailbox upper.requests: a queue gives each message once, so it has one reader, not 2: lower (requests)",
+        ),
+        (("board.lower.reads.requests=lower.requests",), "no task writes it"),
+        (("protocol.default=queue",), 'protocol.default = "queue"'),
+        (("protocol.mailbox={ 'upper.requests' = 'time-slice' }",), "sends any number of messages in a cycle"),
+        (("protocol.depth={ 'upper.status' = 3 }",), "not a queue: it holds one message; queues: upper.requests"),
+        (("protocol.depth={ 'upper.nothing' = 3 }",), "no such mailbox"),
+        (("protocol.depth={ 'upper.requests' = 0 }",), "protocol.depth"),
+    ],
+)
+def test_queues_that_make_no_sense_are_refused_in_one_line(
+    config: MakeConfig, settings: tuple[str, ...], expected: str
+) -> None:
+    found = mistakes(config, *settings)
+    assert sum(expected in line for line in found) == 1
+
+
+def test_a_queue_without_a_reader_is_refused(config: MakeConfig) -> None:
+    alone = QUEUES.partition("[board.lower]")[0]
+    (line,) = mistakes(config, text=alone)
+    assert "mailbox upper.requests: no task reads this queue" in line
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        ({"kind": "mute", "mailbox": "upper.requests"}, "'upper.requests' is a queue, which mute does not strike"),
+        ({"kind": "babble", "mailbox": "upper.requests"}, "refuses those that it cannot hold"),
+        ({"kind": "drop", "board": "lower", "mailbox": "upper.requests_taken"}, "'lower' does not write it"),
+    ],
+)
+def test_faults_that_a_queue_cannot_show_are_refused(config: MakeConfig, fault: dict[str, str], why: str) -> None:
+    text = (
+        QUEUES + "[[fault]]\n" + "\n".join(f'{key} = "{value}"' for key, value in ({"board": "upper"} | fault).items())
+    )
+    (line,) = mistakes(config, text=text)
+    assert why in line

@@ -1,0 +1,210 @@
+"""An arm on a board of its own: driven by the torques of one board or of six, braked as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.watch.alarms import Alarm
+from rack.levels.level import Demand, Ports
+from rack.levels.operator import Answer, Operation
+from rack.levels.servo import JointServo
+from tests.levels.box import mute
+from tests.levels.lockstep import Operator
+from tests.levels.servo.joint_rig import APART, JOINTS, TOGETHER, JointRig
+
+LAST = f"servo_{JOINTS[-1]}"
+WARM_UP = 200
+"""Ticks after which the arm swings."""
+NEAR_RAD = 1e-3
+"""Bound of the tracking error: the load is that of the set point, and the joints do not know of each other's motion."""
+
+
+def swinging(servos: Mapping[str, Mapping[str, Any]] = APART, **arm: float | str) -> JointRig:
+    """Return a rig whose arm swings."""
+    rig = JointRig(servos, **arm)
+    rig.run(WARM_UP)
+    assert np.ptp(rig.positions, axis=0).min() > 0.01
+    return rig
+
+
+def assert_goes_on(rig: JointRig) -> None:
+    """Check that the arm swings, follows its targets, and has kept its limits."""
+    since = len(rig.positions)
+    rig.run(600)
+    assert np.ptp(rig.positions[since + 50 :], axis=0).min() > 0.05
+    assert np.abs(rig.errors()[since + 50 :]).max() < NEAR_RAD
+    assert (rig.status.violations, rig.status.reason) == (0, "")
+
+
+def test_six_boards_move_the_arm_as_one_does() -> None:
+    together, apart = JointRig(TOGETHER), JointRig(APART)
+    for rig in (together, apart):
+        rig.run(900)
+    assert np.array_equal(together.positions, apart.positions)
+    assert np.abs(apart.errors()).max() < NEAR_RAD
+    assert np.ptp(apart.positions, axis=0).min() > 0.1
+
+
+def test_boards_slower_than_the_arm_drive_it_too() -> None:
+    rig = JointRig(APART, every=2)
+    rig.run(900)
+    assert np.abs(rig.errors()).max() < 3 * NEAR_RAD
+    assert sum(rig.braked) < 10
+
+
+def test_arm_is_braked_until_every_board_sends_torques_and_then_stays_where_it_is() -> None:
+    rig = JointRig(APART)
+    rig.rack.tasks["swing"].due = -1
+    rig.rack.tasks[LAST].due = 50
+    rig.run(50)
+    assert all(rig.braked)
+    assert rig.status.reason == f"no torque from board '{LAST}' yet"
+    rig.run(500)
+    assert not any(rig.braked[60:])
+    assert np.abs(rig.positions[-1] - rig.arm.cell.home).max() < NEAR_RAD
+
+
+def test_lost_board_brakes_all_joints_at_once_and_motion_goes_on_when_it_is_back() -> None:
+    rig = swinging()
+    rig.rack.lose("servo_j3", ticks=300)
+    rig.run(1)
+    assert rig.braked[-1]
+    assert rig.status.reason == "board 'servo_j3' is lost: braked until it is back"
+    rig.run(298)
+    assert all(rig.braked[-298:])
+    rig.run(10)
+    assert not rig.braked[-1]
+    assert_goes_on(rig)
+
+
+def test_silent_board_brakes_the_arm_after_two_of_its_cycles() -> None:
+    rig = swinging()
+    rig.rack.disturb("servo_j2.command", mute, ticks=100)
+    rig.run(3)
+    assert not any(rig.braked[-3:])
+    rig.run(1)
+    assert rig.braked[-1]
+    rig.run(100)
+    assert_goes_on(rig)
+
+
+def test_restarted_board_of_the_arm_finds_it_where_it_is() -> None:
+    rig = swinging()
+    before = rig.positions[-1]
+    rig.rack.lose("arm", ticks=50)
+    rig.run(54)
+    assert np.abs(rig.positions[-1] - before).max() < 0.04  # the way that the brakes need
+    assert rig.arm.arm.violations == 0
+    assert_goes_on(rig)
+
+
+@pytest.mark.parametrize(
+    ("kind", "alarm", "parameters"),
+    [
+        ("sensor-bias", Alarm.SENSOR_MODEL, {"joint": 2, "size": 0.02}),
+        ("sensor-dropout", Alarm.SENSOR_SILENT, {}),
+        ("actuator-off", Alarm.ACTUATOR, {"joint": 1}),
+        ("command-nan", Alarm.COMMAND_INVALID, {"joint": 0}),
+        ("command-limit", Alarm.COMMAND_LIMIT, {"joint": 3, "factor": 5.0}),
+    ],
+)
+def test_fault_between_level_and_arm_brakes_it_within_limits(
+    kind: str, alarm: Alarm, parameters: dict[str, float]
+) -> None:
+    rig = swinging(retry=0.1)
+    rig.inject(kind, **parameters)
+    rig.run(60)
+    assert alarm in [finding.alarm for _, finding in rig.found]
+    assert rig.braked[-1]
+    rig.heal()
+    rig.run(200)
+    assert_goes_on(rig)
+
+
+class Nonsense(JointServo):
+    """Writes NaN for a while."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Servo, and spoil the torque."""
+        super().process(read, write, tick)
+        if WARM_UP <= tick < WARM_UP + 20:
+            write.command.torque[0] = np.nan
+
+
+def test_torque_of_a_board_that_is_nan_never_reaches_the_arm() -> None:
+    rig = JointRig({"servo": {"gripper": True}}, servo=Nonsense)
+    rig.run(WARM_UP + 3)
+    assert rig.braked[-1]
+    assert rig.status.reason.startswith("rejected: torque of 'j1' is not finite")
+    rig.run(50)
+    assert_goes_on(rig)
+
+
+def test_stop_brings_the_arm_to_rest_by_torques_before_it_is_braked() -> None:
+    rig = swinging()
+    rig.rack.stop(Demand.STOP, ticks=400)
+    rig.run(400)
+    ramp = np.flatnonzero(rig.braked[WARM_UP:])[0]
+    assert 10 < ramp < 300
+    assert np.abs(np.diff(rig.positions[WARM_UP + ramp - 2 :], axis=0)).max() < 5e-5  # rad a tick: it creeps
+    assert all(rig.braked[WARM_UP + ramp :])
+    rig.run(20)
+    assert_goes_on(rig)
+
+
+def test_demand_to_brake_is_obeyed_at_once() -> None:
+    rig = swinging()
+    rig.rack.stop(Demand.BRAKE, ticks=50)
+    rig.run(1)
+    assert rig.braked[-1]
+    rig.run(60)
+    assert_goes_on(rig)
+
+
+class Restless(JointServo):
+    """Never sees that the arm is stopped, only that it is braked."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Servo on."""
+        read.status.value.stopped = read.status.value.braked
+        super().process(read, write, tick)
+
+
+def test_arm_that_its_boards_do_not_bring_to_rest_is_braked() -> None:
+    rig = JointRig(TOGETHER, servo=Restless)
+    rig.run(WARM_UP)
+    operator = Operator(rig.rack)
+    operator.say("arm", Operation.HOLD)
+    rig.run(50)
+    assert not rig.braked[-1]
+    rig.run(700)
+    assert rig.braked[-1]
+
+
+def test_operator_of_the_arm_holds_it_and_lets_it_go() -> None:
+    rig = swinging()
+    operator = Operator(rig.rack)
+    operator.say("arm", Operation.HOLD)
+    rig.run(300)
+    assert (rig.status.stopped, rig.status.braked, rig.status.answer) == (1, 0, Answer.DONE)
+    assert np.abs(np.diff(rig.positions[-50:], axis=0)).max() < 1e-5
+    operator.say("arm", Operation.RESUME)
+    rig.run(50)
+    assert_goes_on(rig)
+
+
+def test_operator_moves_the_joint_of_one_board() -> None:
+    rig = swinging()
+    operator = Operator(rig.rack)
+    operator.say("servo_j2", Operation.SETPOINT, joints=[1.2])
+    rig.run(1000)
+    assert abs(rig.positions[-1][1] - 1.2) < NEAR_RAD
+    assert np.abs(np.diff(rig.positions[-50:], axis=0)).max() < 1e-5
+    assert rig.rack.read("servo_j2.status").answer == Answer.DONE
+    operator.say("servo_j2", Operation.RESUME)
+    rig.run(1000)
+    assert_goes_on(rig)

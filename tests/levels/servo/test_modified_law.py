@@ -1,0 +1,347 @@
+"""A servo law under control modifications: switched without a step, undone when they fail."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Array
+from rack.levels.errors import LevelError
+from rack.levels.level import Finding, LevelContext
+from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.servo.common_modifications import DeadZone, JointPd, Notch
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.modification import Hook, LawContext, LawSample, ModifiableParams, Modification
+from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
+from tests.levels.arms import cell, config
+
+TICK_NS = 1_000_000
+TRANSFER_TICKS = 50
+JOINTS = 6
+LIMITS = cell("puma560").bounds.torque
+STATE, INERTIA, LOAD = np.zeros((2, JOINTS)), np.full(JOINTS, 2.0), np.full(JOINTS, 7.0)
+HERE = f"{__name__}:"
+COMMON = "rack.levels.servo.common_modifications:"
+
+
+class Half(Modification):
+    """Halves the torque."""
+
+    hook = Hook.AFTER
+
+    def modify(self, sample: LawSample) -> None:
+        sample.torque = 0.5 * sample.torque
+
+
+class Further(Modification):
+    """Wants positions one rad further."""
+
+    hook = Hook.BEFORE
+
+    def modify(self, sample: LawSample) -> None:
+        sample.wanted_position += 1.0
+
+
+class Nine(Modification):
+    """Gives 9 N m in place of the law."""
+
+    hook = Hook.INSTEAD
+
+    def modify(self, sample: LawSample) -> None:
+        assert np.isnan(sample.torque).all()
+        sample.torque[:] = 9.0
+
+
+class Counts(Modification):
+    """Adds the number of its samples since it was put in, N m."""
+
+    hook = Hook.AFTER
+
+    def begin(self, sample: LawSample) -> None:
+        self.samples = 0
+
+    def modify(self, sample: LawSample) -> None:
+        self.samples += 1
+        sample.torque += self.samples
+
+
+class Huge(Modification):
+    hook = Hook.AFTER
+
+    def modify(self, sample: LawSample) -> None:
+        sample.torque += 1e6
+
+
+class Raises(Modification):
+    """Spoils the torque, then fails in its third sample."""
+
+    hook = Hook.AFTER
+
+    def begin(self, sample: LawSample) -> None:
+        self.left = 3
+
+    def modify(self, sample: LawSample) -> None:
+        self.left -= 1
+        sample.torque += 2.0
+        if not self.left:
+            raise ZeroDivisionError("left nothing")
+
+
+class GivesNan(Modification):
+    hook = Hook.BEFORE
+
+    def modify(self, sample: LawSample) -> None:
+        sample.velocity[2] = np.nan
+
+
+class SetsNothing(Modification):
+    hook = Hook.INSTEAD
+
+    def modify(self, sample: LawSample) -> None:
+        pass
+
+
+class Bench:
+    """A law of one number: torque = 3 N m + 10 N m/rad times the position wanted, modified."""
+
+    def __init__(self, **modifications: Mapping[str, Any] | str) -> None:
+        tables = {n: {"class": HERE + m} if isinstance(m, str) else m for n, m in modifications.items()}
+        robot, scene = config("puma560")
+        context = LevelContext("servo", 1, 1, TICK_NS, 0, robot, scene, {}, {})
+        self.findings: list[Finding] = []
+        params = ModifiableParams.model_validate({"modifications": tables, "transfer": TRANSFER_TICKS * TICK_NS * 1e-9})
+        self.law = ModifiedLaw(context, params, LIMITS, self.findings)
+        self.tick = 0
+
+    def switch(self, name: str, is_on: bool) -> str:
+        message = Message(OPERATOR_COMMAND.dtype({}))
+        message.what, message.name, message.goal = Operation.MODIFY, name, Goal.ON if is_on else Goal.OFF
+        return self.law.obey(message)
+
+    def run(self, samples: int, wanted: Callable[[int], float] = lambda tick: 0.0) -> Array:
+        """Return the torque of the third joint in each sample, N m."""
+        found = []
+        for _ in range(samples):
+            motion = Motion(np.zeros((3, JOINTS)))
+            motion.position[:] = wanted(self.tick)
+            found.append(self.law.torque(self._law, LawInputs(motion, STATE, INERTIA, LOAD, self.tick))[2])
+            self.tick += 1
+        return np.array(found)
+
+    @staticmethod
+    def _law(motion: Motion, state: Array) -> Array:
+        return 3.0 + 10.0 * motion.position + 0.0 * state[1]
+
+
+def swing(tick: int) -> float:
+    return 0.5 * np.sin(0.01 * tick)
+
+
+def test_without_a_modification_put_in_the_torque_is_the_laws() -> None:
+    assert Bench(half="Half").run(3).tolist() == [3.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("name", "after"), [("Half", 1.5), ("Further", 13.0), ("Nine", 9.0)], ids=["after", "before", "instead"]
+)
+def test_a_switch_begins_at_the_last_torque_and_goes_over_to_the_modified_law_in_the_transfer_time(
+    name: str, after: float
+) -> None:
+    bench = Bench(it=name)
+    bench.run(5)
+    assert bench.switch("it", True) == ""
+    torque = bench.run(TRANSFER_TICKS + 3)
+    assert torque[0] == pytest.approx(3.0, abs=1e-12)
+    assert torque[TRANSFER_TICKS // 2] == pytest.approx(0.5 * (3.0 + after))
+    assert torque[TRANSFER_TICKS - 1] != after
+    assert torque[TRANSFER_TICKS:].tolist() == [after] * 3
+    bench.switch("it", False)
+    back = bench.run(TRANSFER_TICKS + 1)
+    assert back[0] == pytest.approx(after, abs=1e-12)
+    assert back[-1] == 3.0
+
+
+@pytest.mark.parametrize("name", ["Half", "Further", "Nine"])
+def test_no_step_at_any_switch_under_motion(name: str) -> None:
+    bench, torque = Bench(it=name), [Bench(it=name).run(1, swing)]
+    # Also while the transfer before it lasts.
+    for samples, is_on in ((40, True), (120, False), (20, True), (10, False), (80, True), (200, False)):
+        torque.append(bench.run(samples, swing))
+        bench.switch("it", is_on)
+    steps = np.abs(np.diff(np.concatenate(torque)))
+    in_motion, decay = 10.0 * 0.5 * 0.01, 1.5 / TRANSFER_TICKS
+    assert steps.max() <= in_motion + decay * 10.5
+    assert steps[40] < 1e-12 > steps[160]
+
+
+def test_modifications_act_at_their_hooks_in_the_order_of_the_config() -> None:
+    tables = {
+        name: {"class": HERE + kind, "on": True}
+        for name, kind in (("half", "Half"), ("counts", "Counts"), ("further", "Further"))
+    }
+    assert Bench(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
+
+
+def test_one_put_in_again_starts_anew_and_each_acts_once_a_sample() -> None:
+    bench, last = Bench(counts="Counts", half="Half"), []
+    for name, is_on in (("counts", True), ("half", True), ("counts", False), ("counts", True)):
+        bench.switch(name, is_on)
+        last.append(bench.run(60)[-1])
+    assert last == [3.0 + 60.0, 0.5 * (3.0 + 120.0), 0.5 * 3.0, 0.5 * (3.0 + 60.0)]
+
+
+def test_one_in_place_of_the_law_replaces_another() -> None:
+    bench = Bench(nine="Nine", pd={"class": COMMON + "JointPd"})
+    bench.switch("nine", True)
+    bench.run(60)
+    bench.switch("pd", True)
+    assert bench.law.reason == "modified by pd"
+    assert bench.run(60)[-1] == LOAD[2]
+
+
+def test_limits_stay_in_force() -> None:
+    bench = Bench(huge="Huge")
+    bench.run(1)
+    bench.switch("huge", True)
+    assert np.max(bench.run(100)) == LIMITS[2]
+
+
+def test_after_braking_the_torque_is_at_once_the_laws() -> None:
+    bench = Bench(half="Half")
+    bench.run(5)
+    bench.switch("half", True)
+    bench.law.interrupt()
+    assert bench.run(1).tolist() == [1.5]
+
+
+def test_one_that_raises_is_undone_and_taken_out_in_the_same_sample() -> None:
+    bench = Bench(raises="Raises", half={"class": HERE + "Half", "on": True})
+    bench.run(1)
+    bench.switch("raises", True)
+    torque = bench.run(TRANSFER_TICKS + 5)
+    assert torque[-1] == 1.5
+    # The failure itself is a switch: no step.
+    assert np.abs(np.diff(torque)).max() < 0.1
+    assert bench.findings == [Finding(Alarm.MODIFICATION, 0)]
+    assert bench.law.reason == "modification 'raises' taken out: ZeroDivisionError: left nothing; modified by half"
+    bench.switch("raises", False)
+    assert bench.law.reason == "modified by half"
+
+
+@pytest.mark.parametrize("name", ["GivesNan", "SetsNothing"])
+def test_one_whose_result_is_not_finite_is_taken_out_and_the_law_goes_on(name: str) -> None:
+    bench = Bench(it=name)
+    bench.run(1)
+    bench.switch("it", True)
+    assert bench.run(3).tolist() == [3.0] * 3
+    assert bench.law.reason == "modification 'it' taken out: its result is not finite"
+    # Put in again, it fails again.
+    bench.switch("it", True)
+    bench.run(1)
+    assert len(bench.findings) == 2
+
+
+def test_an_unknown_name_is_refused() -> None:
+    assert Bench(half="Half", nine="Nine").switch("third", True) == "no modification 'third'; permitted: half, nine"
+
+
+def law_of(**params: Any) -> LawContext:
+    return LawContext([f"j{k}" for k in range(JOINTS)], 0.001, LIMITS, params)
+
+
+def sample_of(**vectors: float) -> LawSample:
+    sample = LawSample(JOINTS)
+    for name, value in vectors.items():
+        setattr(sample, name, value)
+    return sample
+
+
+@pytest.mark.parametrize(("error", "seen"), [(0.0005, 0.0), (-0.0005, 0.0), (0.003, 0.002), (-0.003, -0.002)])
+def test_a_dead_zone_hides_small_errors_and_reduces_larger_ones(error: float, seen: float) -> None:
+    sample = sample_of(position=1.0, wanted_position=1.0 + error)
+    DeadZone(law_of(width=0.001)).modify(sample)
+    assert sample.wanted_position - sample.position == pytest.approx(seen, abs=1e-15)
+
+
+def test_pd_control_is_each_joints_own_with_its_load_or_without() -> None:
+    sample = sample_of(wanted_position=0.1, wanted_velocity=0.2, inertia=2.0, load=7.0, torque=np.nan)
+    JointPd(law_of(bandwidth=10.0, damping=0.5)).modify(sample)
+    assert sample.torque == pytest.approx(2.0 * (100.0 * 0.1 + 10.0 * 0.2) + 7.0)
+    JointPd(law_of(bandwidth=10.0, damping=0.5, load=False)).modify(sample)
+    assert sample.torque == pytest.approx(24.0)
+
+
+@pytest.mark.parametrize(("frequency", "least", "most"), [(60.0, 0.0, 0.02), (3.0, 0.99, 1.01), (200.0, 0.9, 1.01)])
+def test_a_notch_removes_its_frequency_and_passes_others(frequency: float, least: float, most: float) -> None:
+    notch, sample, passed = Notch(law_of(frequency=60.0)), sample_of(torque=5.0), []
+    notch.begin(sample)
+    for tick in range(1000):
+        sample.torque = 5.0 + np.sin(2.0 * np.pi * frequency * 0.001 * tick)
+        notch.modify(sample)
+        passed.append(sample.torque[0])
+    assert least <= np.abs(np.array(passed[500:]) - 5.0).max() <= most
+
+
+def test_a_notch_begins_without_a_transient_and_lies_below_half_the_rate() -> None:
+    notch, sample = Notch(law_of(frequency=60.0)), sample_of(torque=5.0)
+    notch.begin(sample)
+    notch.modify(sample)
+    assert sample.torque == pytest.approx(5.0)
+    with pytest.raises(LevelError, match="frequency = 500 Hz: permitted: below half the law's rate, 500 Hz"):
+        Notch(law_of(frequency=500.0))
+
+
+def test_a_modification_that_assigns_a_vector_fills_it() -> None:
+    sample = sample_of(wanted_position=1.0)
+    torque, seen = sample.torque, sample.seen
+    sample.torque = 2.0 * np.ones(JOINTS)
+    sample.torque -= 0.5
+    sample.wanted_velocity = sample.wanted_position + 1.0
+    assert torque.tolist() == [1.5] * JOINTS
+    assert seen[1].tolist() == sample.motion.velocity.tolist() == [2.0] * JOINTS
+
+
+MISTAKES = {
+    "no class": ({"class": COMMON + "Notsch"}, "has no class 'Notsch'"),
+    "another class": ({"class": "rack.levels.servo:ServoExecutor"}, "'ServoExecutor' is not a subclass of"),
+    "half a class": ({"class": HERE + "Unfinished"}, "class 'Unfinished' lacks: modify"),
+    "no hook": ({"class": HERE + "Hookless"}, "class 'Hookless' has the hook None; permitted: before, instead, after"),
+    "unknown hook": (
+        {"class": HERE + "Later"},
+        "class 'Later' has the hook 'later'; permitted: before, instead, after",
+    ),
+    "params of one without": ({"class": HERE + "Half", "params": {"gain": 2.0}}, "'Half' takes no params; remove them"),
+    "params": ({"class": COMMON + "DeadZone", "params": {"width": -1.0}}, "params.width = -1.0: input should be"),
+    "unknown key": ({"class": HERE + "Half", "onn": True}, "Extra inputs"),
+}
+
+
+class Unfinished(Modification):
+    hook = Hook.AFTER
+
+
+class Hookless(Modification):
+    def modify(self, sample: LawSample) -> None:
+        pass
+
+
+class Later(Hookless):
+    hook = "later"  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(("table", "expected"), MISTAKES.values(), ids=MISTAKES)
+def test_a_table_of_a_modification_is_checked_with_its_class(table: Mapping[str, Any], expected: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        ModifiableParams.model_validate({"modifications": {"it": table}})
+
+
+def test_two_in_place_of_the_law_cannot_both_be_on_at_the_start() -> None:
+    tables = {name: {"class": HERE + "Nine", "on": True} for name in ("one", "two")}
+    with pytest.raises(ValueError, match="one, two are on in place of the law; permitted: one"):
+        ModifiableParams.model_validate({"modifications": tables})
