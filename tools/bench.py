@@ -331,9 +331,10 @@ def systems(
     Of a run in lockstep: how many times faster than real time. Of a run in real time: the cycles of the fastest boards
     missed, next to those of `cyclictest` at that rate on those cores; the response down and up, measured by what each
     message rests on; the age of commands when the lowest level reads them, and of its statuses when they are read; and
-    the response to an operator's hold of the highest level that takes one, from giving it to the cycle that acts on it.
+    the response to an operator's hold of the highest level that takes one and responds within the run, from giving it
+    to the end of the cycle that acts on it.
 
-    Exit status: 0 all racks ran, and responded within their bounds; 1 one did not; 2 a bad config.
+    Exit status: 0 all racks ran; 1 a run failed; 2 a bad config.
 
     \b
     Examples:

@@ -12,7 +12,7 @@ from rack.backplane.message import Field, Message, command, status
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.joint_messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
-from rack.levels.level import Input, LevelContext, Ports
+from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Operation
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
@@ -81,7 +81,7 @@ class PrimitiveTable(StateTableExecutor):
         "last_status": Input(JOINT_MOVE_STATUS, "own.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"command": JOINT_REFERENCE, "status": JOINT_MOVE_STATUS}
+    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_MOVE_STATUS, rests_on="statuses")}
     commands = {what: goals for what, goals in StateTableExecutor.commands.items() if what is not Operation.DO}
     vocabulary = vocabulary(
         conditions={

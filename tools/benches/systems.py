@@ -35,7 +35,7 @@ from rack.tools.runs.display import Display
 from rack.tools.runs.launch import RunResult, run_rack
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
-from rack.tools.timing.operator_response import response_of
+from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of
 
 LAUNCH_S = 4.0
 """About how long launching and recording a run take in addition to its time."""
@@ -169,21 +169,19 @@ def _shows(layout: Layout, path: CommandPath) -> bool:
 
 
 def held(recording: Recording, hold: CommandConfig) -> HoldResponse | None:
-    """Return the response to the hold of a run; None if no cycle of the lowest level rested on it."""
+    """Return the response to the hold of a run; None if the recording lacks it."""
     response = response_of(recording)
-    commands = [] if response is None else response.measured
-    # The config may have commands of its own.
-    own = [command for command in commands if (command.level, command.given) == (hold.level, hold.tick)]
-    if response is None or not own:
+    if response is None:
         return None
-    path = response.paths[hold.level]
-    return HoldResponse(
-        level=hold.level,
-        measured_ms=response.ticks(own[0]) * response.tick_ms,
-        longest_ms=path.longest * response.tick_ms,
-        wall_ms=own[0].wall_ms,
-        beyond=own[0] in response.beyond,
-    )
+    # The config may have commands of its own.
+    given = [one for one in response.commands if (one.level, one.given) == (hold.level, hold.tick)]
+    return next((_response(response, one) for one in given), None)
+
+
+def _response(response: OperatorResponse, command: AnsweredCommand) -> HoldResponse:
+    measured = None if command.acts is None else response.ticks(command) * response.tick_ms
+    longest_ms = response.paths[command.level].longest * response.tick_ms
+    return HoldResponse(command.level, command.fate, measured, longest_ms, command.wall_ms)
 
 
 def prediction(config: RackConfig, timing: RackTiming, layout: Layout) -> SystemPrediction:

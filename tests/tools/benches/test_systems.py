@@ -18,7 +18,7 @@ from tests.tools.command_line import rack
 
 PROMISED = SystemPrediction(("top", "low"), 2, 3, (50.0, 400.0), 20.0, 40.0, 22.5, 22.5, 40.0, {0: 0.5}, True)
 TIMES = {"min": 20.0, "p50": 22.5, "p99": 22.5, "p99_9": 22.5, "max": 22.5}
-HOLD = HoldResponse("top", 30.0, 42.5, 31.0, beyond=False)
+HOLD = HoldResponse("top", "acted on", 30.0, 42.5, 31.0)
 FOUND = SystemFigures("one", PROMISED, 8.0, 0.002, 0.0015, {0: 0.4}, TIMES, TIMES, TIMES, TIMES, HOLD, "")
 
 
@@ -85,6 +85,7 @@ def test_a_rack_is_compared_by_its_runs(jointed: Path, tmp_path: Path, monkeypat
     # What one board writes, the next reads in the next tick, or later.
     assert (one["command_age_ms"]["min"], one["status_age_ms"]["min"]) == (2.5, 2.5)
     assert one["hold"]["level"] == "path"
+    assert one["hold"]["fate"] == "acted on"
     assert one["hold"]["measured_ms"] >= 25.0
     assert [peer["who"] for peer in found["absent"]] == ["cyclictest"]
     assert all((pictures / f"systems.{kind}").stat().st_size > 1000 for kind in ("png", "svg"))
@@ -96,16 +97,17 @@ def test_a_config_with_mistakes_is_refused_before_any_rack_runs(jointed: Path, t
     assert "none.toml" in done.stderr
 
 
-def test_a_rack_fails_by_its_run_or_by_a_response_that_no_miss_explains() -> None:
-    beyond = replace(HOLD, beyond=True)
-    failed = replace(FOUND, failure="one: board lost: servo")
-    assert FOUND.worked
-    assert FOUND.held
-    assert replace(FOUND, hold=beyond).worked
-    assert not replace(FOUND, hold=beyond, missed=0.0).worked
-    assert not failed.worked
+def test_a_rack_fails_by_its_run_and_a_late_hold_is_named() -> None:
+    failed = replace(FOUND, failure="board lost: servo")
+    late = replace(FOUND, rack="late", hold=replace(HOLD, measured_ms=45.0))
+    overtaken = replace(FOUND, hold=replace(HOLD, fate="overtaken", measured_ms=None))
+    assert Systems((FOUND, late, overtaken), 1.0, None).worked
     assert not Systems((FOUND, failed), 1.0, None).worked
-    assert list(Systems((FOUND, failed), 1.0, None).lines())[-1] == "one: one: board lost: servo"
+    assert list(Systems((FOUND, failed), 1.0, None).lines())[-1] == "one: board lost: servo"
+    *_, last = Systems((FOUND, late), 1.0, None).lines()
+    assert last == "late: the response to the hold took longer than the longest on the grid"
+    assert any("overtaken" in line for line in Systems((overtaken,), 1.0, None).lines())
+    assert FOUND.held
     assert replace(FOUND, missed=0.02).verdict == "1.85 % missed beyond cyclictest"
 
 
