@@ -27,7 +27,7 @@ OPERATOR_HEAD_SIZE = LINE
 OPERATOR_ENTRIES = 128
 CLOCK = "clock"
 """The system controller, in slot 1: its window holds the fault table, the operator table and operators' mailboxes."""
-MAILBOX_HEAD_SIZE = LINE
+MAILBOX_HEAD_SIZE = 2 * LINE
 SLOT_HEAD_SIZE = 64
 ALARM_SIZE = LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
 """Bytes of one alarm ring: a line for its head, then the records."""
@@ -54,7 +54,7 @@ class AddressMap:
         self.faults = HEAD_SIZE
         self.operator = HEAD_SIZE + FAULT_ENTRIES * FAULT_ENTRY_SIZE
         address = self._place_clock(HEAD_SIZE, layout)
-        for board in dict.fromkeys(task.board for task in layout.tasks):
+        for board in dict.fromkeys(task.board for task in layout.processes):
             address = self._place_board(board, layout, address)
         self.size = address
 
@@ -66,7 +66,7 @@ class AddressMap:
 
     def _place_board(self, board: str, layout: Layout, start: int) -> int:
         address = start
-        tasks = [task for task in layout.tasks if task.board == board]
+        tasks = [task for task in layout.processes if task.board == board]
         for task in tasks:
             self.blocks[task.name] = address
             self.traces[task.name] = address + BLOCK_SIZE

@@ -101,7 +101,7 @@ class FaultTable:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._words = segment.words
-        self._tasks = {task.name: index for index, task in enumerate(segment.layout.tasks)} | {CLOCK: -1}
+        self._tasks = {task.name: index for index, task in enumerate(segment.layout.processes)} | {CLOCK: -1}
         self.entries = [FaultEntry(segment, index) for index in range(FAULT_ENTRIES)]
 
     @property

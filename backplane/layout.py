@@ -14,7 +14,8 @@ Sampled = Literal["time-slice", "double-buffer", "lock"]
 PROTOCOLS: tuple[Sampled, ...] = ("time-slice", "double-buffer", "lock")
 Protocol = Literal[Sampled, "queue"]
 
-Role = Literal["executor", "planner"]
+Role = Literal["executor", "planner", "host"]
+"""A "host" is a board of the host side: it has no rate, and the clock does not release it."""
 
 Wake = Literal["signal", "timer", "poll"]
 """How a task waits for its next cycle: see `rack.backplane.clock.wake`."""
@@ -91,20 +92,35 @@ class TaskSpec:
 
 @dataclass(frozen=True)
 class Layout:
-    """Everything on one backplane. `clock_ns` is the period of the system clock."""
+    """Everything on one backplane. `clock_ns` is the period of the system clock.
+
+    `tasks` are those that the clock releases, `hosts` the boards of the host side.
+    """
 
     rack: str
     clock_ns: int
     tasks: tuple[TaskSpec, ...]
     mailboxes: tuple[MailboxSpec, ...]
+    hosts: tuple[TaskSpec, ...] = ()
+
+    @property
+    def processes(self) -> tuple[TaskSpec, ...]:
+        """Everything that runs as a process of its own: tasks, then host boards."""
+        return self.tasks + self.hosts
+
+    @property
+    def timed(self) -> tuple[MailboxSpec, ...]:
+        """The mailboxes that tasks and clock write, at ticks."""
+        hosts = {host.name for host in self.hosts}
+        return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
 
     def mailbox(self, name: str) -> MailboxSpec:
         """Return the mailbox of that name. Raises `KeyError`."""
         return {m.name: m for m in self.mailboxes}[name]
 
     def task(self, name: str) -> TaskSpec:
-        """Return the task of that name. Raises `KeyError`."""
-        return {t.name: t for t in self.tasks}[name]
+        """Return the task, or the host board, of that name. Raises `KeyError`."""
+        return {t.name: t for t in self.processes}[name]
 
 
 def depth_for(span_ticks: int, every: int, least: int = 4) -> int:

@@ -25,7 +25,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 8
+VERSION = 10
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -246,5 +246,5 @@ def layout_of(entry: dict[str, Any]) -> Layout:
         )
         for m in entry["mailboxes"]
     ]
-    tasks = tuple(TaskSpec(**t) for t in entry["tasks"])
-    return Layout(**{**entry, "tasks": tasks, "mailboxes": tuple(boxes)})
+    tasks, hosts = (tuple(TaskSpec(**t) for t in entry[key]) for key in ("tasks", "hosts"))
+    return Layout(**{**entry, "tasks": tasks, "hosts": hosts, "mailboxes": tuple(boxes)})

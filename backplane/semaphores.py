@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import time
+from collections.abc import Sequence
 from functools import partial
 
 import posix_ipc
@@ -79,9 +80,9 @@ _OPEN: dict[str, Semaphore] = {}
 
 def names(layout: Layout) -> list[str]:
     """Return the POSIX names of every semaphore that a rack needs."""
-    wake = [_name(layout.rack, "wake", task.name) for task in layout.tasks]
+    wake = [_name(layout.rack, "wake", task.name) for task in layout.processes]
     locks = [_name(layout.rack, "lock", m.name) for m in layout.mailboxes if m.protocol == "lock"]
-    done = [_name(layout.rack, "done", task.name) for task in layout.tasks]
+    done = [_name(layout.rack, "done", task.name) for task in layout.processes]
     return [*wake, *done, *locks]
 
 
@@ -99,10 +100,12 @@ def open_all(layout: Layout) -> None:
         _OPEN[name] = Semaphore(name)
 
 
-def unlink(layout: Layout) -> None:
-    """Remove the names; processes keep the semaphores that they have open."""
+def unlink(layout: Layout, kept: Sequence[str] = ()) -> None:
+    """Remove the names; processes keep the semaphores that they have open. Those that wake `kept` keep theirs."""
+    wake = [_name(layout.rack, "wake", host) for host in kept]
     for name in names(layout):
-        _unlink(name)
+        if name not in wake:
+            _unlink(name)
 
 
 def unlink_all(rack: str) -> None:

@@ -117,6 +117,8 @@ class Box(IntEnum):
     OWNER = 4  # the same for the critical section of protocol lock; value: its owner's process id, 0: none
     CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
     REFUSED = 6  # of a queue: messages refused because it was full
+    SENT = 7  # of a queue: serial of the newest message of its own writer; HEAD is greater while another has published
+    TAKEN = 8  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
 
 
 class Slot(IntEnum):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rack.backplane.words import Demand
@@ -10,6 +10,10 @@ from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
 """What a port reads: a mailbox, or mailboxes by board."""
+
+
+Entries = Mapping[str, Sequence[tuple[int, bytes]]]
+"""What a bus adapter wrote in a recorded run, by port: ticks and messages, oldest first."""
 
 
 def mailboxes_of(source: Source) -> tuple[str, ...]:
@@ -33,7 +37,7 @@ class TaskWiring:
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
     task is one of the fastest and watches the clock. `sent`: the ports whose messages the level sends itself.
-    `fails_self_test`: a fault in the config.
+    `fails_self_test`: a fault in the config. `entries`: for a bus adapter in a replay.
     """
 
     task: str
@@ -45,7 +49,20 @@ class TaskWiring:
     guards_clock: bool = False
     sent: tuple[str, ...] = ()
     fails_self_test: bool = False
+    entries: Entries | None = None
     transfer: BusTimes = field(default_factory=BusTimes)
+
+
+@dataclass(frozen=True)
+class HostWiring:
+    """One host board: its program's class, and the mailbox of each port. External: a prompt runs it, not the rack."""
+
+    board: str
+    target: str
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]
+    context: LevelContext
+    is_external: bool = False
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
@@ -72,7 +72,7 @@ from rack.levels.operator import Commands, Operation
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 
 __all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
-__all__ += ["Ports", "Program", "Reading", "Verdict"]
+__all__ += ["MadePorts", "Ports", "Program", "Reading", "Verdict"]
 
 
 class Input(NamedTuple):
@@ -106,6 +106,14 @@ class Output(NamedTuple):
     def is_due(self, tick: int, every: int) -> bool:
         """Return whether the cycle released at `tick`, one of those every `every` ticks, writes it."""
         return (tick + every) % (self.cycles * every) == 0
+
+
+class MadePorts(NamedTuple):
+    """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some are unknown."""
+
+    inputs: Mapping[str, Input] = MappingProxyType({})
+    outputs: Mapping[str, Output] = MappingProxyType({})
+    is_whole: bool = True
 
 
 class Ports(SimpleNamespace):
@@ -216,6 +224,11 @@ class Executor(ABC):
         """Return the names that an operator may give with an operation; see `rack.levels.operator.NAMED`."""
         return cls.names(params)
 
+    @classmethod
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+        """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that classes declare."""
+        return MadePorts()
+
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""
 
@@ -227,7 +240,7 @@ class Executor(ABC):
         """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
 
     def room(self, port: str) -> int:
-        """Return how many messages to take from the queue that `port` reads, asked before each read. Default: all."""
+        """Return how many messages to take from each queue that `port` reads, asked before each read. Default: all."""
         return ALL
 
     def close(self) -> None:
@@ -259,7 +272,7 @@ class Planner(ABC):
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
 
     def room(self, port: str) -> int:
-        """Return how many messages to take from the queue that `port` reads, asked before each read. Default: all."""
+        """Return how many messages to take from each queue that `port` reads, asked before each read. Default: all."""
         return ALL
 
     def wanted(self, read: Ports, tick: int) -> bool:

@@ -37,8 +37,9 @@ def describe(name: str) -> dict[str, str | int | float]:
     state = Run(words[System.STATE]).name.lower() if alive else "dead"
     gone = "its launcher is gone: 'rack clean' removes it"
     by = f"launched {age_s:.0f} s ago by process {launcher}" if alive else gone
-    boards = len({task.board for task in segment.layout.tasks})
-    detail = f"{boards} boards, tick {words[System.TICK]}, {by}"
+    boards, hosts = len({task.board for task in segment.layout.tasks}), len(segment.layout.hosts)
+    side = f" and {hosts} on the host side" if hosts else ""
+    detail = f"{boards} boards{side}, tick {words[System.TICK]}, {by}"
     segment.close()
     return {"rack": name, "state": state, "detail": detail, "launcher": launcher, "age_s": round(age_s, 3)}
 

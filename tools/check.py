@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ import typer
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.config import load, shared_out
-from rack.boards.config.schema import CLOCK_SLOT, RackConfig
+from rack.boards.config.schema import CLOCK_SLOT, HostConfig, RackConfig
 from rack.boards.config.timing import with_budgets
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.rack import spanned
@@ -121,7 +121,8 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
     """Return the inventory of a config as plain data; addresses and sizes in bytes.
 
     Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox `delay_ms` the same;
-    `depth` is the number of a mailbox's slots, `size` the bytes of one message.
+    `depth` is the number of a mailbox's slots, `size` the bytes of one message, `capacity` the most unread ones in a
+    queue (0: no queue).
     """
     places, tick_ms = AddressMap(layout), layout.clock_ns * 1e-6
     tasks = [
@@ -145,6 +146,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
             "size": mailbox.size,
             "depth": mailbox.depth,
             "protocol": mailbox.protocol,
+            "capacity": mailbox.capacity,
             "writer": mailbox.writer,
             "readers": mailbox.readers,
             "delay_ms": mailbox.delay * tick_ms,
@@ -160,9 +162,36 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
         "segment_bytes": places.size,
         "windows": {window.board: window.address for window in places.windows},
         "tasks": tasks,
+        "hosts": [_host(name, host, layout) for name, host in config.host.items()],
         "mailboxes": mailboxes,
         "notes": notes,
     }
+
+
+def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:
+    return {
+        "board": name,
+        "program": host.program,
+        "external": host.external,
+        "writes": [mailbox.name for mailbox in layout.mailboxes if mailbox.writer == name],
+        "reads": [mailbox.name for mailbox in layout.mailboxes if name in mailbox.readers],
+    }
+
+
+def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[str]:
+    """Yield the boards of the host side: they have no rate, and the timing model leaves them out."""
+    if hosts:
+        rows = [
+            [
+                h["board"],
+                "rack prompt" if h["external"] else h["program"],
+                ", ".join(h["writes"]),
+                ", ".join(h["reads"]),
+            ]
+            for h in hosts
+        ]
+        yield ""
+        yield from table(["host side", "program", "writes", "reads"], rows, width, ("program",))
 
 
 def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator[str]:
@@ -184,17 +213,23 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     yield from table(head, [clock, *rows], width, ("trace at", "slice, ms"))
     rows = [
         [
-            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), m["protocol"]),
+            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), _protocol(m)),
             *(f"{m['delay_ms']:g}", f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}"),
         ]
         for m in found["mailboxes"]
     ]
+    yield from _host_lines(found["hosts"], width)
     head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
     yield ""
     yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))
     yield ""
     windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
     yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+
+
+def _protocol(mailbox: dict[str, Any]) -> str:
+    """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
+    return f"{mailbox['protocol']} of {mailbox['capacity']}" if mailbox["capacity"] else str(mailbox["protocol"])
 
 
 def _hex(address: int) -> str:

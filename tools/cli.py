@@ -34,6 +34,11 @@ COMMANDS = (
     ("clean", "rack.tools.clean:clean", "Remove the shared memory that killed racks left behind."),
     ("command", "rack.tools.command:command", "Command one level of a running rack."),
     ("step", "rack.tools.step:step", "Let a rack in lockstep go on by single cycles."),
+    (
+        "prompt",
+        "rack.tools.prompt:prompt",
+        "Open a Python prompt, or run a script, on the host side of a running rack.",
+    ),
     ("inject", "rack.tools.inject:app", "Inject a fault into a running rack."),
     ("estop", "rack.tools.estop:estop", "Engage the brakes of the arm at once, until --reset."),
     ("record", "rack.tools.record:record", "Record a running rack."),

@@ -35,6 +35,14 @@ Share = Annotated[
 Step = Annotated[
     bool, typer.Option("--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on")
 ]
+FromRun = Annotated[
+    Path | None,
+    typer.Option(
+        "--entries",
+        metavar="RUN",
+        help="start no host boards: what they sent in this recorded run enters again, at the same ticks",
+    ),
+]
 NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
 
 
@@ -47,6 +55,7 @@ def run(
     speed: Speed = None,
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
+    entries: FromRun = None,
     out: Out = None,
     no_record: NoRecord = False,
     view: View = False,
@@ -68,6 +77,7 @@ def run(
       rack run nasrem --faults bad-sensors --out runs/sensors
       rack run nasrem --set clock.speed=2 --view
       rack run nist-state-table --lockstep --step
+      rack run ibm --lockstep --entries runs/ibm-20250101-120000
     """
     if view and no_record:
         raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
@@ -81,6 +91,9 @@ def run(
     from rack.tools.runs.folder import folder_of
     from rack.tools.runs.launch import NO_TIME, run_rack
 
+    if entries is not None:
+        from rack.tools.runs.entries import recorded_entries
+
     found = validated(tables)
     if step and found.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
@@ -88,7 +101,10 @@ def run(
     # From the start of the run to the end of its report; during the launch a signal ends the command at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:
-            result = run_rack(found, seconds, folder, display, view=view, share=share, crate=crate, step=step)
+            again = None if entries is None else recorded_entries(found, entries)
+            result = run_rack(
+                found, seconds, folder, display, view=view, share=share, crate=crate, step=step, entries=again
+            )
         _report(found, folder, result, as_json)
     if not result.worked:
         # On stderr and last, where it is seen in any case.

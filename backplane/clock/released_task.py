@@ -38,7 +38,7 @@ class ReleasedTask:
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
         self.spec = spec
-        self.index = segment.layout.tasks.index(spec)
+        self.index = segment.layout.processes.index(spec)
         self.block = segment.block(spec.name)
         self.sleeps = spec.wake == "timer"
         self.is_posted = spec.wake != "poll"

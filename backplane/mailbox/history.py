@@ -3,7 +3,8 @@
 The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time. Each message carries
 the chain of its mailbox, so the digest is complete even if a recorder lost rows, and a restarted writer
 continues it. Messages that become visible after the last tick do not count: nothing reads them, and whether they are
-written before the run ends depends on timing.
+written before the run ends depends on timing. The mailboxes of host boards do not count either: they are not written
+at ticks.
 """
 
 from __future__ import annotations
@@ -66,9 +67,9 @@ def row_dtype(spec: MailboxSpec) -> np.dtype:
 
 
 def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
-    """Return serial and chain of every mailbox's newest message that was visible before tick `until`."""
+    """Return serial and chain of every timed mailbox's newest message that was visible before tick `until`."""
     found = {}
-    for spec in segment.layout.mailboxes:
+    for spec in segment.layout.timed:
         slots = Slots(segment, spec)
         serial = head = slots.box[Box.HEAD]
         oldest = max(0, head - slots.depth)

@@ -41,7 +41,7 @@ TAKEN = MessageType(
     ),
 )
 # Plain integers for the hot path.
-_HEAD, _REFUSED = int(Box.HEAD), int(Box.REFUSED)
+_HEAD, _REFUSED, _SENT = int(Box.HEAD), int(Box.REFUSED), int(Box.SENT)
 _EPOCH, _VISIBLE = int(Slot.EPOCH), int(Slot.VISIBLE_AT)
 _PUT_POSITION = Struct("@2q").pack_into
 ALL = 1 << 62
@@ -70,6 +70,8 @@ class QueueWriter(Writer):
         # Messages are published to a copy of the mailbox's head, then shown together.
         self._shared = slots.box
         slots.box = memoryview(bytearray(slots.box)).cast("q")
+        # A predecessor may have been killed just before this.
+        self._shared[_SENT] = self.serial
         self.message = _sending(slots, self._send, self.room)
         self.taken = 0
         self.refused = 0
@@ -128,8 +130,9 @@ class QueueWriter(Writer):
         slots.lose()
 
     def show(self) -> None:
-        """Show the reader everything published, by one store."""
-        self._shared[_HEAD] = self.serial
+        """Show everything published: by one store each, first to observers, then to the reader."""
+        self._shared[_HEAD] = serial = self.serial
+        self._shared[_SENT] = serial
 
 
 def _sending(slots: Slots, send: Callable[[], bool], room: Callable[[], int]) -> Message:
@@ -154,6 +157,7 @@ class QueueReader(Reader):
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
         self.taken = _last_position(segment, name)
+        self._farthest = self.spec.delay + self.spec.every
         # The value of a reading without a new message, until there is one.
         if self.taken and self._obtain(self.taken):
             self.transfers = 0
@@ -168,50 +172,59 @@ class QueueReader(Reader):
         The newest taken is the value, the others are in `earlier`. `now`: the clock's tick, as in `Writer.write`.
         """
         self.accesses += 1
-        head, count, earlier = self._box[0], 0, list[Message]()
-        while count < most and self._sees(self.taken + 1, head, tick):
-            last = bytes(self.message.raw) if count else b""
-            if self._obtain(self.taken + 1):
+        box, count, earlier = self._box, 0, list[Message]()
+        head, last = box[_HEAD], min(box[_SENT], self.taken + self._depth)
+        if head > last:
+            self._blame_intruder(head)
+        while count < most and self._sees(self.taken + 1, last, tick):
+            before = bytes(self.message.raw) if count else b""
+            if not self._obtain(self.taken + 1):
+                self._count_bad(self.taken + 1)
+            else:
                 if count:
-                    earlier.append(Message(self.slots.dtype, memoryview(bytearray(last))))
+                    earlier.append(Message(self.slots.dtype, memoryview(bytearray(before))))
                 count += 1
-            elif not self._skips(self.taken + 1, head):
-                break
             self.taken += 1
-        self._publish_position(head, tick, now)
+        self._publish_position(last, tick, now)
         if not count:
             return self._unchanged
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
 
-    def _sees(self, serial: int, head: int, tick: int) -> bool:
-        return serial <= head and self._heads[serial & self._mask][_VISIBLE] <= tick
+    def _sees(self, serial: int, last: int, tick: int) -> bool:
+        """Say whether a message may be read, or is not there to wait for; no good one is visible that far ahead."""
+        if serial > last:
+            return False
+        ahead = self._heads[serial & self._mask][_VISIBLE] - tick
+        return ahead <= 0 or (ahead > self._farthest and not self.slots.fetch(serial))
 
-    def _publish_position(self, head: int, tick: int, now: int | None) -> None:
+    def _publish_position(self, last: int, tick: int, now: int | None) -> None:
         newest = self.taken
-        while self._sees(newest + 1, head, tick):
+        while self._sees(newest + 1, last, tick):
             newest += 1
         position = self._position
         _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
         position.write(tick, now)
 
-    def _skips(self, serial: int, head: int) -> bool:
-        """Judge a message that is not good; return False if the true one may still come in its place."""
+    def _count_bad(self, serial: int) -> None:
+        """Count the fault of the message fetched last, which is not good."""
         slots, statistics = self.slots, self.statistics
         statistics.bad_reads += 1
-        # A second look: the true message may just be overwriting a forged one.
-        slots.copy(serial)
         if slots.serial != serial:
             statistics.lost += 1
         elif not slots.is_sound:
             statistics.corrupt += 1
-        elif slots.is_lawful(self._signature):
-            return False
         else:
-            statistics.forged += 1
-            statistics.forger = pid_of(slots.signature)
-            # Once the writer has sent more, it has not taken the place back.
-            return any(slots.fetch(later) and slots.is_lawful(self._signature) for later in range(serial + 1, head + 1))
-        return True
+            self._count_forged()
+
+    def _count_forged(self) -> None:
+        self.statistics.forged += 1
+        self.statistics.forger = pid_of(self.slots.signature)
+
+    def _blame_intruder(self, serial: int) -> None:
+        """Count a message that is not the writer's, and that its next one will replace: it is not taken."""
+        if self.slots.fetch(serial) and not self.slots.is_lawful(self._signature):
+            self.statistics.bad_reads += 1
+            self._count_forged()
 
     def close(self) -> None:
         """Release the claim."""

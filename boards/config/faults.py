@@ -62,7 +62,7 @@ def injection(fault: FaultConfig, config: RackConfig, layout: Layout) -> Injecti
 
 def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: Place) -> Injection:
     kind = KINDS[fault.kind]
-    names = [task.name for task in layout.tasks]
+    names = [process.name for process in layout.processes]
     return Injection(
         kind=kind.number,
         task=-1 if fault.board == CLOCK else names.index(fault.board),
@@ -114,7 +114,8 @@ class FaultRules:
         """Yield every mistake in the fault."""
         yield from self._once_each()
         fault = self.fault
-        tasks: dict[str, Role] = {place.name: place.role for place in self.config.tasks()}
+        places = (*self.config.tasks(), *self.config.hosts())
+        tasks: dict[str, Role] = {place.name: place.role for place in places}
         # The levels' modules may add kinds.
         driving = self._driving()
         kind = KINDS.names.get(fault.kind)
@@ -173,7 +174,11 @@ class FaultRules:
     def _target(self, kind: Kind, tasks: Mapping[str, Role], driving: Mapping[str, Steps]) -> Iterator[Mistake]:
         """Check that the task can be struck by such a fault."""
         board = self.fault.board
-        if board == CLOCK:
+        if board in self.config.host and self.config.host[board].external:
+            yield self._mistake(
+                "board", "external: the rack has no process to strike; permitted: boards that it starts"
+            )
+        elif board == CLOCK:
             if "clock" not in kind.tasks:
                 kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
                 yield self._mistake("board", f"{kind.name} cannot strike the clock; kinds that can: {kinds}")

@@ -14,13 +14,15 @@ from pydantic import ValidationError
 from rack.backplane.address_map import CLOCK, AddressMap
 from rack.backplane.errors import MailboxError
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
+from rack.backplane.mailbox.host_ring import SPARE
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
 from rack.boards.config.mistakes import mistakes_of
-from rack.boards.config.ports import TaskPorts, all_ports
+from rack.boards.config.ports import TaskPorts, all_ports, table_of
 from rack.boards.config.queues import queue_mistakes, queue_slots
 from rack.boards.config.schema import UNREAD, RackConfig, TaskPlace
+from rack.boards.config.sides import Sides, key_of
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
 from rack.levels.operator import OPERATOR_COMMAND
@@ -62,20 +64,25 @@ class Wiring:
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
         self.config = config
         self.mistakes: list[Mistake] = []
-        self.tasks = all_ports(config, self.mistakes)
-        found = {ports.task for ports in self.tasks}
+        self._ports = all_ports(config, self.mistakes)
+        self.tasks = [ports for ports in self._ports if ports.place.role != "host"]
+        self.hosts = [ports for ports in self._ports if ports.place.role == "host"]
+        self.sides = Sides(self._ports)
+        places = [*config.tasks(), *config.hosts()]
+        found = {ports.task for ports in self._ports if ports.is_whole}
         # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
-        self._unknown = {place.board for place in config.tasks() if place.name not in found}
-        self._unknown |= {place.removeprefix("board.") for place in broken}
+        self._unknown = {place.board for place in places if place.name not in found}
+        self._unknown |= {place.removeprefix("board.").removeprefix("host.") for place in broken}
         self.writers: dict[str, tuple[TaskPorts, Output]] = {}
-        for ports in self.tasks:
+        for ports in self._ports:
             self._add_writer(ports)
         self.operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
         self._check_operated()
-        for ports in self.tasks:
+        for ports in self._ports:
             self._check_reads(ports)
         self._check_rest()
-        self.mistakes += queue_mistakes(self)
+        crossing = list(self.sides.mistakes(self._unknown))
+        self.mistakes += crossing or queue_mistakes(self)
         self._check_params()
         if not broken & {"robot", "scene", "task"}:
             self._check_programs()
@@ -103,13 +110,12 @@ class Wiring:
                 self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", given, why))
 
     def _check_reads(self, ports: TaskPorts) -> None:
-        key = "reads" if ports.place.role == "executor" else "planner_reads"
         for port, mailbox in ports.sources:
-            place, wanted = f"board.{ports.place.board}.{key}.{port}", ports.inputs[port].type
+            place, wanted = f"{table_of(ports.place)}.{key_of(ports)}.{port}", ports.inputs[port].type
             if not self.is_known(mailbox):
                 why = f"no task writes it; mailboxes: {self.names()}"
                 self.mistakes.append(Mistake(place, mailbox, why))
-            elif (found := self._kind(mailbox)) is not None and found != wanted:
+            elif ports.is_whole and (found := self._kind(mailbox)) is not None and found != wanted:
                 why = f"carries {found.name} {found.version}; the port needs {wanted.name} {wanted.version}"
                 self.mistakes.append(Mistake(place, mailbox, why))
 
@@ -124,17 +130,18 @@ class Wiring:
 
     def _check_params(self) -> None:
         """Check each board's parameters against the declarations of its executor's and planner's classes."""
-        kinds = [(ports.place.board, ports.kind.params) for ports in self.tasks if ports.kind.params is not None]
-        for board, kind in dict.fromkeys(kinds):
-            params = self.config.board[board].params
+        kinds = [(table_of(ports.place), ports.kind.params) for ports in self._ports if ports.kind.params is not None]
+        for table, kind in dict.fromkeys(kinds):
+            tables, _, board = table.partition(".")
+            params = getattr(self.config, tables)[board].params
             try:
                 kind.model_validate(params)
             except ValidationError as error:
-                self.mistakes += mistakes_of(error, kind, params, f"board.{board}.params")
+                self.mistakes += mistakes_of(error, kind, params, f"{table}.params")
 
     def _check_programs(self) -> None:
         """Check `[task]` against the programs declared by the levels' classes."""
-        for kind in dict.fromkeys(ports.kind.program for ports in self.tasks if ports.kind.program is not None):
+        for kind in dict.fromkeys(ports.kind.program for ports in self._ports if ports.kind.program is not None):
             try:
                 program = kind.model_validate(self.config.task)
             except ValidationError as error:
@@ -172,9 +179,13 @@ class Wiring:
     def layout(self, sizes: Mapping[str, int]) -> Layout:
         """Return the layout of a config without mistakes."""
         tasks = tuple(self._task(ports) for ports in self.tasks)
-        by_name = {task.name: task for task in tasks}
+        hosts = tuple(_host(ports.place) for ports in self.hosts)
+        by_name = {task.name: task for task in tasks + hosts}
         mailboxes: list[MailboxSpec] = []
         for name, (ports, output) in self.writers.items():
+            if name in self.sides.from_host:
+                mailboxes.append(self._ring(name, ports.task, output.type, sizes))
+                continue
             writer = by_name[ports.task]
             every = writer.every * output.cycles
             delay = writer.every * writer.within_cycles
@@ -189,7 +200,15 @@ class Wiring:
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
         mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self.operated.items()]
-        return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes))
+        return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes), hosts)
+
+    def _ring(self, name: str, host: str, kind: MessageType, sizes: Mapping[str, int]) -> MailboxSpec:
+        """Return the mailbox of a host board: a queue that is not by ticks."""
+        capacity = self.config.protocol.depth.get(name, UNREAD)
+        depth = depth_for(capacity + SPARE, 1)
+        return self._mailbox(
+            name, kind, sizes, partial(MailboxSpec, writer=host, every=1, delay=0, capacity=capacity, depth=depth)
+        )
 
     def _queue(self, box: MailboxSpec, reader: TaskSpec, writer: TaskSpec) -> Iterator[MailboxSpec]:
         """Yield a queue with its size, and the mailbox in which its reader writes its position for the writer."""
@@ -242,16 +261,24 @@ class Wiring:
         )
 
     def readers(self, mailbox: str) -> tuple[str, ...]:
-        """Return the tasks that read a mailbox."""
-        return tuple(ports.task for ports in self.tasks if any(mailbox == box for _, box in ports.sources))
+        """Return the tasks and host boards that read a mailbox."""
+        return tuple(ports.task for ports in self._ports if any(mailbox == box for _, box in ports.sources))
 
     def protocol(self, mailbox: str) -> Protocol:
         """Return the protocol of a mailbox."""
-        if mailbox in self.writers and self.writers[mailbox][1].queued:
+        if mailbox in self.sides.to_host:
+            # Host boards read the newest message at once, whatever the protocol.
+            return "time-slice"
+        if mailbox in self.sides.from_host or (mailbox in self.writers and self.writers[mailbox][1].queued):
             return "queue"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
         # A lock would make the clock wait for readers.
         return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
+
+
+def _host(place: TaskPlace) -> TaskSpec:
+    """Return the record of a host board: it has no rate, and leaves no trace."""
+    return TaskSpec(place.name, place.board, place.role, place.slot, place.core, 0, 1, 1, 0)
 
 
 def too_large(layout: Layout) -> Iterable[Mistake]:

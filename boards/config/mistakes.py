@@ -20,11 +20,12 @@ from pydantic_core import ErrorDetails
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import ClockError
 from rack.boards.config.files import file_at
-from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, RackConfig
+from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, HostConfig, RackConfig
 from rack.boards.errors import Mistake
 
 RESERVED = (CLOCK, "above", "below", "own")
 """Names with a special meaning in the wiring of ports."""
+PERMITTED = f"permitted: a-z, 0-9 and _, at most 31, except {', '.join(RESERVED)}"
 PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 PLANNER_TRANSFER = ("exchange_ms", "update_ms")
 BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
@@ -115,6 +116,7 @@ def disagreements(config: RackConfig, broken: frozenset[str] = frozenset()) -> l
     known = [*config.board, *(place.removeprefix("board.") for place in broken if place.startswith("board."))]
     found = [
         *(mistake for name, board in boards for mistake in _board(name, board, known)),
+        *(mistake for name, host in config.host.items() for mistake in _host(name, host, known)),
         *_circles(config),
         *_slots(config),
         *_ends(config),
@@ -129,8 +131,7 @@ def disagreements(config: RackConfig, broken: frozenset[str] = frozenset()) -> l
 def _board(name: str, board: BoardConfig, known: list[str]) -> Iterator[Mistake]:
     place = f"board.{name}"
     if not BOARD_NAME.fullmatch(name) or name in RESERVED:
-        why = f"invalid name for a board; permitted: a-z, 0-9 and _, at most 31, except {', '.join(RESERVED)}"
-        yield Mistake(place, None, why)
+        yield Mistake(place, None, f"invalid name for a board; {PERMITTED}")
     others = ", ".join(other for other in known if other != name) or "none"
     for key, neighbours in (("above", board.above), ("below", board.below)):
         for other in neighbours:
@@ -138,6 +139,18 @@ def _board(name: str, board: BoardConfig, known: list[str]) -> Iterator[Mistake]
                 yield Mistake(f"{place}.{key}", other, f"no other board has this name; boards: {others}")
         yield from _repeated(f"{place}.{key}", neighbours)
     yield from _planner(place, board)
+
+
+def _host(name: str, host: HostConfig, boards: list[str]) -> Iterator[Mistake]:
+    place = f"host.{name}"
+    if not BOARD_NAME.fullmatch(name) or name in RESERVED:
+        yield Mistake(place, None, f"invalid name for a board; {PERMITTED}")
+    if name in boards:
+        yield Mistake(place, None, f"board.{name} has this name already")
+    for other in host.below:
+        if other not in boards:
+            yield Mistake(f"{place}.below", other, f"no board has this name; boards: {', '.join(boards)}")
+    yield from _repeated(f"{place}.below", host.below)
 
 
 def _circles(config: RackConfig) -> Iterator[Mistake]:

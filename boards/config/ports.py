@@ -7,31 +7,33 @@ connect a port to another mailbox.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rack.backplane.layout import Role
 from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
-from rack.boards.config.schema import RackConfig, TaskPlace
+from rack.boards.config.schema import RackConfig, Sources, TaskPlace
 from rack.boards.errors import Mistake
 from rack.boards.wiring import Source, mailboxes_of
+from rack.levels.host_program import HostProgram
 from rack.levels.level import Executor, Input, Output, Planner
 
 
 @dataclass(frozen=True)
 class TaskPorts:
-    """A task's class, and the mailbox of each port.
+    """The class of a task or host board, and the mailbox of each port.
 
     `reads` holds a mailbox by port or, for a port that reads many, a dict of mailboxes by board; `writes` a mailbox by
-    port, `inputs` and `outputs` the declarations of the ports.
+    port, `inputs` and `outputs` the declarations of the ports; not `is_whole` if mistakes keep some unknown.
     """
 
     place: TaskPlace
-    kind: type[Executor] | type[Planner]
+    kind: type[Executor] | type[Planner] | type[HostProgram]
     inputs: Mapping[str, Input]
     outputs: Mapping[str, Output]
     reads: Mapping[str, Source]
     writes: Mapping[str, str]
+    is_whole: bool = True
 
     @property
     def task(self) -> str:
@@ -49,13 +51,33 @@ class TaskPorts:
 
 
 def all_ports(config: RackConfig, mistakes: list[Mistake]) -> list[TaskPorts]:
-    """Return the ports of every task whose class is found; add all mistakes to `mistakes`."""
-    wired = [_wired(config, place, mistakes) for place in config.tasks()]
-    return [ports for ports in wired if ports is not None]
+    """Return the ports of every task and host board whose class is found; add all mistakes to `mistakes`."""
+    wired = [_wired(config, place, mistakes) for place in (*config.tasks(), *config.hosts())]
+    found = [ports for ports in wired if ports is not None]
+    types = {box: ports.outputs[port].type for ports in found for port, box in ports.writes.items()}
+    return [_with_made_ports(config, ports, types) for ports in found]
+
+
+def _with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]) -> TaskPorts:
+    """Add the ports that the config makes: their types may be those of other mailboxes."""
+    if not issubclass(ports.kind, Executor):
+        return ports
+    board = ports.place.board
+    made = ports.kind.made_ports(config.board[board].params, types)
+    return replace(
+        ports,
+        inputs={**ports.inputs, **made.inputs},
+        outputs={**ports.outputs, **made.outputs},
+        reads={**ports.reads, **{port: entry.source for port, entry in made.inputs.items()}},
+        writes={**ports.writes, **{port: f"{board}.{port}" for port in made.outputs}},
+        is_whole=made.is_whole,
+    )
 
 
 def reference(config: RackConfig, place: TaskPlace) -> str:
-    """Return the class that the config names for a task, as "package.module:Class"."""
+    """Return the class that the config names for a task or host board, as "package.module:Class"."""
+    if place.role == "host":
+        return config.host[place.board].program
     board = config.board[place.board]
     return board.executor if place.role == "executor" else board.planner or ""
 
@@ -65,7 +87,8 @@ def _wired(config: RackConfig, place: TaskPlace, mistakes: list[Mistake]) -> Tas
     try:
         kind, outputs = _class(wanted, place.role)
     except LookupError as error:
-        mistakes.append(Mistake(f"board.{place.board}.{place.role}", wanted, str(error.args[0])))
+        key = "program" if place.role == "host" else place.role
+        mistakes.append(Mistake(f"{table_of(place)}.{key}", wanted, str(error.args[0])))
         return None
     for port, entry in outputs.items():
         if entry.rests_on and entry.rests_on not in kind.inputs:
@@ -81,7 +104,17 @@ def _wired(config: RackConfig, place: TaskPlace, mistakes: list[Mistake]) -> Tas
     )
 
 
-def _class(wanted: str, role: Role) -> tuple[type[Executor] | type[Planner], Mapping[str, Output]]:
+def table_of(place: TaskPlace) -> str:
+    """Return the table of a task's board, or of a host board, as in "board.servo"."""
+    return f"{'host' if place.role == 'host' else 'board'}.{place.board}"
+
+
+def _class(wanted: str, role: Role) -> tuple[type[Executor] | type[Planner] | type[HostProgram], Mapping[str, Output]]:
+    if role == "host":
+        program = find_class(wanted, HostProgram)
+        if many := [port for port, entry in program.inputs.items() if entry.many]:
+            raise LookupError(f"port '{many[0]}' reads many mailboxes; permitted on the host side: one")
+        return program, {port: Output(kind) for port, kind in program.outputs.items()}
     if role == "executor":
         executor = find_class(wanted, Executor)
         given = executor.outputs.items()
@@ -96,12 +129,12 @@ def _sources(
     config: RackConfig, place: TaskPlace, inputs: Mapping[str, Input], mistakes: list[Mistake]
 ) -> Iterator[tuple[str, Source]]:
     """Yield port and mailbox, or mailboxes by board, for every port that has one."""
-    name, role, table = place.board, place.role, config.board[place.board]
-    key, wired = ("reads", table.reads) if role == "executor" else ("planner_reads", table.planner_reads)
-    neighbours = {"own": (name,), "above": table.above, "below": table.below}
+    name, role = place.board, place.role
+    key, wired, above, below = _own_wiring(config, place)
+    neighbours = {"own": (name,), "above": above, "below": below}
     for port in [p for p in wired if p not in inputs]:
         why = f"the {role} has no such port; ports: {', '.join(inputs) or 'none'}"
-        mistakes.append(Mistake(f"board.{name}.{key}.{port}", list(wired[port]), why))
+        mistakes.append(Mistake(f"{table_of(place)}.{key}.{port}", list(wired[port]), why))
     for port, entry in inputs.items():
         start, _, rest = entry.source.partition(".")
         boards = neighbours.get(start, (start,))
@@ -110,10 +143,22 @@ def _sources(
         if not found and entry.many and entry.optional:
             yield port, {}
         elif not found:
-            mistakes.append(Mistake(f"board.{name}.{start}", None, f"missing; port '{port}' of the {role} needs it"))
+            why = f"missing; port '{port}' of the {role} needs it"
+            mistakes.append(Mistake(f"{table_of(place)}.{start}", None, why))
         elif not entry.many and len(found) > 1:
             why = f"port '{port}' of the {role} reads one mailbox, not {len(found)}"
-            mistakes.append(Mistake(f"board.{name}.{at}", given, why))
+            mistakes.append(Mistake(f"{table_of(place)}.{at}", given, why))
         elif port in wired or start not in ("above", "below") or {*boards} <= config.board.keys() - {name}:
             # A neighbour that does not exist is reported by the rules.
             yield port, {box.partition(".")[0]: box for box in found} if entry.many else found[0]
+
+
+def _own_wiring(config: RackConfig, place: TaskPlace) -> tuple[str, Mapping[str, Sources], Sources, Sources]:
+    """Return the key under which a config rewires ports, what it holds, and the boards above and below."""
+    if place.role == "host":
+        host = config.host[place.board]
+        return "reads", host.reads, (), host.below
+    board = config.board[place.board]
+    if place.role == "executor":
+        return "reads", board.reads, board.above, board.below
+    return "planner_reads", board.planner_reads, board.above, board.below

@@ -5,11 +5,11 @@ The two are separate so that at launch the crate imports the levels while this p
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 
@@ -32,7 +32,7 @@ from rack.boards.config.toml import Tables, parse
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
-from rack.boards.wiring import BusTimes, ClockWiring, TaskWiring
+from rack.boards.wiring import BusTimes, ClockWiring, Entries, HostWiring, TaskWiring, mailboxes_of
 from rack.levels.level import Executor, LevelContext, Pace
 from rack.levels.tables import RobotConfig, Table
 
@@ -91,8 +91,14 @@ class Resolved:
     config: RackConfig
     layout: Layout
     tasks: tuple[TaskWiring, ...]
+    hosts: tuple[HostWiring, ...]
     faults: tuple[Injection, ...]
     commands: tuple[Request, ...]
+
+    def with_entries(self, entries: Mapping[str, Entries]) -> Resolved:
+        """Return the rack for a replay: no host boards, but what each bus adapter wrote in the recorded run."""
+        tasks = tuple(replace(task, entries=entries.get(task.task)) for task in self.tasks)
+        return replace(self, tasks=tasks, hosts=())
 
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task ends."""
@@ -144,9 +150,13 @@ class Resolved:
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:
-        """Return notes for the launch to report: cores replaced, real-time priorities refused."""
-        refused = self._refused(segment)
-        return shared_out(self.config) + ([f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else [])
+        """Return notes for the launch to report: cores replaced, real-time priorities refused, no repeatable run."""
+        refused, live = self._refused(segment), ", ".join(host.board for host in self.hosts)
+        found = shared_out(self.config)
+        found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
+        if live and self.config.clock.mode == "lockstep":
+            found.append(f"what {live} sends enters at ticks that depend on its timing; --entries RUN repeats a run")
+        return found
 
     def check_realtime(self, segment: Segment) -> None:
         """Raise `LaunchError` if a real-time priority was refused and the config requires it."""
@@ -205,17 +215,33 @@ class _Examined:
         faults = injections(config, layout)
         failing = {layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"}
         tasks = tuple(self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks)
-        return Resolved(config, layout, tasks, faults, requests(config, layout))
+        hosts = tuple(self._host(ports) for ports in self._wiring.hosts)
+        return Resolved(config, layout, tasks, hosts, faults, requests(config, layout))
+
+    def _host(self, ports: TaskPorts) -> HostWiring:
+        config, name = self._config, ports.place.board
+        return HostWiring(
+            board=name,
+            target=reference(config, ports.place),
+            inputs=dict(ports.sources),
+            outputs=dict(ports.writes),
+            context=self._context_of(name, 1, config.host[name].params),
+            is_external=config.host[name].external,
+        )
 
     def _task(self, layout: Layout, ports: TaskPorts, fails_self_test: bool) -> TaskWiring:
         board, spec = self._config.board[ports.place.board], layout.task(ports.task)
         is_executor = spec.role == "executor"
+        # What is on the host side, a bus adapter exchanges by itself.
+        of_host, from_host = self._wiring.sides.of_host, self._wiring.sides.from_host
         critical = not is_executor and is_critical(self._config, layout, spec.board)
         return TaskWiring(
             task=ports.task,
             target=reference(self._config, ports.place),
-            inputs=dict(ports.reads),
-            outputs=dict(ports.writes),
+            inputs={
+                port: source for port, source in ports.reads.items() if not from_host.intersection(mailboxes_of(source))
+            },
+            outputs={port: box for port, box in ports.writes.items() if box not in of_host},
             context=self._context(spec.board),
             critical_priority=board.priority if critical else 0,
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
@@ -227,10 +253,20 @@ class _Examined:
     def _context(self, name: str) -> LevelContext:
         config, board = self._config, self._config.board[name]
         paces = {name: Pace(config.every(name), other.within_cycles) for name, other in config.board.items()}
+        return replace(
+            self._context_of(name, config.every(name), board.params),
+            within_cycles=board.within_cycles,
+            above={other: paces[other] for other in board.above},
+            below={other: paces[other] for other in board.below},
+        )
+
+    def _context_of(self, name: str, every: int, params: Mapping[str, Any]) -> LevelContext:
+        """Return the context of a board without neighbours."""
+        config = self._config
         return LevelContext(
             board=name,
-            every=config.every(name),
-            within_cycles=board.within_cycles,
+            every=every,
+            within_cycles=1,
             clock_ns=config.clock_ns,
             seed=config.seed,
             # In a rack without an arm no level uses it.
@@ -238,9 +274,7 @@ class _Examined:
             scene=config.scene,
             task=config.task,
             sizes=self._sizes,
-            above={other: paces[other] for other in board.above},
-            below={other: paces[other] for other in board.below},
-            params=board.params,
+            params=params,
         )
 
 
@@ -268,17 +302,18 @@ def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]
 
 
 def _broken(error: ValidationError) -> frozenset[str]:
-    """Return the tables with mistakes, as "robot" or "board.servo"."""
+    """Return the tables with mistakes, as "robot", "board.servo" or "host.program"."""
     places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
-    return frozenset(".".join(keys[:2] if keys[0] == "board" else keys[:1]) for keys in places)
+    return frozenset(".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places)
 
 
 def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
     """Return a config made of the tables without mistakes."""
     kept = {key: value for key, value in tables.items() if key in RackConfig.model_fields and key not in broken}
     boards = {name: table for name, table in kept.get("board", {}).items() if f"board.{name}" not in broken}
+    hosts = {name: table for name, table in kept.get("host", {}).items() if f"host.{name}" not in broken}
     # Stand-ins for required tables; nothing that depends on a broken table is checked.
     spare = {"name": "unnamed", "clock": {"period_ms": 1}}
     none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
-    config = RackConfig.model_validate({**spare, **kept, "board": boards or none})
+    config = RackConfig.model_validate({**spare, **kept, "board": boards or none, "host": hosts})
     return config if boards else config.model_copy(update={"board": {}})

@@ -24,6 +24,9 @@ from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneCo
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
 LAST_SLOT = 21
+OUTSIDE = 0
+"""Stands for the slot of a host board, which has none."""
+ANY_CORE = -1
 
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
@@ -129,7 +132,9 @@ class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
     default: Sampled = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
-    mailbox: dict[MailboxName, Protocol] = Field({}, description="protocol by mailbox")
+    mailbox: dict[MailboxName, Protocol] = Field(
+        {}, description="protocol by mailbox; queue: its one reader gets every message, in order"
+    )
     depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
         {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
     )
@@ -188,6 +193,18 @@ class BoardConfig(Table):
         description="while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then brakes; "
         "brake: the arm brakes at once",
     )
+
+
+class HostConfig(Table):
+    """`[host.<name>]`: one board of the host side, without slot, rate and priority: see `rack.levels.host_program`."""
+
+    program: ClassName = Field(description="class of the program, package.module:Class")
+    external: bool = Field(False, description="the rack does not start it: it is run by 'rack prompt'")
+    below: Neighbours = Field((), description="bus adapter through which it reaches the levels; or a list")
+    reads: dict[str, Sources] = Field({}, description="mailbox by port; overrides the program's own")
+    params: dict[str, Any] = Field({}, description="parameters of the program, declared by its class")
+    restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board")
+    restarts_within_s: Positive | None = Field(None, description="overrides supervision.within_s for this board, s")
 
 
 class CommandConfig(Table):
@@ -261,6 +278,7 @@ class RackConfig(Table):
     scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
     task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")
     board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
+    host: dict[str, HostConfig] = Field({}, description="boards of the host side by name, without real time")
     supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of lost boards")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
     command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at its tick")
@@ -291,6 +309,11 @@ class RackConfig(Table):
                 slot = board.slot if board.planner_slot is None else board.planner_slot
                 core = board.core if board.planner_core is None else board.planner_core
                 yield TaskPlace(f"{name}.planner", name, "planner", slot, core, board.planner_priority)
+
+    def hosts(self) -> Iterator[TaskPlace]:
+        """Yield every board of the host side, outside the crate: it has no slot, and runs on any core."""
+        for name in self.host:
+            yield TaskPlace(name, name, "host", OUTSIDE, ANY_CORE, 0)
 
     def text(self) -> str:
         """Return the config as self-contained TOML that loads to the same config."""

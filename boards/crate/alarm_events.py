@@ -180,7 +180,7 @@ class AlarmEvents:
         return f", for {self._span(entry[Entry.TICKS])}" if entry[Entry.TICKS] else ""
 
     def _task(self, number: int, other: str) -> str:
-        return self._layout.tasks[number].name if number >= 0 else other
+        return self._layout.processes[number].name if number >= 0 else other
 
     def _span(self, ticks: float) -> str:
         return f"{counting(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"

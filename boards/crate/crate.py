@@ -42,8 +42,9 @@ from rack.boards.crate.requests import (
 )
 from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import hog
+from rack.boards.host.board import run_host_board
 from rack.boards.run.board import enter, run_clock_board, run_task_board
-from rack.boards.wiring import ClockWiring, TaskWiring
+from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
 
@@ -92,6 +93,8 @@ class Crate:
                 self._fork(name, lambda segment: run_task_board(segment, task, self._attention))
             case PowerOn(name, ClockWiring() as clock):
                 self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
+            case PowerOn(name, HostWiring() as host):
+                self._fork(name, lambda segment: run_host_board(segment, host, self._attention))
             case PowerOn(name, HogWiring(entry)):
                 self._fork(name, lambda segment: hog(segment, entry))
             case PowerOff(name):
@@ -146,6 +149,10 @@ class Crate:
         tick = self._mark_lost(name)
         self._poll.unregister(pidfd)
         os.close(pidfd)
+        if self._is_host(name):
+            # Whatever it has started: a host board leads a process group, which lasts until its leader is reaped.
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(pid, signal.SIGKILL)
         _, status = os.waitpid(pid, 0)
         with suppress(OSError):
             self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
@@ -157,14 +164,23 @@ class Crate:
         tick = words[System.TICK]
         if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
             block = self._segment.block(name)
+            if self._is_host(name) and block[Block.STATE] == TaskState.ENDED:
+                # Its program is done; a task ends with the run alone.
+                block[Block.PID] = 0
+                return tick
             if block[Block.STATE] != TaskState.FAILED:
                 block[Block.STATE] = TaskState.ABSENT
             block[Block.LOST] = block[Block.LOST] or tick + 1
-            UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
+            if not self._is_host(name):
+                UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
             words[System.LOSSES] += 1
             # In lockstep the clock waits for this.
             semaphores.done_semaphore(self._segment.rack, name).release()
         return tick
+
+    def _is_host(self, name: str) -> bool:
+        assert self._segment is not None, "boards are forked after the segment is open"
+        return any(host.name == name for host in self._segment.layout.hosts)
 
     def _kill(self, board: str | None = None) -> None:
         for pidfd, (name, _) in self._boards.items():
@@ -176,6 +192,10 @@ class Crate:
         self._poll.unregister(self._line)
         self._poll.unregister(self._launcher)
         deadline = time.monotonic() + LEAVE_S
+        for pidfd, (name, _) in self._boards.items():
+            if self._is_host(name):
+                # It may block for ever: only a signal gets it out of that.
+                signal.pidfd_send_signal(pidfd, signal.SIGTERM)
         while self._boards and (left := deadline - time.monotonic()) > 0:
             self._reap_ended(int(left * 1000) + 1)
         self._kill()

@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -29,6 +29,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
+from rack.boards.crate.hosts import HostBoards
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.patience import Patience, await_opened
@@ -46,6 +47,7 @@ from rack.boards.crate.requests import (
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.events import Cause, Ending, Event, Journal, Outcome
 from rack.boards.faults.kind import KINDS
+from rack.boards.wiring import Entries
 
 LAUNCH_S = 60.0
 """Time limit of each step of the launch: to preload one class, which may compile code, or to ready all boards."""
@@ -61,7 +63,8 @@ class Rack:
     """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
 
     `on_event` is called with every `Event`, in the caller's process. Without `share`, a launch is refused if another
-    rack's real-time boards occupy a core that this one requests. A `crate` that was started earlier saves time.
+    rack's real-time boards occupy a core that this one requests. A `crate` that was started earlier saves time. With
+    `entries`, by bus adapter and port, host boards are not started: what a recorded run wrote there enters instead.
     """
 
     def __init__(
@@ -70,8 +73,10 @@ class Rack:
         on_event: Callable[[Event], None] | None = None,
         share: bool = True,
         crate: CrateLine | None = None,
+        entries: Mapping[str, Entries] | None = None,
     ) -> None:
         self.config = config
+        self._entries = entries
         self._share = share
         self.segment: Segment
         self.outcome: Outcome | None = None
@@ -123,7 +128,8 @@ class Rack:
         self._crate = crate = self._crate or CrateLine()
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
         crate.send(Preload(classes(self.config), tuple(sys.path), _cell(self.config)))
-        self._plan = plan = resolve(self.config)
+        plan = resolve(self.config)
+        self._plan = plan = plan if self._entries is None else plan.with_entries(self._entries)
         remove_dead(self.config.name)
         self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
         self._set_words()
@@ -132,7 +138,7 @@ class Rack:
         self._journal.add("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
         await_opened(crate, self._journal, LAUNCH_S)
         # The crate has them open and every board inherits them. Without names nothing can be left behind.
-        semaphores.unlink(plan.layout)
+        semaphores.unlink(plan.layout, kept=[host.board for host in plan.hosts if host.is_external])
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
         self._await_ready()
@@ -176,10 +182,12 @@ class Rack:
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
         supervision = Supervision(self.config, self._plan.layout)
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
+        self._hosts = HostBoards(self.segment, self._plan.hosts, supervision, self._line, self._journal)
         self._alarms = AlarmWatch(self.segment, self.config)
         self._heartbeat = Heartbeat(self.segment)
         self._reset_latch()
         self._line.ask(PowerOn(CLOCK, clock))
+        self._hosts.start()
         self._journal.add("start", CLOCK, self.config.clock.mode)
 
     def _reset_latch(self) -> None:
@@ -210,6 +218,7 @@ class Rack:
                 self._journal.add("detection", "rack", f"'{board}' is not responding", "hang", subject=board)
                 self._recovery.end_hanging(board)
             self._recovery.advance()
+            self._hosts.look()
             if not self._is_armed:
                 self._reset_latch()
             is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
@@ -277,6 +286,10 @@ class Rack:
 
     def _lose(self, end: Ended) -> None:
         """Record the end of a board, and restart it or give it up."""
+        if hasattr(self, "_hosts") and end.name in self._hosts:
+            if not self._hosts.lose(end, _status(end.status)):
+                self._faults.append(f"host board '{end.name}' ended: {_status(end.status)}; no restarts left")
+            return
         text = f"board '{end.name}' ended: {_status(end.status)}"
         self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
         if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
@@ -287,8 +300,7 @@ class Rack:
             self._is_beyond_help = end.name == CLOCK
             self._give_up(end.name, f"{text}; no restarts left")
         else:
-            nth = f"restart {restart.number} of at most {restart.most} in {restart.within_s:g} s"
-            self._journal.add("reaction", end.name, nth, "restart")
+            self._journal.add("reaction", end.name, str(restart), "restart")
 
     def _give_up(self, board: str, text: str) -> None:
         self._faults.append(text)

@@ -23,6 +23,9 @@ class Restart(NamedTuple):
     most: int
     within_s: float
 
+    def __str__(self) -> str:
+        return f"restart {self.number} of at most {self.most} in {self.within_s:g} s"
+
 
 class Supervision:
     """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have the same outcome."""
@@ -59,7 +62,8 @@ class Supervision:
         common = self._config.supervision
         if task == CLOCK:
             return common.restarts, common.within_s
-        board = self._config.board[self._layout.task(task).board]
+        spec, config = self._layout.task(task), self._config
+        board = config.host[task] if spec.role == "host" else config.board[spec.board]
         most = common.restarts if board.restarts is None else board.restarts
         return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rack.boards.wiring import ClockWiring, TaskWiring
+    from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
     from rack.levels.tables import RobotConfig, SceneConfig
 
 
@@ -54,10 +54,10 @@ class HogWiring:
 
 @dataclass(frozen=True)
 class PowerOn:
-    """Fork one board: a task, the clock, or a hog, which occupies a board's core."""
+    """Fork one board: a task, the clock, a host board, or a hog, which occupies a board's core."""
 
     name: str
-    wiring: TaskWiring | ClockWiring | HogWiring
+    wiring: TaskWiring | ClockWiring | HostWiring | HogWiring
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class BoundCase:
     @cached_property
     def board(self) -> str:
         """The task that the fault strikes; "clock" for the clock."""
-        return CLOCK if self.injection.task < 0 else self.layout.tasks[self.injection.task].name
+        return CLOCK if self.injection.task < 0 else self.layout.processes[self.injection.task].name
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
@@ -63,6 +63,11 @@ class BoundCase:
     def is_planner(self) -> bool:
         """Whether it strikes a planner, which writes at no fixed period."""
         return self.board != CLOCK and self.layout.task(self.board).role == "planner"
+
+    @property
+    def is_host(self) -> bool:
+        """Whether it strikes a host board, which has no cycle."""
+        return self.board != CLOCK and self.layout.task(self.board).role == "host"
 
     @property
     def cycle(self) -> int:
@@ -112,8 +117,9 @@ class Bound:
 
 
 def cycles(count: int) -> Bound:
-    """Return a bound of `count` cycles of the task; 0 is the cycle in which the fault strikes."""
-    return Bound(_counted(count, "cycle") if count else "the same cycle", lambda case: count * case.cycle)
+    """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host board has none."""
+    text = _counted(count, "cycle") if count else "the same cycle"
+    return Bound(text, lambda case: None if case.is_host else count * case.cycle)
 
 
 def cycles_and_time(count: int, time_ns: int) -> Bound:

@@ -42,18 +42,22 @@ class StruckRack:
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
         self.segment, self.driver = segment, driver
         self.clock = SystemClock(segment)
+        # The clock neither releases host boards nor waits for them, but faults strike their processes.
+        self._struck = [*driver.tasks, *(ReleasedTask(segment, host) for host in segment.layout.hosts)]
 
     def target(self, entry: FaultEntry) -> ReleasedTask | None:
-        """Return the task that a fault strikes; None: the clock."""
-        return next((task for task in self.driver.tasks if task.index == entry[Entry.TASK]), None)
+        """Return the task, or host board, that a fault strikes; None: the clock."""
+        return next((task for task in self._struck if task.index == entry[Entry.TASK]), None)
 
     def send(self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals) -> bool:
         """Send a signal to a task's process; return False if there is no such process."""
-        if task.lost_tick >= 0:
+        pid = task.block[Block.PID]
+        # A host board whose program is done, or which a replay does without, has no process.
+        if task.lost_tick >= 0 or pid <= 0:
             return False
         entry.acted(tick, time.monotonic_ns())
         try:
-            os.kill(task.block[Block.PID], number)
+            os.kill(pid, number)
         except ProcessLookupError:
             return False
         return True

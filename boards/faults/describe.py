@@ -15,7 +15,7 @@ ALL_JOINTS = "all joints"
 
 def board_of(entry: FaultEntry, layout: Layout) -> str:
     """Return the task that a fault strikes; "clock" for the clock."""
-    return CLOCK if entry[Entry.TASK] < 0 else layout.tasks[entry[Entry.TASK]].name
+    return CLOCK if entry[Entry.TASK] < 0 else layout.processes[entry[Entry.TASK]].name
 
 
 def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:

@@ -27,7 +27,7 @@ Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "ar
 """The place where a step acts. `process`, `clock`, `bus`: the clock's board, at the start of a tick. `load`, `writer`,
 `lock`: the task itself. `core`: another process on the task's core. `arm`: the level that drives the arm. `start`: the
 board, as it starts."""
-Struck = Literal["executor", "planner", "clock"]
+Struck = Literal["executor", "planner", "clock", "host"]
 Died = Literal["died"]
 DIED: Died = "died"
 """Detection by the Rack: the process died."""

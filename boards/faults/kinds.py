@@ -57,7 +57,7 @@ KINDS.add(
         where="process",
         means="SIGKILL kills the task's process",
         step=clock_board.KILL,
-        tasks=("executor", "planner", "clock"),
+        tasks=("executor", "planner", "clock", "host"),
         detected_as=(DIED,),
         bound=bounds.by_rack_or(4),
         consequence=DEATH,
@@ -69,6 +69,7 @@ KINDS.add(
         where="process",
         means="SIGSTOP stops the task's process",
         step=clock_board.HANG,
+        tasks=("executor", "planner", "host"),
         detected_as=(Alarm.HANG,),
         # Four releases missed, plus the release at which that is noticed.
         bound=bounds.cycles(4 + 1),

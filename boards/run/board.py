@@ -14,6 +14,7 @@ from rack.backplane.memory import lock_memory, touch_memory
 from rack.backplane.process import cores_kept_awake, die_with_parent, name_process, pin, set_priority, take_processor
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
+from rack.boards.adapters.bus_adapter import BusAdapter
 from rack.boards.classes import find_class
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
@@ -68,6 +69,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
     kind: type[Executor] | type[Planner]
     kind = find_class(wiring.target, Executor) if spec.role == "executor" else find_class(wiring.target, Planner)
     level = kind(wiring.context)
+    if isinstance(level, BusAdapter):
+        level.attach(segment, wiring.entries)
     try:
         level.self_test()
         if wiring.fails_self_test:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rack.backplane.message import Field, Message, command, status
-from rack.levels.level import Executor, Input, LevelContext, Output, Planner, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output, Planner, Ports, Reading
 
 REQUEST = command("request", 1, Field("made_at", "i8", "tick", "release of the cycle that sent it"))
 SENT = status("sent", 1, Field("sent", "i8", "1", "requests sent"), Field("refused", "i8", "1", "refused: queue full"))
@@ -23,6 +23,16 @@ TAKEN = status(
 def request_id(context: LevelContext, tick: int, number: int) -> int:
     """Return the id of the n-th request of a cycle: it does not depend on what the level remembers."""
     return 1 + tick // context.every * int(context.params["burst"]) + number
+
+
+def count(requests: Reading, status: Message) -> None:
+    """Check the ids of the requests taken, and count them."""
+    for request in (*requests.earlier, requests.value) if requests.is_new else ():
+        step = request.id - status.newest
+        status.repeated += step <= 0
+        status.missing += max(0, step - 1)
+        status.newest = request.id
+        status.taken += 1
 
 
 class Asking(Executor):
@@ -62,13 +72,7 @@ class Answering(Executor):
             self._has_begun = True
             if read.own.is_there:
                 write.status.copy_from(read.own.value)
-        requests = (*read.requests.earlier, read.requests.value) if read.requests.is_new else ()
-        for request in requests:
-            step = request.id - write.status.newest
-            write.status.repeated += step <= 0
-            write.status.missing += max(0, step - 1)
-            write.status.newest = request.id
-            write.status.taken += 1
+        count(read.requests, write.status)
 
 
 class Steady(Executor):
@@ -99,3 +103,29 @@ class Stepping(Planner):
             write.id += 1
             write.made_at = tick
             assert write.send(), "there was room"
+
+
+class Filing(Planner):
+    """Plans what it has taken: its slice is several cycles, in which requests wait."""
+
+    inputs = {"requests": Input(REQUEST, "above.requests")}
+    output = TAKEN
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Want a plan for every request."""
+        return bool(read.requests.is_new)
+
+    def plan(self, read: Ports, write: Message, tick: int) -> None:
+        """Count the requests."""
+        count(read.requests, write)
+
+
+class Filed(Executor):
+    """Shows its planner's counts."""
+
+    inputs = {"plan": Input(TAKEN, "own.plan")}
+    outputs = {"status": TAKEN}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Copy the plan."""
+        write.status.copy_from(read.plan.value)

@@ -29,10 +29,13 @@ from rack.levels.timing.trace_times import (
 from rack.tools.analysis.report_markdown import markdown
 from rack.tools.faults.judge import faults
 from rack.tools.runs.history import counted, first_difference, frequency, holds, misses, steal
+from rack.tools.runs.host_side import entries_of
 from rack.tools.runs.measured_response import system_response
+from rack.tools.runs.queues import queues
 from rack.tools.runs.recording import Recording
 
 Report = dict[str, Any]
+ENTRY_COUNTS = ("passed", "refused", "overtaken", "full", "waiting")
 
 
 def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
@@ -70,8 +73,10 @@ def report_of(recording: Recording) -> Report:
         **faults(recording.events, layout),
         "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
         "system_response": system_response(recording),
+        "entries": _entries(recording),
         "task": _task_outcome(recording),
         "motion": _motion(recording),
+        "queues": queues(recording),
         "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
     }
@@ -81,7 +86,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
         *("misses", "steal", "frequency_mhz", "notes", "holds", "faults", "unexplained", "restarts"),
-        *("system_response", "task", "motion", "rows_lost"),
+        *("system_response", "entries", "task", "motion", "queues", "rows_lost"),
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
@@ -167,6 +172,19 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: 
         "processor_ms": distribution(cycles["processor_ns"] * 1e-6),
         **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
     }
+
+
+def _entries(recording: Recording) -> list[Report]:
+    """Return the entries of all bus adapters: their counts at the end, and the ages of what passed, ms."""
+    found, tick_ms = [], recording.layout.clock_ns * 1e-6
+    for mailbox, entry, source in entries_of(recording.layout, recording.config):
+        if mailbox in recording.mailboxes:
+            ages = recording.signal(mailbox, f"{entry}.age")
+            counts = {name: int(recording.signal(mailbox, f"{entry}.{name}")[-1]) for name in ENTRY_COUNTS}
+            name = f"{mailbox.partition('.')[0]}.{entry}"
+            ages_ms = distribution(ages[ages >= 0] * tick_ms)
+            found.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
+    return found
 
 
 def _task_outcome(recording: Recording) -> Report | None:

@@ -84,11 +84,13 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])
+    yield from _queues(report["queues"])
     yield from _holds(report)
     yield from _times(report)
     yield from _faults(report)
     yield from _misses(report)
     yield from _response(report["system_response"])
+    yield from _entries(report["entries"])
 
 
 def _times(report: Report) -> Iterator[str | Grid]:
@@ -219,6 +221,15 @@ def _motion(motion: Report | None) -> Iterator[str]:
         )
 
 
+def _queues(queues: Sequence[Report]) -> Iterator[str]:
+    for queue in queues:
+        refused = f", {queue['refused']} refused" if queue["refused"] else ""
+        yield (
+            f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at most "
+            f"{queue['waiting']} waiting, room for {queue['capacity']}{refused}."
+        )
+
+
 def _times_row(name: str, task: Report) -> dict[str, str]:
     row = {"task": name, "R": f"{task['slice_ms']:g}"}
     row |= {key: str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")}
@@ -263,3 +274,16 @@ def _response_along(response: Report) -> Iterator[str | Grid]:
             yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
         if found["unseen"]:
             yield from ("", f"{way}: {found['unseen']} not measured: messages are missing in the recording.")
+
+
+def _entries(entries: list[Report]) -> Iterator[str | Grid]:
+    """Yield what passed between the two sides; nothing for a rack without bus adapters."""
+    if not entries:
+        return
+    yield from ("", "## Bus adapters, ages in ms of simulated time", "")
+    counts = ("entry", "source", "passed", "refused", "overtaken", "full", "waiting")
+    rows = [
+        [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ("p50", "p99", "max"))]
+        for row in entries
+    ]
+    yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("overtaken", "waiting", "source"))

@@ -21,7 +21,7 @@ COMMAND, STATUS, HELD = "#4477aa", "#ee6677", "#ccbb44"
 ROUNDING_MS = 1e-6
 LOWER = 0.12
 """Part of a row between marks of commands and of statuses, and its middle."""
-NARROW = ("processes", "sum, eq. 3.3", "status up", "loads")
+NARROW = ("hosts", "processes", "sum, eq. 3.3", "status up", "loads")
 """Columns of the predictions that a narrow terminal leaves out, in this order."""
 NARROW_MEASURED = ("late", "status age p50", "command age p50", "up p50", "down p50", "loads")
 """Columns of the measurements, likewise."""
@@ -39,11 +39,13 @@ class Marks(NamedTuple):
 class SystemPrediction:
     """What a config promises, times in ms. `levels` are those of its longest response, the highest first.
 
-    `boards` are the slots that it takes, beside the clock's. `fits` is None without a budget; `loads` are by core.
+    `boards` are the slots that it takes besides the clock's, `hosts` its boards without real time; `processes` are
+    those that it starts. `fits` is None without a budget; `loads` are by core.
     """
 
     levels: tuple[str, ...]
     boards: int
+    hosts: int
     processes: int
     rates_hz: tuple[float, ...]
     longest_cycle_ms: float
@@ -137,7 +139,17 @@ class Systems:
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield both tables for people, fitted to `width`: what the configs promise, and what the runs have shown."""
         yield "what the configs promise: times in ms, R_s from the release of the highest level; loads by core"
-        head = ["rack", "levels", "boards", "processes", "rates, Hz", "R_max", "bound, eq. 3.2", "sum, eq. 3.3"]
+        head = [
+            "rack",
+            "levels",
+            "boards",
+            "hosts",
+            "processes",
+            "rates, Hz",
+            "R_max",
+            "bound, eq. 3.2",
+            "sum, eq. 3.3",
+        ]
         head += ["command down", "status up", "loads", "fits"]
         yield from table(head, [_promised(one) for one in self.figures], width, NARROW)
         for one in self.figures:
@@ -233,7 +245,7 @@ def _promised(one: SystemFigures) -> list[str]:
     fits = {True: "yes", False: "NO", None: "-"}[found.fits]
     rates = " ".join(f"{rate:.4g}" for rate in found.rates_hz) or "-"
     shown_times = [f"{time:g}" if found.levels else "-" for time in times]
-    counts = map(str, (len(found.levels) or "-", found.boards, found.processes))
+    counts = map(str, (len(found.levels) or "-", found.boards, found.hosts, found.processes))
     return [one.rack, *counts, rates, *shown_times, _loads(found.loads), fits]
 
 

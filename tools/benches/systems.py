@@ -188,11 +188,13 @@ def prediction(config: RackConfig, timing: RackTiming, layout: Layout) -> System
     """Return what a config promises."""
     forecast, hierarchy = Forecast.of(timing), timing.hierarchy
     slots = {task.slot for task in layout.tasks}
+    started = [host for host in config.host.values() if not host.external]
     rates = (1e9 / (every * timing.clock_ns) for every in hierarchy.cycles)
     return SystemPrediction(
         levels=hierarchy.levels,
         boards=len(slots),
-        processes=len(layout.tasks) + 1,  # the clock's
+        hosts=len(config.host),
+        processes=len(layout.tasks) + len(started) + 1,  # the clock's
         rates_hz=tuple(rates),
         longest_cycle_ms=max(hierarchy.cycles, default=0) * timing.clock_ns * 1e-6,
         bound_ms=forecast.system.bound_eq_3_2_ms,

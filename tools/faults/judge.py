@@ -107,7 +107,7 @@ class _Judge:
         self._events, self._run, self._layout = events, run, run.layout
         shown = [_shown(strike, events) for strike in strikes]
         self._strikes = sorted(shown, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
-        self._tasks = [task.name for task in run.layout.tasks]
+        self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
         self._skipped = SkippedTicks(events)
         self._last = max((event.tick for event in events), default=0)

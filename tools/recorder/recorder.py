@@ -121,7 +121,7 @@ class Recorder:
         self._files = RunFiles(folder, layout)
         self._spool.resume(self._files.add)
         traces = {task.name: trace_ring(segment, task.name) for task in layout.tasks}
-        mailboxes = {mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in layout.mailboxes}
+        mailboxes = {mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in layout.timed}
         self._rings = traces | mailboxes
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)

@@ -6,9 +6,9 @@ The table has a line a task; below it are the active faults, what holds the rack
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -19,6 +19,7 @@ from rich.text import Text
 from rack.boards.events import Event
 from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
+from rack.tools.runs.host_side import EntryRow, HostRow
 from rack.tools.runs.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
 DROPPED = ("tick", "sched", "slot", "cycles", "Hz", "restarts", "core", "exec ms", "late ms", "skipped")
 """Columns that a narrow terminal leaves out, in this order."""
 STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green", "holding": "yellow"}
-COUNTED = {"missed": "red", "skipped": "red", "restarts": "yellow"}
+COUNTED = {"missed": "red", "skipped": "red", "restarts": "yellow", "refused": "yellow", "full": "yellow"}
 """Colours of counts above 0."""
 HELD = "bold yellow"
 NO_DEMAND = "none"
@@ -128,7 +129,7 @@ def display_for(silent: bool) -> Iterator[Display]:
 
 @dataclass(frozen=True)
 class RackView:
-    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, active faults, holds, progress."""
+    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults, holds, progress."""
 
     snapshot: Snapshot
 
@@ -139,13 +140,25 @@ class RackView:
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
         yield grid(list(COLUMNS), cells, width, DROPPED, _style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
+        for rows in (snapshot.hosts, snapshot.entries):
+            yield from _host_side(rows, width)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
+        yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             why, *release = hold.parts
             yield Text(hold.line if len(hold.line) <= width else "\n  ".join([why, *release]), style=HELD)
         if snapshot.progress is not None:
             yield _bar(snapshot.progress, width if terminal.is_terminal else 0)
+
+
+def _host_side(rows: Sequence[HostRow] | Sequence[EntryRow], width: int) -> Iterator[RenderableType]:
+    """Yield the table of the host boards, or of what passes to and from them, if there are any."""
+    if rows:
+        found = [asdict(row) for row in rows]
+        cells = [[decimal(v, 1) if isinstance(v, float | None) else str(v) for v in row.values()] for row in found]
+        yield Text()
+        yield grid([name.replace("_", " ") for name in found[0]], cells, width, style=_style)
 
 
 def line_of(snapshot: Snapshot) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,12 +15,14 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.events import Event, Outcome
+from rack.boards.wiring import Entries
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, strikes
 from rack.tools.runs.display import Display
 from rack.tools.runs.folder import EventLog
 from rack.tools.runs.holds import Standstill
+from rack.tools.runs.queues import Queues
 from rack.tools.runs.recorder_process import RecorderProcess
 from rack.tools.runs.snapshot import RackMonitor
 from rack.tools.runs.window import ViewerWindow, free_port, url
@@ -41,7 +43,8 @@ News = Callable[[], list[str]]
 class RunResult:
     """A finished run: its outcome, the counts of every task's control block, and the faults injected into it.
 
-    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events.
+    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events. `refused`: messages
+    that full queues refused, by queue.
     """
 
     rack: str
@@ -52,6 +55,7 @@ class RunResult:
     recording: str
     faults: tuple[Strike, ...]
     clock_offset_ns: int
+    refused: dict[str, int]
 
     @property
     def worked(self) -> bool:
@@ -85,11 +89,12 @@ def run_rack(
     share: bool = True,
     crate: CrateLine | None = None,
     step: bool = False,
+    entries: Mapping[str, Entries] | None = None,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder` unless that is None.
 
     With `view`, open a viewer on what the recorder serves; it may be closed at any time. With `step`, in lockstep, hold
-    before tick 0 until the rack is stepped. `share` and `crate` are as in `Rack`.
+    before tick 0 until the rack is stepped. `share`, `crate` and `entries` are as in `Rack`.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that fails does not
     change how the run ends.
@@ -102,7 +107,7 @@ def run_rack(
             recorder = None if folder is None else RecorderProcess()
             if recorder is not None:
                 stack.callback(recorder.finish)
-            rack = stack.enter_context(Rack(config, log.add, share, crate))
+            rack = stack.enter_context(Rack(config, log.add, share, crate, entries))
             rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -130,6 +135,7 @@ def run_rack(
             recording=recording,
             faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
             clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+            refused={queue.mailbox: queue.refused for queue in Queues(segment).look()},
         )
         log.end(result.document())
     return result

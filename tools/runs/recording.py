@@ -99,8 +99,9 @@ class Recording:
         with _naming(self.folder / "signals.parquet"):
             text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
             boxes = [MailboxSpec(**{**m, **_tuples(m), "fields": ()}) for m in text["mailboxes"]]
-            tasks = tuple(TaskSpec(**task) for task in text["tasks"])
-            return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes))
+            # Earlier versions recorded no host boards.
+            tasks, hosts = (tuple(TaskSpec(**task) for task in text.get(key, ())) for key in ("tasks", "hosts"))
+            return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes), hosts)
 
     @cached_property
     def lost(self) -> dict[str, int]:

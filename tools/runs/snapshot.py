@@ -16,6 +16,8 @@ from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
+from rack.tools.runs.host_side import EntryRow, HostRow, entry_rows, host_rows
+from rack.tools.runs.queues import QueueFill, Queues
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
@@ -69,7 +71,8 @@ class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work.
+    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
+    `queues` are all of them, empty ones too.
     """
 
     rack: str
@@ -83,6 +86,9 @@ class Snapshot:
     tasks: tuple[TaskRow, ...]
     progress: TaskProgress | None
     holds: tuple[Hold, ...] = ()
+    hosts: tuple[HostRow, ...] = ()
+    entries: tuple[EntryRow, ...] = ()
+    queues: tuple[QueueFill, ...] = ()
 
 
 class RackMonitor:
@@ -93,6 +99,7 @@ class RackMonitor:
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
         self._holds = Holds(segment)
+        self._queues = Queues(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
@@ -121,6 +128,9 @@ class RackMonitor:
             tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
             progress=self._progress(),
             holds=self._holds.look(),
+            hosts=host_rows(self._segment),
+            entries=entry_rows(self._segment),
+            queues=self._queues.look(),
         )
 
     def _active_faults(self) -> Iterator[str]:

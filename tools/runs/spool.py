@@ -56,7 +56,7 @@ class RunFiles:
 
     def __init__(self, folder: Path, layout: Layout, suffix: str = "") -> None:
         self.tasks = [task.name for task in layout.tasks]
-        self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.mailboxes)], 0)
+        self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
         self.taken = dict(self.lost)
         self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}")
         self._signals = SignalsFile(folder / f"{SIGNALS}{suffix}", layout)
@@ -195,7 +195,7 @@ def _read_frames(file: IO[bytes], layout: Layout) -> Iterator[Frame]:
 def _dtypes(layout: Layout) -> dict[str, np.dtype]:
     """Return the row type of every ring of a rack: traces by task, then messages by mailbox."""
     traces = {task.name: RECORD for task in layout.tasks}
-    return traces | {mailbox.name: row_dtype(mailbox) for mailbox in layout.mailboxes}
+    return traces | {mailbox.name: row_dtype(mailbox) for mailbox in layout.timed}
 
 
 def _lock(file: IO[bytes], path: Path) -> None:

@@ -73,8 +73,8 @@ class ViewSink:
             ]
             for task in layout.tasks
         }
-        # An operator's mailbox has no age: it is not written periodically.
-        periodic = [mailbox for mailbox in layout.mailboxes if mailbox.writer != CLOCK]
+        # The mailboxes of operators and host boards, and queues, have no age: they are not written periodically.
+        periodic = [box for box in layout.timed if box.writer != CLOCK and box.protocol != "queue"]
         self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
         for mailbox, age in self._ages.items():
             of_mailbox[mailbox].append(age.write)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
 from rack.backplane.mailbox.queue import QueueReader, QueueWriter, taken_name
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box
+from rack.backplane.words import Box, Slot
 from tests.backplane.bus import NAME, message_address, queue
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork
@@ -203,3 +204,30 @@ def test_messages_of_other_mailboxes_cannot_be_sent(make_bus: MakeBus) -> None:
         writer.message.send()
     with pytest.raises(MailboxError, match=r"only messages of a queue"):
         writer.message.room()
+
+
+@pytest.mark.parametrize("word", Slot)
+@pytest.mark.parametrize("at", [1, 3])
+def test_no_damage_to_a_slot_holds_up_the_queue(make_bus: MakeBus, word: Slot, at: int) -> None:
+    segment = make_bus(*queue(3))
+    writer, reader = ends(segment)
+    send(writer, 0, 1, 2, 3)
+    words = segment.words[(message_address(segment, at) - SLOT_HEAD_SIZE) // 8 :]
+    words[word] ^= 1 << 40
+    found = ids(reader.read(1))
+    # The checksum does not cover the time stamp.
+    assert found == [serial for serial in (1, 2, 3) if serial != at or word is Slot.STAMP_NS]
+    assert reader.statistics.bad_reads == (word is not Slot.STAMP_NS)
+    assert reader.taken == 3
+    writer.taken = reader.taken
+    assert send(writer, 1, 4) == [True]
+    assert ids(reader.read(2)) == [4]
+
+
+def test_a_head_out_of_range_costs_a_reader_no_more_than_its_slots(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(8, slots=16))
+    writer, reader = ends(segment)
+    send(writer, 0, 1)
+    reader.slots.box[Box.HEAD] = reader.slots.box[Box.SENT] = 1 << 50
+    assert ids(reader.read(1)) == [1]
+    assert reader.taken <= 16

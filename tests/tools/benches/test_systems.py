@@ -16,7 +16,7 @@ from tests.boards.conftest import PLAIN
 from tests.boards.vector_racks import JOINTED
 from tests.tools.command_line import rack
 
-PROMISED = SystemPrediction(("top", "low"), 2, 3, (50.0, 400.0), 20.0, 40.0, 22.5, 22.5, 40.0, {0: 0.5}, True)
+PROMISED = SystemPrediction(("top", "low"), 2, 0, 3, (50.0, 400.0), 20.0, 40.0, 22.5, 22.5, 40.0, {0: 0.5}, True)
 TIMES = {"min": 20.0, "p50": 22.5, "p99": 22.5, "p99_9": 22.5, "max": 22.5}
 HOLD = HoldResponse("top", "acted on", 30.0, 42.5, 31.0)
 FOUND = SystemFigures("one", PROMISED, 8.0, 0.002, 0.0015, {0: 0.4}, TIMES, TIMES, TIMES, TIMES, HOLD, "")
@@ -43,7 +43,7 @@ def test_what_a_config_promises_is_read_from_it_alone() -> None:
     assert found.levels == ("task", "elemental_move", "primitive", "servo")
     assert found.rates_hz == pytest.approx((1, 4, 50, 400))
     # Slots 2 to 7, one of them a planner's; five executors, four planners and the clock.
-    assert (found.boards, found.processes) == (6, 10)
+    assert (found.boards, found.hosts, found.processes) == (6, 0, 10)
     assert (found.longest_cycle_ms, found.bound_ms, found.sum_ms) == (1000, 4000, 1272.5)
     assert found.fits
     assert set(found.loads) == {0, 1}
@@ -118,7 +118,7 @@ def test_the_figures_are_two_tables_and_the_chains() -> None:
     assert "one: top > low" in lines
     assert "lone: no level above another" in lines
     rows = [line.split() for line in lines if line.startswith(("one ", "lone "))]
-    assert rows[0] == ["one", "2", "2", "3", "50", "400", "20", "40", "22.5", "22.5", "40", "0.50", "yes"]
+    assert rows[0] == ["one", "2", "2", "0", "3", "50", "400", "20", "40", "22.5", "22.5", "40", "0.50", "yes"]
     assert rows[2][:5] == ["one", "8", "0.20", "0.15", "0.05"]
     assert rows[2][-3:] == ["top", "30.0", "42.5"]
     assert rows[3][-3:] == ["-", "-", "-"]

@@ -1,0 +1,115 @@
+"""Mailboxes of the host side: a bounded ring from one host board to one bus adapter, not by ticks.
+
+The host board writes at any time. A full ring is an answer, `False`, never a wait: nothing is overwritten that the
+adapter has not taken. The adapter takes messages in its own cycles, as many as it wants, and refuses those that are
+damaged, forged, or hold what no message of that type may hold. Its place in the ring is in shared memory, so an adapter
+that is restarted goes on there.
+
+Alternatives considered: a pipe or a socket per host board (the kernel copies each message twice, and a dead reader
+raises in the writer), and protocol time-slice (a host board has no ticks at which its messages could become visible).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rack.backplane.layout import FieldSpec
+from rack.backplane.mailbox.mailbox import DoubleBufferWriter
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box
+
+SPARE = 2
+"""Slots more than messages may wait: the one being written, and one that the adapter copies meanwhile."""
+_HEAD, _TAKEN, _REFUSED = int(Box.HEAD), int(Box.TAKEN), int(Box.REFUSED)
+
+
+class HostWriter(DoubleBufferWriter):
+    """The host board's end of a ring. Opening it claims the mailbox, as any writer does."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        super().__init__(segment, name)
+        self._box = self._slots.box
+
+    @property
+    def is_full(self) -> bool:
+        """Whether as many messages wait as the ring holds."""
+        return self._box[_HEAD] - self._box[_TAKEN] >= self.spec.capacity
+
+    def send(self, tick: int) -> bool:
+        """Publish `message`, written at `tick`; return False, and count it, when the ring is full."""
+        if self.is_full:
+            self._box[_REFUSED] += 1
+            return False
+        return self.write(tick)
+
+
+class HostReader:
+    """The adapter's end of a ring. `taken` and `refused` count messages taken from it, and those that were bad."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        self.spec = spec = segment.layout.mailbox(name)
+        self._slots = Slots(segment, spec)
+        self._box = self._slots.box
+        self._is_proper = ProperContent(spec.fields)
+        self.refused = 0
+        """Messages refused: damaged, forged, or improper."""
+        self.overtaken = 0
+        """Messages that a newer one overtook before it was taken."""
+
+    @property
+    def waiting(self) -> int:
+        """Messages that wait, at most the slots of the ring."""
+        return min(max(0, self._box[_HEAD] - self._box[_TAKEN]), self.spec.depth)
+
+    @property
+    def full(self) -> int:
+        """How often the writer found the ring full."""
+        return self._box[_REFUSED]
+
+    @property
+    def written(self) -> int:
+        """Tick at which the message taken last was written."""
+        return self._slots.tick
+
+    def take(self) -> Message | None:
+        """Take the oldest message that waits; None if it is bad. Valid until the next call."""
+        head, oldest = self._box[_HEAD], self._box[_TAKEN] + 1
+        # Only a writer that does not keep to the rules overwrites what waits.
+        serial = max(oldest, head - self.spec.depth + SPARE)
+        self.overtaken += serial - oldest
+        self._box[_TAKEN] = serial
+        return self._fetched(serial)
+
+    def take_newest(self, most: int) -> Message | None:
+        """Take all that wait and return the newest good one, looking at no more than `most`; None: there is none."""
+        waiting, head = self.waiting, self._box[_HEAD]
+        self._box[_TAKEN] = head
+        for back in range(min(waiting, most)):
+            if (message := self._fetched(head - back)) is not None:
+                self.overtaken += waiting - back - 1
+                return message
+        return None
+
+    def _fetched(self, serial: int) -> Message | None:
+        slots = self._slots
+        if slots.fetch(serial) and slots.is_lawful(0) and self._is_proper(slots.message):
+            return slots.message
+        self.refused += 1
+        return None
+
+
+class ProperContent:
+    """Says whether a message holds only what its type permits: numbers that are not NaN, members of enums."""
+
+    def __init__(self, fields: tuple[FieldSpec, ...]) -> None:
+        self._numbers = [field.name for field in fields if np.dtype(field.kind).kind == "f"]
+        self._enums = [(field.name, [number for _, number in field.values]) for field in fields if field.values]
+
+    def __call__(self, message: Message) -> bool:
+        """Say whether a message is proper."""
+        record = message.record
+        if any(np.isnan(record[name]).any() for name in self._numbers):
+            return False
+        return all(np.isin(record[name], numbers).all() for name, numbers in self._enums)

@@ -1,0 +1,190 @@
+"""The entries of a bridge: what each passes, in which direction, when, and what is counted of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+from pydantic import Field as Key
+from pydantic import ValidationError, model_validator
+
+from rack.backplane.mailbox.host_ring import HostReader
+from rack.backplane.mailbox.mailbox import Reading
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.message import Field, MessageType
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import wake_semaphore
+from rack.levels.level import Ports
+from rack.levels.tables import LAST_TICK, Table
+
+NEVER = -1
+PORT = re.compile(r"[a-z][a-z0-9_]*")
+RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clear", "copy_from")
+"""Names that the status of a bridge needs for itself."""
+
+ENTRY = MessageType(
+    "adapter_entry",
+    1,
+    (
+        Field("passed", "u4", "1", "messages passed to the other side"),
+        Field("refused", "u4", "1", "messages refused: damaged, forged, NaN, or not a member of an enum"),
+        Field("overtaken", "u4", "1", "messages that a newer one overtook before the exchange"),
+        Field("full", "u4", "1", "messages that the host board could not send, since too many waited"),
+        Field("waiting", "u4", "1", "messages that wait for the next cycles"),
+        Field("arrived", "i8", "tick", "tick at which the newest message reached the other side; -1: none yet"),
+        Field("age", "i8", "tick", "time since that message was written; -1: none yet"),
+    ),
+)
+"""One entry, in the status of its bridge."""
+
+
+class EntryConfig(Table):
+    """One mailbox that a bridge passes across."""
+
+    source: str = Key(alias="from", description="mailbox to pass, as in program.requests; its side is the direction")
+    every: int = Key(1, ge=1, le=LAST_TICK, description="exchange in every n-th cycle of the bridge, cycles")
+    phase: int = Key(0, ge=0, description="with every: which of the n cycles, cycles")
+    asynchronous: bool = Key(False, description="pass each message as it comes, once; default: the newest, repeatedly")
+    most: int = Key(8, ge=1, le=256, description="messages of a host board looked at in one cycle; the others wait")
+
+    @model_validator(mode="after")
+    def _has_one_mode(self) -> Self:
+        if self.phase >= self.every:
+            raise ValueError(f"phase = {self.phase}: must be less than every, {self.every}")
+        if self.asynchronous and self.every > 1:
+            raise ValueError(f"every = {self.every}: the entry is asynchronous; permitted: one of the two")
+        return self
+
+    def is_due(self, cycle: int) -> bool:
+        """Say whether the entry is exchanged in that cycle of the bridge."""
+        return cycle % self.every == self.phase
+
+
+class AdapterParams(Table):
+    """`[board.<bridge>.params]`."""
+
+    entries: dict[str, EntryConfig] = Key({}, alias="pass", description="mailboxes to pass, by port of the bridge")
+
+    @model_validator(mode="after")
+    def _has_ports(self) -> Self:
+        if wrong := [port for port in self.entries if not PORT.fullmatch(port) or port in RESERVED]:
+            raise ValueError(f"pass.{wrong[0]}: invalid name; permitted: a-z, 0-9 and _, except {', '.join(RESERVED)}")
+        return self
+
+    @classmethod
+    def entries_of(cls, params: Mapping[str, Any]) -> dict[str, EntryConfig]:
+        """Return the entries in a table; none if it has mistakes."""
+        try:
+            return cls.model_validate(params).entries
+        except ValidationError:
+            return {}
+
+
+@dataclass
+class EntryCount:
+    """The counts of one entry: the fields of `ENTRY`. `written`: tick at which the newest message was written."""
+
+    passed: int = 0
+    refused: int = 0
+    overtaken: int = 0
+    full: int = 0
+    waiting: int = 0
+    arrived: int = NEVER
+    written: int = NEVER
+
+    def resume(self, record: Any, tick: int) -> None:
+        """Continue with the counts in the status of an earlier cycle."""
+        age = int(record["age"])
+        for name in ("passed", "refused", "overtaken", "full", "waiting", "arrived"):
+            setattr(self, name, int(record[name]))
+        self.written = NEVER if age == NEVER else tick - age
+
+    def passes(self, tick: int, written: int) -> None:
+        """EntryCount a message."""
+        self.passed += 1
+        self.arrived, self.written = tick, written
+
+    def fill(self, record: Any, tick: int) -> None:
+        """Write the counts into the status of a cycle."""
+        age = NEVER if self.written == NEVER else tick - self.written
+        record[...] = (self.passed, self.refused, self.overtaken, self.full, self.waiting, self.arrived, age)
+
+
+class Crossing(Protocol):
+    """One entry, at work."""
+
+    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+        """Exchange, in a cycle in which that is due."""
+
+
+class Inward:
+    """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read by ticks."""
+
+    def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
+        self._ring, self._port, self._table, self._count = HostReader(segment, table.source), port, table, count
+        self._refused, self._overtaken = count.refused, count.overtaken
+
+    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+        """Take what waits, and check it."""
+        ring, count, out = self._ring, self._count, getattr(write, self._port)
+        if self._table.asynchronous:
+            for _ in range(min(ring.waiting, self._table.most, out.room())):
+                if (message := ring.take()) is not None:
+                    out.copy_from(message)
+                    out.send()
+                    count.passes(tick, ring.written)
+        elif ring.waiting and (message := ring.take_newest(self._table.most)) is not None:
+            out.copy_from(message)
+            count.passes(tick, ring.written)
+        count.refused, count.overtaken = self._refused + ring.refused, self._overtaken + ring.overtaken
+        count.full, count.waiting = ring.full, ring.waiting
+
+
+class Outward:
+    """Out of real time: from a level's mailbox, read by ticks, to one that host boards read; it wakes them."""
+
+    def __init__(self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount) -> None:
+        self._writer, self._port, self._table, self._count = open_writer(segment, own), port, table, count
+        self._wake = [wake_semaphore(segment.rack, reader) for reader in self._writer.spec.readers]
+
+    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+        """Copy what is there."""
+        reading: Reading = getattr(read, self._port)
+        if not reading.is_there or (self._table.asynchronous and not reading.is_new):
+            return
+        for message in (*reading.earlier, reading.value):
+            self._writer.message.copy_from(message)
+            self._writer.write(tick)
+        if reading.is_new or self._count.written == NEVER:
+            self._count.written = tick
+        self._count.passes(tick, self._count.written)
+        for semaphore in self._wake:
+            # One post is enough: a host board that does not wait would let the semaphore overflow.
+            if not semaphore.value:
+                semaphore.release()
+
+
+Rows = Sequence[tuple[int, bytes]]
+"""Messages of a recorded run with their ticks, oldest first; of a mailbox that repeats itself only the changes."""
+
+
+class Replayed:
+    """A mailbox of the bridge in a replay: what the recorded run wrote to it, at the same ticks.
+
+    Of messages that are each read once, a bridge that was restarted gives out those after tick `since`.
+    """
+
+    def __init__(self, rows: Rows, port: str, is_queued: bool, since: int = NEVER) -> None:
+        self._rows, self._port, self._is_queued = rows, port, is_queued
+        self._at = sum(tick <= since for tick, _ in rows) if is_queued else 0
+
+    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+        """Give out what the recorded run wrote up to this cycle."""
+        out, rows = getattr(write, self._port), self._rows
+        while self._at < len(rows) and rows[self._at][0] <= tick:
+            out.raw[:] = rows[self._at][1]
+            self._at += 1
+            if self._is_queued:
+                out.send()

@@ -1,0 +1,144 @@
+"""The bus as a program of the host side sees it: `rack.levels.host_program.Bus`, on a segment."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
+
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.clock.wake import CHECK_S
+from rack.backplane.errors import MailboxError
+from rack.backplane.mailbox.host_ring import HostWriter
+from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.words import Block, System, TaskState
+from rack.boards.wiring import HostWiring
+
+COMMAND_ID = "id"
+_Port = TypeVar("_Port")
+
+
+class HostBus:
+    """The ports of one host board. Opening it claims the board: a second process is refused with `MailboxError`."""
+
+    def __init__(self, segment: Segment, wiring: HostWiring) -> None:
+        self._segment, self._words = segment, segment.words
+        self.block = segment.block(wiring.board)
+        self._claim = _claim(segment, wiring.board)
+        self._inlets = {port: HostInlet(segment, mailbox) for port, mailbox in wiring.inputs.items()}
+        self._writers: dict[str, HostWriter] = {}
+        try:
+            for port, mailbox in wiring.outputs.items():
+                self._writers[port] = HostWriter(segment, mailbox)
+        except MailboxError:
+            self.close()
+            raise
+        self._semaphore = wake_semaphore(segment.rack, wiring.board)
+        self.block[Block.PID] = os.getpid()
+        self.block[Block.LOST] = 0
+        self.block[Block.STATE] = TaskState.RUNNING
+
+    @property
+    def tick(self) -> int:
+        """The clock's tick."""
+        return self._words[System.TICK]
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the run has ended: the program should return."""
+        return self._segment.run_is_over
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until a message arrives; False when none has after the timeout, or when the run ends."""
+        deadline = time.monotonic() + timeout_s
+        while not self.is_over:
+            left = deadline - time.monotonic()
+            if self._semaphore.acquire(max(0.0, min(left, CHECK_S))):
+                return True
+            if left <= CHECK_S:
+                return False
+        return False
+
+    def read(self, port: str) -> Reading:
+        """Return the newest message; `earlier` holds the unread ones before it, as far as the mailbox keeps them."""
+        return _of(self._inlets, port).read()
+
+    def send(self, port: str, **fields: Any) -> bool:
+        """Send a message with these fields, all others 0; False when too many wait at the adapter.
+
+        A command without an `id` gets the number of the message, which rises by one with every message sent. Raises
+        `AttributeError` for an unknown field.
+        """
+        writer = _of(self._writers, port)
+        message = writer.message
+        message.clear()
+        if COMMAND_ID in (message.record.dtype.names or ()):
+            message.id = writer.serial + 1
+        for name, value in fields.items():
+            # Read first: a slot for any other name would raise an error that does not list the fields.
+            getattr(message, name)
+            setattr(message, name, value)
+        return writer.send(self.tick)
+
+    def sent(self, port: str) -> int:
+        """Return the number of messages sent so far, by former processes of this board too."""
+        return _of(self._writers, port).serial
+
+    def finish(self) -> None:
+        """Declare the program's work done, as its return does."""
+        self.block[Block.STATE] = TaskState.ENDED
+
+    def close(self) -> None:
+        """Give the board up: another process may open it."""
+        for writer in self._writers.values():
+            writer.close()
+        self._claim.close()
+
+
+class HostInlet:
+    """Reads a mailbox of a bus adapter at any time: the newest whole message, and the unread ones before it."""
+
+    def __init__(self, segment: Segment, mailbox: str) -> None:
+        self._reader = DoubleBufferReader(segment, mailbox)
+        self._slots = Slots(segment, self._reader.spec)
+
+    def read(self) -> Reading:
+        """Return the newest message, and the unread ones before it; the first read returns the newest alone."""
+        before = self._reader.serial
+        reading = self._reader.peek()
+        if before and self._reader.serial > before + 1:
+            return reading._replace(earlier=tuple(self._between(before, self._reader.serial)))
+        return reading
+
+    def _between(self, before: int, newest: int) -> Iterator[Message]:
+        """Yield a copy of each good message between two serials, as far as the slots reach back."""
+        slots = self._slots
+        for serial in range(max(before + 1, newest - slots.mask), newest):
+            if slots.fetch(serial) and slots.is_lawful(0):
+                message = Message(slots.dtype)
+                message.copy_from(slots.message)
+                yield message
+
+
+def _claim(segment: Segment, board: str) -> ByteLock:
+    claim = ByteLock(segment, _claim_address(segment, board))
+    if not claim.take():
+        claim.close()
+        pid = segment.block(board)[Block.PID]
+        raise MailboxError(f"host board '{board}' is run by process {pid} already; permitted: one")
+    return claim
+
+
+def _claim_address(segment: Segment, board: str) -> int:
+    return segment.map.blocks[board] + 8 * Block.PID
+
+
+def _of(ports: Mapping[str, _Port], port: str) -> _Port:
+    if port not in ports:
+        raise AttributeError(f"no port '{port}'; ports: {', '.join(sorted(ports)) or 'none'}")
+    return ports[port]

@@ -1,0 +1,100 @@
+"""Mistakes in the host side of a config: each one line, with its place and what is permitted."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.boards.config import resolve
+from rack.boards.config.resolved import loads
+from rack.boards.config.toml import override, parse, to_toml
+from rack.boards.errors import ConfigError
+from tests.boards.test_host_side import HOSTED
+
+IDLE = "rack.levels.host_program:HostProgram"
+MISTAKES = {
+    "a rate": (["host.program.rate_hz=10"], "host.program.rate_hz = 10: unknown key; known: program, external, below"),
+    "a priority": (["host.program.priority=3"], "host.program.priority = 3: unknown key; known: program"),
+    "no program": (["host.program.program=host_programs:Adder"], "has no HostProgram named 'Adder'; it has: Console, "),
+    "the name of a board": (
+        [f"host.adder={{ program = '{IDLE}' }}"],
+        "host.adder: board.adder has this name",
+    ),
+    "a name": (
+        [f"host.own={{ program = '{IDLE}' }}"],
+        "host.own: invalid name for a board; permitted: a-z",
+    ),
+    "below": (["host.program.below=brigde"], 'host.program.below = "brigde": no board has this name; boards: bridge'),
+    "no bridge below": (["host.program.below=[]"], "host.program.below: missing; port 'sum' of the host needs it"),
+    "real time reads the host side": (
+        ["board.adder.reads.number=program.numbers"],
+        'board.adder.reads.number = "program.numbers": it is on the host side; pass it through a bus adapter',
+    ),
+    "the host side reads real time": (
+        ["host.program.reads.sum=adder.status"],
+        'host.program.reads.sum = "adder.status": it is on the real-time side; pass it through a bus adapter',
+    ),
+    "a bridge on the real-time side": (
+        ["board.second={ slot = 9, every = 1, executor = 'host_programs:Repeater', below = 'bridge' }"],
+        'board.second.reads.sum = "bridge.sum": a bus adapter joins the two sides; '
+        "'adder' and 'second' are both on the real-time side",
+    ),
+    "a bridge on the host side": (
+        ["host.second={ program = 'host_programs:Listener', below = 'bridge' }"],
+        "'program' and 'second' are both on the host side",
+    ),
+    "a second bridge": (
+        [
+            "board.second={ slot = 9, every = 1, executor = 'rack.boards.adapters.bus_adapter:BusAdapter' }",
+            "board.second.params.pass.sum={ from = 'bridge.sum' }",
+        ],
+        'board.second.params.pass.sum = "bridge.sum": it is on the host side already',
+    ),
+    "an unknown source": (
+        ["board.bridge.params.pass.more={ from = 'program.more' }"],
+        'board.bridge.params.pass.more = "program.more": no task writes it; mailboxes: ',
+    ),
+    "both modes": (
+        ["board.bridge.params.pass.numbers.every=2"],
+        "board.bridge.params.pass.numbers: every = 2: the entry is asynchronous; permitted: one of the two",
+    ),
+    "a phase": (
+        ["board.bridge.params.pass.sum={ every = 2, phase = 2 }"],
+        "board.bridge.params.pass.sum: phase = 2: must be less than every, 2",
+    ),
+    "a name of an entry": (
+        ["board.bridge.params.pass.status={ from = 'adder.status' }"],
+        "pass.status: invalid name; permitted: a-z, 0-9 and _, except status, ",
+    ),
+    "a fault": (
+        ["host.program.external=true", "fault=[{ kind = 'kill', board = 'program', tick = 1 }]"],
+        'fault[0].board = "program": external: the rack has no process to strike',
+    ),
+    "a fault that needs cycles": (
+        ["fault=[{ kind = 'overrun', board = 'program', tick = 1 }]", "clock.mode=realtime"],
+        "overrun strikes only executors; executors: bridge, adder",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_line(name: str) -> None:
+    settings, line = MISTAKES[name]
+    with pytest.raises(ConfigError) as error:
+        resolve(loads(to_toml(override(parse(HOSTED), settings))))
+    (mistake,) = error.value.mistakes
+    assert line in str(mistake)
+
+
+def test_a_bridge_and_its_host_boards_are_in_the_layout() -> None:
+    resolved = resolve(loads(HOSTED))
+    layout = resolved.layout
+    assert [host.name for host in layout.hosts] == ["program"]
+    assert [task.name for task in layout.tasks] == ["bridge", "adder"]
+    boxes = {box.name: (box.writer, box.readers, box.protocol) for box in layout.mailboxes}
+    assert boxes["program.numbers"] == ("program", ("bridge",), "queue")
+    assert boxes["bridge.numbers"] == ("bridge", ("adder",), "queue")
+    assert boxes["bridge.sum"] == ("bridge", ("program",), "time-slice")
+    assert {box.name for box in layout.timed} == set(boxes) - {"program.numbers"}
+    bridge = next(task for task in resolved.tasks if task.task == "bridge")
+    assert dict(bridge.inputs) == {"sum": "adder.status"}
+    assert set(bridge.outputs) == {"numbers", "status"}

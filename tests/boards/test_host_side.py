@@ -1,0 +1,191 @@
+"""Boards of the host side as real processes: whatever they do, the real-time side goes on as without them."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import signal
+from collections.abc import Callable
+
+import pytest
+
+from rack.backplane.errors import MailboxError
+from rack.backplane.mailbox.history import chains
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System
+from rack.boards import Rack
+from rack.boards.config import resolve
+from rack.boards.host.bus import HostBus
+from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.host_programs import Failing
+from tests.processes import BOUND_S, wait_until
+
+HOSTED = f"""{CLOCK}
+[board.bridge]
+slot = 2
+rate_hz = 100
+below = "adder"
+executor = "rack.boards.adapters.bus_adapter:BusAdapter"
+ends_run = true
+
+[board.bridge.params.pass]
+numbers = {{ from = "program.numbers", asynchronous = true }}
+sum = {{ from = "adder.status" }}
+
+[board.adder]
+slot = 3
+rate_hz = 400
+above = "bridge"
+executor = "host_programs:Adder"
+
+[host.program]
+program = "host_programs:Counting"
+below = "bridge"
+"""
+"""A program sends numbers through a bridge to a level that adds them."""
+
+
+ENDS = ("died", "restart", "rejoined", "given_up", "done")
+"""Codes of events about the process of a host board."""
+
+
+def others(**programs: str) -> str:
+    """Return the tables of more host boards, and of an entry for each that no level reads."""
+    entries = [f'{name} = {{ from = "{name}.numbers" }}\n' for name in programs]
+    tables = [
+        f'[host.{name}]\nprogram = "host_programs:{program}"\nbelow = "bridge"\n' for name, program in programs.items()
+    ]
+    return HOSTED.replace("sum = {", "".join(entries) + "sum = {") + "".join(tables)
+
+
+def watch(rack: Rack, condition: Callable[[], bool]) -> None:
+    """Supervise a rack that has been started until `condition` holds, then stop it."""
+
+    def holds() -> bool:
+        rack.watch(0.01)
+        return condition()
+
+    wait_until(holds, BOUND_S)
+    rack.stop("the test has seen enough")
+    while rack.watch(0.5):
+        continue
+
+
+def status(segment: Segment, board: str = "bridge") -> object:
+    """Return the newest status of a board."""
+    return open_observer(segment, f"{board}.status").peek().value
+
+
+def codes(rack: Rack, board: str) -> list[str]:
+    """Return the codes of the events of a board."""
+    return [event.code for event in rack.events if event.board == board]
+
+
+def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: MakeConfig) -> None:
+    with Rack(config("host.program.params.count=50", "protocol.depth={ 'program.numbers' = 8 }", text=HOSTED)) as rack:
+        outcome = rack.run()
+        assert (outcome.cause, status(rack.segment, "adder").sum) == ("task done", 50 * 51 / 2)
+        entry = status(rack.segment).numbers
+        assert (entry["passed"], entry["refused"], entry["overtaken"]) == (50, 0, 0)
+        assert 0 <= entry["arrived"] < outcome.ticks
+    assert "died" not in codes(rack, "program")
+
+
+def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_is_without_them(
+    config: MakeConfig,
+) -> None:
+    text = others(hung="Silent", failed="Failing", finished="Ending", killed="Silent")
+    settings = ("board.bridge.ends_run=false", "host.program.program=host_programs:Silent")
+    settings += ("host.failed={ restarts = 1, restarts_within_s = 1e6 }",)
+    with Rack(config(*settings, text=text)) as rack:
+        rack.start()
+        block = rack.segment.block("killed")
+        wait_until(lambda: block[Block.PID] > 0 and rack.watch(0.01) is not None)
+        os.kill(block[Block.PID], signal.SIGKILL)
+        ends = {"killed": "rejoined", "failed": "given_up", "finished": "done"}
+        watch(rack, lambda: all(code in codes(rack, board) for board, code in ends.items()))
+        assert rack.segment.words[System.EMERGENCY_STOP] == 0
+        assert sum(rack.segment.block(task.name)[Block.MISSED] for task in rack.segment.layout.tasks) == 0
+        assert rack.outcome is not None
+        ticks = rack.outcome.ticks
+        found = chains(rack.segment, ticks)["adder.status"]
+    assert codes(rack, "killed") == ["died", "restart", "rejoined"]
+    # It may fail again before the Rack has seen its new process.
+    failed = [code for code in codes(rack, "failed") if code != "rejoined"]
+    assert failed == ["died", "restart", "died", "given_up"]
+    line = inspect.getsourcelines(Failing.run)[1] + 2
+    printed = [event.text for event in rack.events if event.kind == "printed"]
+    assert printed == [f"host board 'failed': ValueError: no numbers (host_programs.py, line {line})"] * 2
+    external = [f"host.{name}.external=true" for name in ("program", "hung", "failed", "finished", "killed")]
+    with Rack(config(*settings, *external, text=text)) as alone:
+        alone.run(ticks * 0.0025)
+        assert chains(alone.segment, ticks)["adder.status"] == found
+
+
+def test_a_flood_is_bounded_in_every_cycle_and_its_writer_is_refused(config: MakeConfig) -> None:
+    settings = ("host.program.program=host_programs:Flooding", "board.bridge.params.pass.numbers.most=3")
+    with Rack(config(*settings, text=HOSTED)) as rack:
+        rack.start()
+        watch(rack, lambda: status(rack.segment).numbers["full"] > 100 and status(rack.segment).numbers["passed"] > 100)
+        entry, bridge = status(rack.segment).numbers, rack.segment.block("bridge")
+        assert entry["passed"] <= 3 * bridge[Block.CYCLES]
+        assert entry["waiting"] <= 32
+        assert bridge[Block.MISSED] == rack.segment.block("adder")[Block.MISSED] == 0
+
+
+def test_what_is_damaged_or_improper_is_refused_at_the_bridge(config: MakeConfig) -> None:
+    settings = ("host.program.program=host_programs:Improper",)
+    with Rack(config(*settings, text=HOSTED)) as rack:
+        assert rack.run().cause == "task done"
+        entry = status(rack.segment).numbers
+        assert (entry["passed"], entry["refused"], status(rack.segment, "adder").sum) == (1, 2, 7.0)
+
+
+def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_it_started(config: MakeConfig) -> None:
+    # The fixture checks that no process is left.
+    with Rack(config("host.program.program=host_programs:Deaf", text=HOSTED)) as rack:
+        rack.start()
+        watch(rack, lambda: status(rack.segment, "adder").sum > 0)
+
+
+def test_a_stopped_program_is_found_killed_and_started_again(config: MakeConfig) -> None:
+    text = HOSTED + '\n[[fault]]\nkind = "hang"\nboard = "program"\nwhen = "adder.status.last == 1"\n'
+    with Rack(config("host.program.program=host_programs:Deaf", text=text)) as rack:
+        rack.start()
+        watch(rack, lambda: "rejoined" in codes(rack, "program"))
+    assert [code for code in codes(rack, "program") if code in ENDS] == ["died", "restart", "rejoined"]
+    assert "'program' is not responding: stopped by a signal" in [event.text for event in rack.events]
+
+
+def test_a_killed_bridge_goes_on_where_it_was(config: MakeConfig) -> None:
+    text = HOSTED + '\n[[fault]]\nkind = "kill"\nboard = "bridge"\nwhen = "adder.status.last == 20"\n'
+    with Rack(config("host.program.params.count=60", "supervision.lockstep_restart_s=0.1", text=text)) as rack:
+        assert rack.run().cause == "task done"
+        assert (status(rack.segment).numbers["passed"], status(rack.segment, "adder").sum) == (60, 60 * 61 / 2)
+
+
+def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConfig) -> None:
+    found = config("host.program.program=host_programs:Console", "host.program.external=true", text=HOSTED)
+    with Rack(found) as rack:
+        rack.start()
+        (wiring,) = resolve(found).hosts
+        first = HostBus(rack.segment, wiring)
+        with pytest.raises(MailboxError, match=f"'program' is run by process {os.getpid()} already; permitted: one"):
+            HostBus(rack.segment, wiring)
+        assert first.send("numbers", value=2.0)
+        first.close()
+        second = HostBus(rack.segment, wiring)
+        assert second.send("numbers", value=3.0)
+        wait_until(lambda: rack.watch(0.01) and second.read("sum").value.last == 2)
+        assert (second.read("sum").value.sum, second.sent("numbers")) == (5.0, 2)
+        with pytest.raises(AttributeError, match="no field 'valu'; fields: id, value, colour"):
+            second.send("numbers", valu=1)
+        second.finish()
+        while rack.watch(0.5):
+            continue
+        assert rack.outcome is not None
+        assert rack.outcome.cause == "task done"
+        assert second.is_over
+        assert not second.wait(60.0)
+        second.close()

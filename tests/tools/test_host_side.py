@@ -1,0 +1,123 @@
+"""The host side on the command line: a prompt, what status and check show, and replays of recorded entries."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards import Rack
+from rack.boards.config import load
+from tests.boards.test_host_side import HOSTED
+from tests.processes import RACK
+from tests.tools.command_line import rack
+
+
+@pytest.fixture
+def hosted(tmp_path: Path) -> Path:
+    """A rack with a host board, as a file."""
+    path = tmp_path / "hosted.toml"
+    path.write_text(HOSTED)
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of a recorded run, and its report."""
+    folder = tmp_path_factory.mktemp("recorded")
+    (folder / "hosted.toml").write_text(HOSTED)
+    settings = ["--set", f"name=entries-{os.getpid()}", "--set", "host.program.params.count=40"]
+    done = rack("run", folder / "hosted.toml", *settings, "--out", folder / "run", "--json")
+    return folder / "run", json.loads(done.stdout)
+
+
+def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
+    hosted: Path, rack_name: str, tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
+) -> None:
+    run, first = recorded
+    out = ("--entries", run, "--out", tmp_path / "again", "--json")
+    again = json.loads(rack("run", hosted, "--set", f"name={rack_name}", *out).stdout)
+    assert [report["outcome"]["cause"] for report in (first, again)] == ["task done"] * 2
+    assert first["digest"] == again["digest"]
+    assert first["entries"] == again["entries"]
+    assert next(entry["passed"] for entry in first["entries"]) == 40
+    assert "--entries RUN repeats a run" in first["notes"][0]
+    assert again["notes"] == []
+
+
+def test_entries_of_another_rack_are_refused_in_one_line(
+    rack_name: str, tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
+) -> None:
+    run, _ = recorded
+    other = tmp_path / "other.toml"
+    text = HOSTED.replace("numbers = {", "others = {")
+    other.write_text(text.replace("[host", 'reads.number = "bridge.others"\n\n[host'))
+    done = rack("run", other, "--entries", run, "--no-record")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"--entries {run}: bridge.others: no such mailbox; needed: number 1, 24 bytes\n"
+    none = rack("run", "k1607", "--set", f"name={rack_name}", "--entries", run, "--no-record")
+    assert (none.returncode, none.stderr) == (2, f"--entries {run}: '{rack_name}' has no bus adapter\n")
+
+
+def test_check_shows_the_host_side_and_leaves_it_out_of_the_timing(hosted: Path) -> None:
+    text = rack("check", hosted).stdout
+    assert "program    host_programs:Counting  program.numbers  bridge.sum" in text
+    found = json.loads(rack("check", hosted, "--json").stdout)
+    assert [task["task"] for task in found["tasks"]] == ["bridge", "adder"]
+    assert found["hosts"][0]["writes"] == ["program.numbers"]
+
+
+@contextmanager
+def console(hosted: Path, name: str) -> Iterator[Rack]:
+    """Run a rack with an external host board."""
+    settings = [f"name={name}", "host.program.external=true", "host.program.program=host_programs:Console"]
+    with Rack(load(hosted, settings)) as running:
+        running.start()
+        yield running
+
+
+def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(hosted: Path, rack_name: str) -> None:
+    with console(hosted, rack_name) as running:
+        first = subprocess.Popen(
+            [*RACK, "prompt", rack_name], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        )
+        assert first.stdin is not None
+        assert first.stdout is not None
+        with first:
+            first.stdin.write("number(4)\nprint('sent')\n")
+            while "sent" not in first.stdout.readline():
+                continue
+            second = rack("prompt", rack_name)
+            assert second.returncode == 1
+            assert second.stderr == f"host board 'program' is run by process {first.pid} already; permitted: one\n"
+            status = rack("status", rack_name).stdout
+            assert f"program  {first.pid}  running     1         0" in status
+            first.kill()
+        # A prompt that was killed leaves its place to the next one.
+        script = hosted.parent / "more.py"
+        script.write_text("number(5)\nwhile bus.read('sum').value.sum < 9:\n    bus.wait(1.0)\nbus.finish()\n")
+        done = rack("prompt", rack_name, "program", script)
+        assert (done.returncode, done.stderr) == (0, "")
+        while running.watch(0.5):
+            continue
+        assert running.outcome is not None
+        assert running.outcome.cause == "task done"
+
+
+def test_a_script_that_fails_is_one_line_and_unknown_boards_are_refused(hosted: Path, rack_name: str) -> None:
+    with console(hosted, rack_name):
+        script = hosted.parent / "bad.py"
+        script.write_text("number(1 / 0)\n")
+        done = rack("prompt", rack_name, "program", script)
+        assert (done.returncode, done.stderr) == (1, f"{script}: ZeroDivisionError: division by zero\n")
+        wrong = rack("prompt", rack_name, "adder")
+        assert wrong.returncode == 2
+        assert wrong.stderr.startswith(
+            f"BOARD = adder: not an external host board of '{rack_name}'; permitted: program"
+        )

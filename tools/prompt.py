@@ -1,0 +1,105 @@
+"""`rack prompt`: a Python prompt, or a script, on the host side of a running rack."""
+
+from __future__ import annotations
+
+import code
+import contextlib
+import runpy
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rack.backplane.segment import Segment
+from rack.boards.classes import find_class
+from rack.boards.config.resolved import loads, resolve
+from rack.boards.host.bus import HostBus
+from rack.boards.wiring import HostWiring
+from rack.levels.host_program import HostProgram
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT, SIGNALS
+from rack.tools.console.parameters import RackName
+
+HostName = Annotated[
+    str | None, typer.Argument(metavar="BOARD", help="external host board; not needed when the rack has one")
+]
+Script = Annotated[
+    Path | None, typer.Argument(metavar="SCRIPT", help="Python script to run, in place of a prompt", dir_okay=False)
+]
+
+
+def prompt(rack: RackName, board: HostName = None, script: Script = None) -> None:
+    """Open a Python prompt on the host side of a running rack, or run a script there.
+
+    It takes the place of the program of a host board with `external = true`, one process at a time. `bus` sends and
+    reads messages, `program` is the board's program, which may offer more names. Whatever happens here, the real-time
+    side is not delayed. The prompt can be left and opened again while the rack runs.
+
+    Exit status: 0 it was left; 1 there is no such rack, the board is in use, or the script failed; 2 usage.
+
+    \b
+    Examples:
+      rack prompt chimera
+      rack prompt chimera command stream.py
+    """
+    segment = Segment.attach(rack)
+    if segment.run_is_over:
+        raise Failure(f"rack '{rack}': the run is over")
+    wiring = _wiring(segment, board)
+    program = find_class(wiring.target, HostProgram)(wiring.context)
+    bus = HostBus(segment, wiring)
+    names = {"bus": bus, "program": program, **program.names(bus)}
+    try:
+        with _python_signals():
+            if script is None:
+                _interact(rack, wiring.board, names)
+            else:
+                _run(script, names)
+    finally:
+        bus.close()
+
+
+def _wiring(segment: Segment, board: str | None) -> HostWiring:
+    """Return the wiring of the external board. Raises `Failure` if it cannot be told which."""
+    found = {host.board: host for host in resolve(loads(segment.config)).hosts if host.is_external}
+    names = ", ".join(found) or "none"
+    if board is None and len(found) != 1:
+        raise Failure(f"BOARD is missing; external host boards of '{segment.rack}': {names}", 2)
+    if board is not None and board not in found:
+        raise Failure(f"BOARD = {board}: not an external host board of '{segment.rack}'; permitted: {names}", 2)
+    return found[board or next(iter(found))]
+
+
+@contextlib.contextmanager
+def _python_signals() -> Iterator[None]:
+    """Let signals act as Python's own prompt and scripts expect: Ctrl-C is `KeyboardInterrupt`."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _interact(rack: str, board: str, names: dict[str, Any]) -> None:
+    with contextlib.suppress(ImportError):
+        import readline  # noqa: F401  line editing and history
+
+    offered = ", ".join(names)
+    code.interact(f"rack {rack}, host board '{board}': {offered}", local=names, exitmsg="")
+
+
+def _run(script: Path, names: dict[str, Any]) -> None:
+    """Run a script. Raises `Failure` with the exception, in one line, that ended it."""
+    if not script.is_file():
+        raise Failure(f"{script}: no such file", 2)
+    try:
+        runpy.run_path(str(script), names, "__main__")
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPT.number or 128 + signal.SIGINT)
+    except Exception as error:
+        raise Failure(f"{script}: {type(error).__name__}: {error}") from error

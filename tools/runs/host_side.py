@@ -1,0 +1,93 @@
+"""The host side of a running rack: its boards, and what bus adapters pass between the two sides."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Box, TaskState
+
+ADAPTER_STATUS = "adapter_status"
+"""Message type of the status of a bus adapter: a group of counts for each entry."""
+AWAY = "away"
+"""State of a host board that no process runs: an external one, or one that is being restarted."""
+DONE = "done"
+
+
+@dataclass(frozen=True)
+class HostRow:
+    """A host board now: `pid` is 0 while no process runs it, `sent` counts its messages."""
+
+    board: str
+    pid: int
+    state: str
+    sent: int
+    restarts: int
+
+
+@dataclass(frozen=True)
+class EntryRow:
+    """One entry of a bus adapter: its counts, and the age of its newest message, simulated ms; None: none yet."""
+
+    entry: str
+    source: str
+    passed: int
+    refused: int
+    overtaken: int
+    full: int
+    waiting: int
+    age_ms: float | None
+
+
+def host_rows(segment: Segment) -> tuple[HostRow, ...]:
+    """Return the host boards."""
+    return tuple(_host_row(segment, host) for host in segment.layout.hosts)
+
+
+def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
+    block = segment.block(host.name)
+    # The process that runs a host board locks this word, and the kernel unlocks it.
+    runs = ByteLock.is_taken(segment, segment.map.blocks[host.name] + 8 * Block.PID)
+    state = TaskState(block[Block.STATE])
+    heads = [segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == host.name]
+    return HostRow(
+        board=host.name,
+        pid=block[Block.PID] if runs else 0,
+        state=DONE if state == TaskState.ENDED else state.name.lower() if runs else AWAY,
+        sent=sum(segment.words[head + Box.HEAD] for head in heads),
+        restarts=max([0, *(segment.words[head + Box.EPOCH] - 1 for head in heads)]),
+    )
+
+
+def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
+    """Return the entries of all bus adapters."""
+    found: list[EntryRow] = []
+    tick_ms = segment.layout.clock_ns * 1e-6
+    for mailbox, entry, source in entries_of(segment.layout, segment.config):
+        status = open_observer(segment, mailbox).peek()
+        if status.is_there:
+            counts = getattr(status.value, entry)
+            age = int(counts["age"])
+            found.append(
+                EntryRow(
+                    entry=f"{mailbox.partition('.')[0]}.{entry}",
+                    source=source,
+                    **{name: int(counts[name]) for name in ("passed", "refused", "overtaken", "full", "waiting")},
+                    age_ms=None if age < 0 else age * tick_ms,
+                )
+            )
+    return tuple(found)
+
+
+def entries_of(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
+    """Yield status mailbox, name and source of every entry of a rack's bus adapters; `config` is TOML text."""
+    boxes = [box.name for box in layout.mailboxes if box.message == ADAPTER_STATUS]
+    boards = tomllib.loads(config)["board"] if boxes else {}
+    for box in boxes:
+        for entry, table in boards[box.partition(".")[0]].get("params", {}).get("pass", {}).items():
+            yield box, entry, table["from"]
