@@ -23,7 +23,8 @@ class BoardTiming:
     `above` and `below` name each other: a board is above all that it lists below, and all that list it above.
 
     `is_critical` is true if the plan update is the paper's critical section: it keeps the executor waiting. `budget` is
-    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock.
+    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock. `queues` are the
+    mailboxes in which messages wait for it.
     """
 
     name: str
@@ -40,6 +41,7 @@ class BoardTiming:
     is_critical: bool
     budget: Budget | None
     plan_within_ns: int | None = None
+    queues: tuple[str, ...] = ()
 
     @property
     def is_plan_budgeted(self) -> bool:
