@@ -121,6 +121,7 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
         if row.otherwise and rest == left:
             yield f"{_named(number, row)}: never fires in '{state}': the rows above it take every case of it"
         left = rest
+    left = joined(left)
     for box in left[:MAX_HOLES]:
         yield f"hole: no row of '{state}' takes {_described(box, vocabulary)}"
     if len(left) > MAX_HOLES:
@@ -156,6 +157,19 @@ def without(box: Box, taken: Box) -> Sequence[Box]:
             pieces.append({**rest, condition: outside})
         rest[condition] = inside
     return pieces
+
+
+def joined(boxes: Sequence[Box]) -> list[Box]:
+    """Return fewer boxes with the same cases: those that differ in one condition become one."""
+    left: list[Box] = []
+    for count, box in enumerate(boxes, 1):
+        for at, other in enumerate(left):
+            differing = [condition for condition in box if box[condition] != other[condition]]
+            if len(differing) == 1:
+                both = {**box, differing[0]: box[differing[0]] | other[differing[0]]}
+                return joined([*left[:at], both, *left[at + 1 :], *boxes[count:]])
+        left.append(box)
+    return left
 
 
 def _described(box: Box, vocabulary: Vocabulary) -> str:

@@ -45,6 +45,7 @@ MOVE_TABLE_STATUS = status(
     *STATUS_HEAD,
     Field("sent", "u4", "1", "serial of the newest command sent down; 0: none"),
     Field("reached", "u1", "1", "1: the newest pose has joint positions"),
+    Field("put", "i2", "1", "row of the object put down last; -1: none"),
     Field("resting", "u1", "1", "1: the arm rests"),
 )
 
@@ -61,7 +62,9 @@ class MovePlanConfig(Table):
 
     pose: dict[Name, TaughtPoseConfig] = Key(min_length=1, description="poses by name")
     place: dict[Name, Place] = Key({}, description="origin of an object put there, m, by name")
-    moved: NotNegative = Key(0.01, description="distance from where it was sensed at which an object is displaced, m")
+    moved: NotNegative = Key(
+        0.01, description="distance from where it was sensed , or should stand, at which an object is displaced, m"
+    )
     home_speed: Positive = Key(1.0, le=1.0, description="part of the joints' limits on the way home")
 
 
@@ -85,6 +88,7 @@ class MoveTable(StateTableExecutor):
                 ("there", "displaced", "moving"),
                 "the object to pick: there: where it was sensed for the newest `move`; a place is always there",
             ),
+            "support": Condition(("there", "elsewhere"), "where the object put down last rests: at its place, or not"),
             "gripper": Condition(("free", "holds"), "whether the gripper holds something"),
             "reach": Condition(YES_NO, "whether the newest pose has joint positions"),
         },
@@ -111,6 +115,7 @@ class MoveTable(StateTableExecutor):
         self._aim = np.zeros(3)  # m: where the object, or the place, was for it
         self._yaw = 0.0  # rad: likewise
         self._holds = False  # the gripper holds something
+        self._carried = self._put = -1  # rows of the object in it, and of the one put down last; -1: none
         self._row = -1  # of that object in the world model; -1: it was a place
         self._positions: Array = np.zeros((context.sizes["bodies"], 3))  # m, as sensed
         self._quaternions: Array = np.zeros((context.sizes["bodies"], 4))
@@ -127,19 +132,22 @@ class MoveTable(StateTableExecutor):
             last = read.last_command.value
             write.command.copy_from(last)
             self._sent, self._reached = read.last_status.value.sent, bool(read.last_status.value.reached)
+            self._put = read.last_status.value.put
             self._what, self._speed, self._row = last.words, last.speed, last.object
             self._joints[:], self._aim[:], self._yaw = last.joints, last.aim, last.yaw
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
         """Return where the level below, the object and the gripper are."""
         below, world = read.status.value, read.world.value
-        self.detail, self.resting, self._holds = below.reason, not below.moving, below.held > 0
+        self.detail, self.resting = below.reason, not below.moving
+        self._holds, self._carried = below.held > 0, below.object if below.held else -1
         self._positions, self._quaternions = world.position, world.quaternion
         is_seen = not read.world.is_lost and world.revision > 0
         return {
             "below": answer_of(read.status, self._sent),
             "world": "seen" if is_seen else "unseen",
             "target": self._target(world) if is_seen else "moving",
+            "support": "there" if not is_seen or self._put < 0 or self._is_at(world, self._put) else "elsewhere",
             "gripper": ("free", "holds")[self._holds],
             "reach": YES_NO[self._reached],
         }
@@ -149,8 +157,11 @@ class MoveTable(StateTableExecutor):
             return "there"
         if norm(world.velocity[self._row]) > STILL_M_S:
             return "moving"
-        away = norm(world.position[self._row] - self._aim)
-        return "displaced" if away > self.table.plan.moved else "there"
+        return "there" if self._is_at(world, self._row) else "displaced"
+
+    def _is_at(self, world: Message, row: int) -> bool:
+        """Return whether an object is where the newest motion aims."""
+        return bool(norm(world.position[row] - self._aim) <= self.table.plan.moved)
 
     def do_move(self, pose: str) -> None:
         """Send the arm to a pose."""
@@ -167,6 +178,7 @@ class MoveTable(StateTableExecutor):
 
     def do_open(self) -> None:
         """Open the gripper."""
+        self._put = self._carried
         self._send("open", self._joints, 1.0)
 
     def do_close(self) -> None:
@@ -207,3 +219,4 @@ class MoveTable(StateTableExecutor):
         command.joints[:], command.speed = self._joints, self._speed
         command.object, command.aim, command.yaw = self._row, self._aim, self._yaw
         shown.sent, shown.reached, shown.resting = self._sent, self._reached, self.resting
+        shown.put = self._put

@@ -57,6 +57,7 @@ JOINT_MOVE_STATUS = status(
     1,
     *STATUS_HEAD,
     Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
+    Field("end", "f8", "rad", "where the newest motion ends", ("joints",)),
     Field("moving", "u1", "1", "1: they still change"),
     Field("closed", "u1", "1", "1: the gripper is commanded to close"),
     Field("held", "u1", "1", "1: it holds something"),
@@ -87,8 +88,8 @@ class PrimitiveTable(StateTableExecutor):
         conditions={
             "hold": Condition(YES_NO, "whether an operator or the level above holds this one, or its board is lost"),
             "arm": Condition(
-                ("still", "moving", "away"),
-                "still: at the end of the motion; away: the boards below do not follow set points",
+                ("arrived", "resting", "moving", "away"),
+                "arrived: at rest where the newest motion ends; resting: elsewhere; away: the joints do not follow",
             ),
             "gripper": Condition(("moving", "open", "empty", "holds"), "empty: closed on nothing"),
         },
@@ -117,6 +118,7 @@ class PrimitiveTable(StateTableExecutor):
         self._point = np.zeros((3, len(cell.home)))  # the newest set point: rad, rad/s, rad/s2
         self._point[0] = cell.home
         self._goal, self._speed = cell.home.copy(), 1.0  # rad, part of the limits: of the newest command
+        self._end = cell.home.copy()  # (joints,), rad: where the newest motion ends
         self._curve: Curve | None = None  # None: at rest
         self._from = 0  # tick at which it began
         self._follows = 0  # cycles for which the boards below have followed; 0: they do not
@@ -136,7 +138,7 @@ class PrimitiveTable(StateTableExecutor):
         if read.last_status.is_there:
             last = read.last_status.value
             self._closed, self._held, self._object = bool(last.closed), bool(last.held), last.object
-            self._point[0] = last.position
+            self._point[0], self._end[:] = last.position, last.end
             write.command.copy_from(read.last_command.value)
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
@@ -149,8 +151,13 @@ class PrimitiveTable(StateTableExecutor):
             self._point[0], self._point[1:], self._curve = self._curve.table[curves.REST], 0.0, None
         away = np.abs(position - self._point[0]).max() > self.table.plan.settled
         self.resting = self._curve is None and not away
-        arm = "away" if not self._follows else "still" if self.resting else "moving"
-        return {"arm": arm, "gripper": self._grip(read.arm.value), "hold": YES_NO[self.holds]}
+        there = np.abs(self._end - self._point[0]).max() <= self.table.plan.settled
+        arm = "moving" if not self.resting else "arrived" if there else "resting"
+        return {
+            "arm": arm if self._follows else "away",
+            "gripper": self._grip(read.arm.value),
+            "hold": YES_NO[self.holds],
+        }
 
     def _follow(self, read: Ports) -> Array:
         """Find out whether the boards below follow; return the joint positions, rad."""
@@ -189,6 +196,7 @@ class PrimitiveTable(StateTableExecutor):
             return self.do_halt()
         start, limits = self._point[0], self._limits
         goal = np.clip(self._goal, limits.position[:, 0], limits.position[:, 1])
+        self._end[:] = goal
         speed = min(max(self._speed, MIN_SPEED), 1.0)
         if np.abs(goal - start).max() > NOWHERE_RAD:
             self._start(Passage(start, goal, speed * limits.velocity, speed * limits.acceleration))
@@ -228,5 +236,5 @@ class PrimitiveTable(StateTableExecutor):
         command.inertia, command.load = np.diagonal(inertia), bias
         command.opening = self._gripper.closed if self._closed else self._gripper.open
         command.force, command.payload_mass = self._gripper.force, load.mass
-        shown.position, shown.moving = self._point[0], not self.resting
+        shown.position, shown.end, shown.moving = self._point[0], self._end, not self.resting
         shown.closed, shown.held, shown.object = self._closed, self._held, self._object if self._held else -1

@@ -6,8 +6,9 @@ Pre-emptive Scheduling*, Software Engineering Journal 8 (1993):
 
     R = w + J,  w = B + C + sum over all tasks above of ceil((w + J_j) / T_j) C_j.
 
-This is the response of a job released together with all tasks above it. A rack releases all tasks together at tick 0,
-so the bound is attained. Times are integers in one unit; a rack uses ns.
+This is the response of a job released together with all tasks above it. A rack without phases releases all tasks
+together at tick 0, so the bound is attained; boards with phases may respond sooner, never later. Times are integers in
+one unit; a rack uses ns.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from rack.levels.timing.trace_times import (
 )
 from rack.tools.analysis.report_markdown import markdown
 from rack.tools.faults.judge import faults
-from rack.tools.runs.history import counted, first_difference, frequency, holds, misses, steal
+from rack.tools.runs.history import counted, fired_rows, first_difference, frequency, holds, misses, steal
 from rack.tools.runs.host_side import entries_of
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.queues import queues
@@ -70,6 +70,7 @@ def report_of(recording: Recording) -> Report:
         "frequency_mhz": frequency(recording),
         "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
         "holds": holds(recording),
+        "state_tables": fired_rows(recording),
         **faults(recording.events, layout),
         "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
         "system_response": system_response(recording),
@@ -85,7 +86,7 @@ def report_of(recording: Recording) -> Report:
 def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
-        *("misses", "steal", "frequency_mhz", "notes", "holds", "faults", "unexplained", "restarts"),
+        *("misses", "steal", "frequency_mhz", "notes", "holds", "state_tables", "faults", "unexplained", "restarts"),
         *("system_response", "entries", "task", "motion", "queues", "rows_lost"),
     )
     layout = wire(config)

@@ -86,6 +86,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _motion(report["motion"])
     yield from _queues(report["queues"])
     yield from _holds(report)
+    yield from _state_tables(report["state_tables"])
     yield from _times(report)
     yield from _faults(report)
     yield from _misses(report)
@@ -123,6 +124,21 @@ def _holds(report: Report) -> Iterator[str | Grid]:
     yield Grid(("level", "by", "since, s", "until, s", "lasted, s"), rows)
     for level in (hold["level"] for hold in holds if hold["until_s"] is None and hold["by"] == "operator"):
         yield from ("", f"Still held at the end: {level}; `{resume_command(report['rack'], level)}` releases it.")
+
+
+def _state_tables(levels: dict[str, list[Report]]) -> Iterator[str | Grid]:
+    """Yield one line a level: the table, how many rows fired, and those that fired first and last."""
+    if not levels:
+        return
+    yield from ("", "## State tables", "")
+    rows = []
+    for level, fired in levels.items():
+        most, last = max(fired, key=lambda row: row["cycles"]), fired[-1]
+        tables = ", then ".join(dict.fromkeys(row["table"] for row in fired))
+        count = [str(len(fired)), str(sum(row["cycles"] for row in fired))]
+        ends = [f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, last)]
+        rows.append([level, tables, *count, *ends])
+    yield Grid(("level", "table", "rows fired", "cycles", "most often, since", "newest, since"), rows)
 
 
 def _first(rows: Sequence[Any], which: str) -> str:

@@ -7,7 +7,7 @@ messages, by what each of them rests on.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +24,7 @@ from rack.levels.operator import Operation
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import CommandPath, command_paths, mailboxes_along
-from rack.levels.timing.trace_times import Distribution, distribution, plan_ages
+from rack.levels.timing.trace_times import Distribution, distribution, newest_visible
 from rack.tools.analysis.analysis import core_loads
 from rack.tools.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.benches.observed import CycleCount, Runs, missed_share
@@ -213,7 +213,7 @@ def cycles_in(run: RunResult, layout: Layout, board: str) -> CycleCount:
 
 
 def ages_ms(recording: Recording, timing: RackTiming, down: bool) -> Distribution | None:
-    """Return the age of commands as the lowest levels read them, or of their statuses as read above, ms.
+    """Return the age of commands in the cycles of the lowest levels, or of their statuses in those above, ms.
 
     An age is the time since the release that wrote the message. None if there is no such message.
     """
@@ -223,8 +223,12 @@ def ages_ms(recording: Recording, timing: RackTiming, down: bool) -> Distributio
 
 
 def _ages(recording: Recording, writer: str, reader: str) -> Iterator[np.ndarray]:
-    """Yield the ages in ticks of what one board reads of another, cycle by cycle."""
-    read: Mapping[str, np.ndarray] = recording.cycles
+    """Yield the ages in ticks of what one board has of another, cycle by cycle."""
+    cycles: np.ndarray = recording.cycles[reader]["tick"]
     for box in mailboxes_along(recording.layout, (writer, reader)):
         made, visible_at = (recording.signal(box.name, name) for name in ("tick", "visible_at"))
-        yield plan_ages(read[reader]["tick"], made, visible_at)
+        grid = recording.layout.read_grid(box, reader)
+        # Between two reads the message of the last one grows older.
+        since = (cycles - grid.phase) % grid.every
+        newest = newest_visible(cycles - since, visible_at)
+        yield cycles[newest >= 0] - made[newest[newest >= 0]]

@@ -34,13 +34,14 @@ SILENT_S = 5.0
 NOTE_S = 1.5
 """Time after which a wait is explained on stderr."""
 
-Fate = Literal["given", "taken", "done", "refused", "overtaken"]
+Fate = Literal["waiting", "given", "taken", "done", "refused", "overtaken"]
 
 
 @dataclass(frozen=True)
 class Reply:
     """A command and its fate. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
 
+    The fate "waiting" is that of a command to a rack held for single steps; it has no serial yet.
     The fate stays "given" where the level's status does not answer operators. `objection` is why it was refused.
     """
 
@@ -70,6 +71,8 @@ class Reply:
     @property
     def line(self) -> str:
         """All of it as one line."""
+        if self.fate == "waiting":
+            return f"command to '{self.level}', {self.text}: waits for the next step of the rack, which is held"
         ends = {
             "given": "; the status of this level does not answer operators",
             "taken": f", taken up at tick {self.taken_up}",
@@ -114,6 +117,10 @@ class LiveDesk:
             raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
         if _Patience(segment, "").is_in_vain:
             raise Failure(f"rack '{segment.rack}': its run is over")
+        if segment.words[System.HELD]:
+            # Without a client: whoever gives it steps the rack afterwards.
+            entry = self._table.add(wanted)
+            return Reply(0, command.level, describe(message_of(entry, segment.layout)), -1, "waiting")
         # However the wait ends, leaving the claim withdraws a request that has not been given.
         with self._table.claim(wanted) as entry:
             ticket, text = entry[RequestWord.TICKET], describe(message_of(entry, segment.layout))

@@ -89,6 +89,25 @@ def holds(recording: Recording) -> list[dict[str, Any]]:
     return sorted(found, key=lambda hold: (hold["since_s"], hold["level"]))
 
 
+def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
+    """Return, by level with state tables, the rows that fired: table, row, name, cycles, and when first."""
+    found = {}
+    for mailbox in recording.mailboxes:
+        if not {"table", "row", "fired"} <= recording.fields(mailbox):
+            continue
+        ticks, row = recording.signal(mailbox, "tick"), recording.signal(mailbox, "row")
+        texts = recording.signal(mailbox, "table"), recording.signal(mailbox, "fired")
+        cycles: dict[tuple[str, int, str], list[int]] = {}
+        for tick, key in zip(ticks.tolist(), zip(texts[0], row.tolist(), texts[1], strict=True), strict=True):
+            cycles.setdefault(key, [0, tick])[0] += 1
+        tick_s = recording.layout.clock_ns * 1e-9
+        found[mailbox.removesuffix(".status")] = [
+            {"table": table, "row": number, "name": name, "cycles": count, "first_s": round(first * tick_s, 6)}
+            for (table, number, name), (count, first) in sorted(cycles.items(), key=lambda item: item[1][1])
+        ]
+    return found
+
+
 def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
     mailbox, tick_s = f"{level}.status", recording.layout.clock_ns * 1e-9
     fields = recording.fields(mailbox)

@@ -36,7 +36,9 @@ class Queues:
     """Looks at the queues of a rack, from the host side."""
 
     def __init__(self, segment: Segment) -> None:
-        boxes = [box for box in segment.layout.mailboxes if box.protocol == "queue"]
+        # Those of host boards are queues whose readers write no position.
+        tasks = {task.name for task in segment.layout.tasks}
+        boxes = [box for box in segment.layout.mailboxes if box.protocol == "queue" and box.writer in tasks]
         self._ends = [(open_observer(segment, b.name), open_observer(segment, taken_name(b.name))) for b in boxes]
 
     def look(self) -> tuple[QueueFill, ...]:

@@ -67,6 +67,24 @@ class Commanded:
         self._serials.write(block, block.messages["id"], lambda serial: f"command {serial}" if serial else "")
 
 
+class FiredRows:
+    """Writes which row of a state table fires, as a lane, and every change to the log."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
+        self._stream, self._board = stream, mailbox.name.partition(".")[0]
+        self._lane, self._changes = ValueLane(stream, self._board, "row"), Changes()
+
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        rows = block.messages[["table", "row", "fired", "in_state"]]
+        self._lane.write(block, rows, lambda row: f"{row[1]} {row[2].decode('ascii', 'replace')}")
+        for at in self._changes.rows(rows):
+            table, row, fired, state = (part.decode() if isinstance(part, bytes) else part for part in rows[at].item())
+            text = f"{self._board}: row {row} '{fired}', now in '{state}', table {table}"
+            line = rr.TextLog(text, level="INFO" if row else "ERROR")
+            self._stream.at(int(block.ticks[at]), int(block.stamps_ns[at]), (LOG, "rows"), line)
+
+
 class Moves:
     """Writes the current elemental move of `MOVE_STATUS`es, by its verb."""
 
@@ -77,6 +95,17 @@ class Moves:
         """Write what changed."""
         moves = block.messages[["current", "verb"]]
         self._moves.write(block, moves, lambda move: verb_name(move[1]) if move[0] else "")
+
+
+class Requests:
+    """Writes the motion request under way of `MOTION_STATUS`es."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
+        self._requests = ValueLane(stream, mailbox.name.partition(".")[0], "request")
+
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        self._requests.write(block, block.messages["current"], lambda serial: f"request {serial}" if serial else "")
 
 
 def verb_name(verb: int) -> str:

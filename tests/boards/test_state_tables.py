@@ -1,0 +1,115 @@
+"""A level whose executor is a state table: the row that fires, swaps at a tick, restarts, an operator's commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import State
+from rack.boards import Rack
+from rack.boards.config.resolved import resolve
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError
+from tests.boards.commanded_racks import commands
+from tests.boards.conftest import MakeConfig
+from tests.boards.messages import Written
+from tests.boards.table_racks import HOLE, SAW, counting
+
+SWAP = 'level = "counter", what = "table", name = "slow", tick = 39'
+SWAP_BACK = 'level = "counter", what = "table", name = "saw", tick = 59'
+RESET = 'level = "counter", what = "do", name = "reset high", tick = 19'
+RESUME = 'level = "counter", what = "resume", tick = 31'
+EDIT = 'fault=[{ kind = "kill", board = "counter", at = 0.1 }]'
+
+
+def counted(config: RackConfig, seconds: float = 0.25) -> tuple[np.ndarray, str]:
+    """Run a rack; return the statuses of its counter, one a cycle, and the digest."""
+    with Rack(config) as rack:
+        outcome = rack.run(seconds)
+        return Written.on(rack.segment).messages["counter.status"]["message"], outcome.digest
+
+
+@pytest.fixture
+def counter(config: MakeConfig, tmp_path: Path) -> MakeConfig:
+    """Configs of the rack that counts."""
+    return lambda *settings: config(*settings, text=counting(tmp_path))
+
+
+def test_the_status_shows_the_row_that_fired(counter: MakeConfig) -> None:
+    statuses, _ = counted(counter())
+    assert statuses["count"][:14].tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 9, 8, 7, 6]
+    assert statuses["row"][8:13].tolist() == [3, 3, 4, 5, 5]
+    assert [name.decode() for name in statuses["fired"][9:12]] == ["count up", "turn", "count down"]
+    assert [name.decode() for name in statuses["in_state"][9:12]] == ["up", "down", "down"]
+    assert set(statuses["table"].tolist()) == {b"saw"}
+    assert set(statuses["state"].tolist()) == {State.EXECUTING}
+
+
+def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -> None:
+    given = commands(SWAP, SWAP_BACK)
+    (one, digest), (_, other) = counted(counter(given)), counted(counter(given))
+    names = [name.decode() for name in one["table"]]
+    assert names == ["saw"] * 10 + ["slow"] * 5 + ["saw"] * (len(names) - 15)
+    # It stays where it was, and goes on from there.
+    assert set(one["count"][10:15].tolist()) == {10}
+    assert digest == other != counted(counter())[1]
+
+
+def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
+    statuses, _ = counted(counter(commands(SWAP), 'fault=[{ kind = "kill", board = "counter", at = 0.15 }]'), 0.9)
+    assert statuses["table"][-1] == b"slow"
+    assert set(statuses["count"][10:].tolist()) == {10}
+
+
+def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(counter: MakeConfig, tmp_path: Path) -> None:
+    with Rack(counter(EDIT)) as rack:
+        (tmp_path / "saw.toml").write_text(SAW.replace('name = "count up"', 'name = "up it goes"'))
+        rack.run(0.9)
+        statuses = Written.on(rack.segment).messages["counter.status"]["message"]
+    names = [name.decode() for name in statuses["fired"]]
+    assert "count up" in names[:10]
+    assert "count up" not in names[10:]
+    assert "up it goes" in names[10:]
+    assert len(set(statuses["checksum"].tolist())) == 2
+    assert np.abs(np.diff(statuses["count"])).max() == 1
+
+
+def test_an_operator_does_a_command_of_the_level_until_resume(counter: MakeConfig) -> None:
+    statuses, _ = counted(counter(commands(RESET, RESUME)))
+    assert statuses["fired"][5] == b"reset"
+    assert statuses["words"][5] == b"reset high"
+    assert statuses["count"][4:8].tolist() == [5, 10, 9, 8]
+    assert statuses["state"][5] == State.DONE
+    assert statuses["standing"][4:9].tolist() == [0, 6 + 1, 6 + 1, 6 + 1, 0]
+
+
+def test_a_table_with_a_hole_is_refused_with_its_state_and_case(counter: MakeConfig, tmp_path: Path) -> None:
+    given = counter()
+    (tmp_path / "saw.toml").write_text(HOLE)
+    with pytest.raises(ConfigError) as caught:
+        resolve(given)
+    assert str(caught.value) == (
+        "board.counter.params.tables.saw = \"saw.toml\": hole: no row of 'down' takes count = low, late = yes, new = no"
+    )
+
+
+def test_unknown_tables_and_commands_are_refused_with_those_that_there_are(counter: MakeConfig) -> None:
+    given = commands(
+        'level = "counter", what = "table", name = "swift", tick = 4',
+        'level = "counter", what = "do", name = "reset middle", tick = 4',
+        'level = "counter", what = "do", tick = 4',
+    )
+    with pytest.raises(ConfigError) as caught:
+        resolve(counter(given))
+    assert str(caught.value).splitlines() == [
+        "command[0].name = \"swift\": table of 'counter' knows: saw, slow",
+        "command[1].name = \"reset middle\": do of 'counter' knows: reset low, reset high",
+        "command[2].name: do of 'counter' knows: reset low, reset high",
+    ]
+
+
+def test_a_missing_file_is_a_mistake_of_the_config(counter: MakeConfig) -> None:
+    with pytest.raises(ConfigError, match=r'params\.tables\.saw = "none\.toml": cannot be read: No such file'):
+        resolve(counter("board.counter.params.tables.saw=none.toml"))
