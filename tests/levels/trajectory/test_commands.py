@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +134,7 @@ def test_an_unknown_body_is_refused() -> None:
 
 
 @pytest.fixture
-def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[[str], CommandEnvironment]]:
+def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], CommandEnvironment]:
     """Make a command environment that runs a script of this text."""
     monkeypatch.syspath_prepend(str(tmp_path))
 
@@ -143,7 +143,7 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Cal
         params = {"script": "moves.py"}
         return CommandEnvironment(LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params))
 
-    yield make
+    return make
 
 
 def test_a_script_finds_the_calls_by_name(environment: Callable[[str], CommandEnvironment]) -> None:
