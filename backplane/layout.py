@@ -7,18 +7,54 @@ attaches by name knows every mailbox and every task without importing the config
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 Sampled = Literal["time-slice", "double-buffer", "lock"]
 """Protocols whose readers sample the newest message."""
 PROTOCOLS: tuple[Sampled, ...] = ("time-slice", "double-buffer", "lock")
 Protocol = Literal[Sampled, "queue"]
 
+BY_TICKS: tuple[Protocol, ...] = ("time-slice", "queue")
+"""Protocols under which messages become visible at ticks fixed in advance."""
+
 Role = Literal["executor", "planner", "host"]
 """A "host" is a board of the host side: it has no rate, and the clock does not release it."""
 
 Wake = Literal["signal", "timer", "poll"]
 """How a task waits for its next cycle: see `rack.backplane.clock.wake`."""
+
+
+class TickGrid(NamedTuple):
+    """The ticks `phase`, `phase` + `every`, ..., with `phase` < `every`."""
+
+    every: int
+    phase: int = 0
+
+    def upto(self, tick: int) -> int:
+        """Return the newest of them up to `tick`; negative before the first."""
+        return tick - (tick - self.phase) % self.every
+
+    def since(self, tick: int) -> int:
+        """Return the first of them at `tick` or later, `tick` not being negative."""
+        return tick + (self.phase - tick) % self.every
+
+
+@dataclass(frozen=True)
+class ExchangeSpec:
+    """How the executor `task` reads a mailbox, if the config says so: at the ticks `phase`, `phase` + `every`, ...
+
+    `asynchronous`: it gets the newest message as soon as that is whole, whatever the protocol.
+    """
+
+    task: str
+    every: int
+    phase: int
+    asynchronous: bool = False
+
+    @property
+    def grid(self) -> TickGrid:
+        """The ticks at which it reads."""
+        return TickGrid(self.every, self.phase)
 
 
 @dataclass(frozen=True)
@@ -43,9 +79,10 @@ class MailboxSpec:
     """One mailbox: its writer and readers, its message, its protocol.
 
     `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
-    become visible at multiples of `every`. `depth` is the number of slots, a power of two. `rests_on` names the
-    mailboxes on whose information its messages rest, all read by its writer; queues, in which messages wait, are not
-    among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
+    become visible at multiples of `every`, counted from tick `phase`. `depth` is the number of slots, a power of two.
+    `rests_on` names the mailboxes on whose information its messages rest, all read by its writer; queues, in which
+    messages wait, are not among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
+    `exchanges` are the readers that do not simply read it in every cycle.
     """
 
     name: str
@@ -61,21 +98,28 @@ class MailboxSpec:
     fields: tuple[FieldSpec, ...]
     rests_on: tuple[str, ...] = ()
     capacity: int = 0
+    phase: int = 0
+    exchanges: tuple[ExchangeSpec, ...] = ()
 
     @property
     def is_by_ticks(self) -> bool:
-        """Whether what its readers get depends on ticks alone."""
-        return self.protocol in ("time-slice", "queue")
+        """Whether its messages become visible by ticks alone."""
+        return self.protocol in BY_TICKS
+
+    @property
+    def is_repeatable(self) -> bool:
+        """Whether what each of its readers gets depends on ticks alone."""
+        return self.is_by_ticks and not any(exchange.asynchronous for exchange in self.exchanges)
 
 
 @dataclass(frozen=True)
 class TaskSpec:
     """One schedulable task: the executor of a board or its planner.
 
-    `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in
-    ticks; `within_cycles` the cycles that one plan may take. `priority` is SCHED_FIFO's, 0 for
-    ordinary scheduling. `depth` is the number of records in its trace ring, a power of two. `wake`: how it waits for
-    its next cycle in real time.
+    `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in ticks; releases are
+    the ticks `phase`, `phase` + `every`, ... `within_cycles` is the cycles that one plan may take. `priority` is
+    SCHED_FIFO's, 0 for ordinary scheduling. `depth` is the number of records in its trace ring, a power of two. `wake`:
+    how it waits for its next cycle in real time.
     """
 
     name: str
@@ -88,6 +132,12 @@ class TaskSpec:
     within_cycles: int
     depth: int
     wake: Wake = "signal"
+    phase: int = 0
+
+    @property
+    def grid(self) -> TickGrid:
+        """Its releases."""
+        return TickGrid(self.every, self.phase)
 
 
 @dataclass(frozen=True)
@@ -121,6 +171,11 @@ class Layout:
     def task(self, name: str) -> TaskSpec:
         """Return the task, or the host board, of that name. Raises `KeyError`."""
         return {t.name: t for t in self.processes}[name]
+
+    def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
+        """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises `KeyError`."""
+        slowest = max((e.grid for e in mailbox.exchanges if e.task == reader), default=None)
+        return slowest or self.task(reader).grid
 
 
 def depth_for(span_ticks: int, every: int, least: int = 4) -> int:

@@ -20,12 +20,12 @@ import posix_ipc
 
 from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
 from rack.backplane.errors import SegmentError
-from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import ExchangeSpec, FieldSpec, Layout, MailboxSpec, TaskSpec
 from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 10
+VERSION = 11
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -233,18 +233,16 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
     return FieldSpec(**{**entry, "shape": shape, "fields": fields, "values": values})
 
 
+def mailbox_of(entry: dict[str, Any]) -> MailboxSpec:
+    """Return a mailbox from plain data, its `fields` excepted."""
+    # Recordings of earlier versions lack the last two.
+    names = {key: tuple(entry.get(key, ())) for key in ("readers", "rests_on")}
+    exchanges = tuple(ExchangeSpec(**exchange) for exchange in entry.get("exchanges", ()))
+    return MailboxSpec(**{**entry, **names, "exchanges": exchanges})
+
+
 def layout_of(entry: dict[str, Any]) -> Layout:
     """Return a layout from the plain data that `dataclasses.asdict` makes of it."""
-    boxes = [
-        MailboxSpec(
-            **{
-                **m,
-                "readers": tuple(m["readers"]),
-                "fields": tuple(_field(f) for f in m["fields"]),
-                "rests_on": tuple(m.get("rests_on", ())),  # recordings of earlier versions lack it
-            }
-        )
-        for m in entry["mailboxes"]
-    ]
+    boxes = [mailbox_of({**m, "fields": tuple(_field(f) for f in m["fields"])}) for m in entry["mailboxes"]]
     tasks, hosts = (tuple(TaskSpec(**t) for t in entry[key]) for key in ("tasks", "hosts"))
     return Layout(**{**entry, "tasks": tasks, "hosts": hosts, "mailboxes": tuple(boxes)})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from rack.backplane.layout import ExchangeSpec
 from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
@@ -37,7 +38,8 @@ class TaskWiring:
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
     task is one of the fastest and watches the clock. `sent`: the ports whose messages the level sends itself.
-    `fails_self_test`: a fault in the config. `entries`: for a bus adapter in a replay.
+    `fails_self_test`: a fault in the config. `entries`: for a bus adapter in a replay. `exchange`: the ports that are
+    not simply read in every cycle; it makes the task write its mailbox `<board>.exchange`.
     """
 
     task: str
@@ -51,6 +53,7 @@ class TaskWiring:
     fails_self_test: bool = False
     entries: Entries | None = None
     transfer: BusTimes = field(default_factory=BusTimes)
+    exchange: Mapping[str, ExchangeSpec] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

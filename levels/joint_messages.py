@@ -2,6 +2,16 @@
 
 Every vector has all joints of the arm; a board of some joints fills and obeys its own. Symbolic sizes as in
 `rack.levels.messages`.
+
+A level of your own that servoes joints
+- names them in its parameter `joints` (without one: all), and says with `gripper = true` that it drives the gripper.
+- writes a `JOINT_TORQUE` in every cycle, for the moment when it acts: a cycle after the release. `sampled` shows the
+  arm which of its statuses the torque rests on; one that is too old brakes it.
+- wants its joints where they are while the arm says `braked`: only then is it released. While it only says `stopped`,
+  brings them to rest and holds them; an arm that still moves after the time that this takes is braked.
+
+A level of your own above these reports no set point (`due = 0`) while one of them is `stopped`, and begins again where
+they hold the arm.
 """
 
 from __future__ import annotations

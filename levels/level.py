@@ -95,8 +95,8 @@ class Output(NamedTuple):
 
     type: MessageType
     cycles: int = 1
-    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, so that readers released then
-    find it fresh. If that cycle is missed, the message is missing too."""
+    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, counted from the board's phase,
+    so that readers released then find it fresh. If that cycle is missed, the message is missing too."""
     queued: bool = False
     """The level sends its messages itself, any number in a cycle: it fills `write.port` and calls `write.port.send()`.
     False: the queue is full, and the message was not taken; `write.port.room()` says how many more it takes."""
@@ -105,9 +105,9 @@ class Output(NamedTuple):
     carry the tick of that information, of an input that reads many the oldest, of none their own release. By these
     ticks the response of the whole hierarchy is measured."""
 
-    def is_due(self, tick: int, every: int) -> bool:
-        """Return whether the cycle released at `tick`, one of those every `every` ticks, writes it."""
-        return (tick + every) % (self.cycles * every) == 0
+    def is_due(self, tick: int, every: int, phase: int) -> bool:
+        """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`, writes it."""
+        return (tick - phase + every) % (self.cycles * every) == 0
 
 
 class MadePorts(NamedTuple):
@@ -164,6 +164,7 @@ class LevelContext:
     above: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level above, by name
     below: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level below, by name
     params: Mapping[str, Any] = field(default_factory=dict)  # `[board.<name>.params]`, as given
+    phase: int = 0  # first tick of the level, less than `every`
 
     @property
     def period_s(self) -> float:

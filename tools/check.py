@@ -133,6 +133,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
             "priority": task.priority,
             "rate_hz": 1e9 / (task.every * layout.clock_ns),
             "every_ticks": task.every,
+            "phase_ticks": task.phase,
             "slice_ms": task.every * task.within_cycles * tick_ms,
             "trace_address": places.traces[task.name],
         }
@@ -200,17 +201,19 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
     yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
     yield from found["notes"]
-    clock = [*map(str, (CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-")), "", "", "", ""]
+    phase = {"phase": "phase_ticks"} if any(task["phase_ticks"] for task in found["tasks"]) else {}
+    clock = [*map(str, (CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-"))]
     rows = [
         [
             *map(str, (t["slot"], t["task"], t["core"], t["priority"] or "-")),
-            *(f"{t['rate_hz']:g}", str(t["every_ticks"]), f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+            *(f"{t['rate_hz']:g}", str(t["every_ticks"]), *(str(t[key]) for key in phase.values())),
+            *(f"{t['slice_ms']:g}", _hex(t["trace_address"])),
         ]
         for t in found["tasks"]
     ]
-    head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", "slice, ms", "trace at"]
+    head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", *phase, "slice, ms", "trace at"]
     yield ""
-    yield from table(head, [clock, *rows], width, ("trace at", "slice, ms"))
+    yield from table(head, [[*clock, *[""] * (len(head) - len(clock))], *rows], width, ("trace at", "slice, ms"))
     rows = [
         [
             *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), _protocol(m)),

@@ -57,8 +57,8 @@ class ClockDriver(ABC):
     def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
         self.words = segment.words
         self.tasks = [ReleasedTask(segment, task) for task in by_priority(segment.layout)]
-        groups = groupby(self.tasks, key=lambda task: (task.spec.role, task.spec.every))
-        self._groups = [(every, list(tasks)) for (_, every), tasks in groups]
+        groups = groupby(self.tasks, key=lambda task: (task.spec.role, task.spec.every, task.spec.phase))
+        self._groups = [(every, phase, list(tasks)) for (_, every, phase), tasks in groups]
         self.controller: Controller | None = None
         self.skip = 0
         self.alarms = alarms or AlarmWriter(segment, CLOCK)
@@ -84,8 +84,8 @@ class ClockDriver(ABC):
     def due(self, tick: int, last: int) -> list[ReleasedTask]:
         """Return the tasks with a release in (last, tick], in the order of their releases."""
         found: list[ReleasedTask] = []
-        for every, tasks in self._groups:
-            release = tick - tick % every
+        for every, phase, tasks in self._groups:
+            release = tick - (tick - phase) % every
             if release > last:
                 found += [task for task in tasks if task.is_free(release)]
         return found

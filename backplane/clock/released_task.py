@@ -45,7 +45,7 @@ class ReleasedTask:
         self.missed = 0
         self.is_stopped = False
         self.deadline = self.block[_DEADLINE]
-        self._every = spec.every
+        self._every, self._phase = spec.every, spec.phase
         self._done = self.block[_DONE]
         self.wake: Callable[[], None] = wake_semaphore(segment.rack, spec.name).release
         self.done = done_semaphore(segment.rack, spec.name)
@@ -58,7 +58,7 @@ class ReleasedTask:
     def release(self, tick: int) -> None:
         """Give the task its newest release."""
         block, every = self.block, self._every
-        release = tick - tick % every
+        release = tick - (tick - self._phase) % every
         if self.is_stopped:
             self.check_stopped()
         done = block[_DONE]
@@ -117,7 +117,7 @@ class ReleasedTask:
 
 def by_priority(layout: Layout) -> list[TaskSpec]:
     """Return the tasks in the order in which the clock releases them: executors by rate, then planners."""
-    return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.slot))
+    return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.phase, t.slot))
 
 
 class Watchdog:

@@ -128,7 +128,7 @@ class NextCycle:
 
     def _block_on_semaphore(self) -> bool:
         bound = int(CHECK_S * 1e9)
-        if self._silent_clock is not None and self._due > 0:
+        if self._silent_clock is not None and self._has_begun:
             bound = min(bound, self._silent_clock.patience_ns(self._due))
         self._semaphore.bind(monotonic_ns() + bound)
         return not self._semaphore.wait() or self._look_around()
@@ -143,10 +143,15 @@ class NextCycle:
 
     def _look_around(self) -> bool:
         """Check the clock, after a wait without a release; return False if the launcher is gone."""
-        if self._silent_clock is not None and self._due > 0:
+        if self._silent_clock is not None and self._has_begun:
             self._silent_clock.check()
         return is_alive(*self._launcher)
 
+    @property
+    def _has_begun(self) -> bool:
+        """Whether a release is past: before the first one the clock may not have started."""
+        return self._due > self._spec.phase
+
     def hold_until(self, tick: int) -> None:
         """Take no release before `tick`: a planner keeps the time slice of its plan."""
-        self._due = max(self._due, tick + -tick % self._spec.every)
+        self._due = max(self._due, self._spec.grid.since(tick))

@@ -115,7 +115,7 @@ class Writer:
         if now is None or now < in_time:
             return in_time
         cycle = min(self.spec.every, self._delay)
-        return (now // cycle + 1) * cycle
+        return now + cycle - (now - self.spec.phase) % cycle
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
         """Publish `message`, visible at that tick; return False when its bound cut it off.

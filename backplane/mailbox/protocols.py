@@ -146,9 +146,10 @@ def open_writer(segment: Segment, name: str) -> Writer:
     return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
 
 
-def open_reader(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading under its protocol."""
-    return READERS[segment.layout.mailbox(name).protocol](segment, name)
+def open_reader(segment: Segment, name: str, asynchronous: bool = False) -> Reader:
+    """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is whole."""
+    protocol = segment.layout.mailbox(name).protocol
+    return READERS["double-buffer" if asynchronous and protocol == "time-slice" else protocol](segment, name)
 
 
 def open_observer(segment: Segment, name: str) -> Reader:

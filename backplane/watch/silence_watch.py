@@ -86,8 +86,12 @@ class SilenceWatch:
             self._investigate(tick, age)
             if tick - max(newest, self._task.since) >= self._lost_after:
                 return True
+        return self.is_writer_lost(tick)
+
+    def is_writer_lost(self, tick: int) -> bool:
+        """Say whether the writer is lost, however old its messages are."""
         # From the tick after the loss: within that tick the answer would depend on which process is faster.
-        return newest != NOT_YET and 0 < self._block[_LOST] <= tick
+        return self._reader.newest != NOT_YET and 0 < self._block[_LOST] <= tick
 
     def _investigate(self, tick: int, age: int) -> None:
         pid = pid_of(self._slots.box[_CLAIMANT])
@@ -108,7 +112,7 @@ class SilenceWatch:
         head = slots.box[0]
         # A serial without a message was lost on the way, not suppressed.
         spec = self._reader.spec
-        due = finished - (finished + spec.delay) % spec.every
+        due = finished - (finished + spec.delay - spec.phase) % spec.every
         return slots.copy(head) and slots.serial == head and slots.tick < due
 
     def _report(self, code: Alarm, tick: int, age: int) -> None:

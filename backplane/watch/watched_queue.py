@@ -71,7 +71,9 @@ class WatchedQueue:
             self._task.troubles += 1
         if is_bad or reader.taken != messages.seen:
             messages.judge(tick)
+        return reading._replace(is_lost=True) if self.is_writer_lost(tick) else reading
+
+    def is_writer_lost(self, tick: int) -> bool:
+        """Say whether the writer is lost."""
         # From the tick after the loss: within that tick the answer would depend on which process is faster.
-        if 0 < self._writer[_LOST] <= tick:
-            return reading._replace(is_lost=True)
-        return reading
+        return 0 < self._writer[_LOST] <= tick

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.layout import TickGrid
+from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.mailbox.protocols import open_reader
 from rack.backplane.mailbox.queue import ALL
 from rack.backplane.mailbox.slots import Slots
@@ -26,26 +27,32 @@ def everything() -> int:
 
 
 def watched(
-    segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask, room: Callable[[], int] = everything
+    segment: Segment,
+    name: str,
+    alarms: AlarmWriter,
+    task: ReadingTask,
+    *,
+    room: Callable[[], int] = everything,
+    asynchronous: bool = False,
 ) -> WatchedReader | SporadicReader | WatchedQueue:
     """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have no period.
 
-    `room`: how many messages of a queue to take, asked before each read.
+    `room`: how many messages of a queue to take, asked before each read. `asynchronous`: the task gets each message as
+    soon as it is whole, under any other protocol.
     """
     spec = segment.layout.mailbox(name)
     if spec.protocol == "queue":
         return WatchedQueue(segment, name, alarms, task, room)
-    if spec.writer == CLOCK:
-        return SporadicReader(segment, name, alarms, task)
-    return WatchedReader(segment, name, alarms, task)
+    kind = SporadicReader if spec.writer == CLOCK else WatchedReader
+    return kind(segment, open_reader(segment, name, asynchronous), alarms, task)
 
 
 class WatchedReader:
     """Reads a mailbox for a task and raises the task's alarms about it. A clean read costs a few comparisons more."""
 
-    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> None:
-        self.reader = reader = open_reader(segment, name)
-        episodes = Episodes(segment, name, alarms)
+    def __init__(self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask) -> None:
+        self.reader = reader
+        episodes = Episodes(segment, reader.spec.name, alarms)
         self._messages = MessageWatch(segment, reader, episodes)
         self._silence = SilenceWatch(segment, reader, episodes, task)
         self._task = task
@@ -73,6 +80,10 @@ class WatchedReader:
             return self._lost[reading.verdict]
         return reading
 
+    def is_writer_lost(self, tick: int) -> bool:
+        """Say whether the writer is lost, without a read."""
+        return self._writer[_LOST] > 0 and self._silence.is_writer_lost(tick)
+
 
 class SporadicReader:
     """Reads an operator's mailbox: silence there proves nothing, but messages must be whole, and the clock's.
@@ -81,11 +92,11 @@ class SporadicReader:
     before it. The first read returns all that the slots hold, since a restarted board must know them.
     """
 
-    def __init__(self, segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask) -> None:
-        self.reader = open_reader(segment, name)
+    def __init__(self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask) -> None:
+        self.reader = reader
         self._task = task
-        self._slots = Slots(segment, self.reader.spec)
-        self._findings = ReadFindings(self.reader, Episodes(segment, name, alarms))
+        self._slots = Slots(segment, reader.spec)
+        self._findings = ReadFindings(reader, Episodes(segment, reader.spec.name, alarms))
         self._bad_reads = 0
 
     def read(self, tick: int) -> Reading:
@@ -100,6 +111,10 @@ class SporadicReader:
             return reading._replace(earlier=tuple(self._between(before, self.reader.serial)))
         return reading
 
+    def is_writer_lost(self, tick: int) -> bool:
+        """Return False: a lost clock ends no silence, and releases nobody."""
+        return False
+
     def _between(self, before: int, newest: int) -> Iterator[Message]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""
         slots = self._slots
@@ -108,3 +123,26 @@ class SporadicReader:
                 message = Message(slots.dtype)
                 message.copy_from(slots.message)
                 yield message
+
+
+class GridReader:
+    """Reads a mailbox at the ticks of a grid only; in between, the last reading stands and the bus is not accessed.
+
+    A read that falls into a skipped cycle is left out. So a restarted task reads at the same ticks as before.
+    """
+
+    def __init__(self, watched: WatchedReader | SporadicReader | WatchedQueue, grid: TickGrid) -> None:
+        self.reader = watched.reader
+        self._watched, self._every, self._phase = watched, *grid
+        kept = [Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)]
+        self._kept = [(reading, reading._replace(is_lost=True)) for reading in kept]
+        self._was_lost = False
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message visible at `tick` if it is due, otherwise that of the last read."""
+        if (tick - self._phase) % self._every == 0:
+            reading = self._watched.read(tick)
+            self._was_lost = reading.is_lost
+            return reading
+        is_lost = self._was_lost or self._watched.is_writer_lost(tick)
+        return self._kept[self.reader.serial > 0][is_lost]

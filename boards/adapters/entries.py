@@ -12,7 +12,7 @@ from pydantic import ValidationError, model_validator
 
 from rack.backplane.mailbox.host_ring import HostReader
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import Field, MessageType
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
@@ -147,6 +147,7 @@ class Outward:
 
     def __init__(self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._writer, self._port, self._table, self._count = open_writer(segment, own), port, table, count
+        self._source = open_observer(segment, table.source)
         self._wake = [wake_semaphore(segment.rack, reader) for reader in self._writer.spec.readers]
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
@@ -157,9 +158,9 @@ class Outward:
         for message in (*reading.earlier, reading.value):
             self._writer.message.copy_from(message)
             self._writer.write(tick)
-        if reading.is_new or self._count.written == NEVER:
-            self._count.written = tick
-        self._count.passes(tick, self._count.written)
+        # A reading does not say when its message was written.
+        self._source.read(tick)
+        self._count.passes(tick, self._source.newest)
         for semaphore in self._wake:
             # One post is enough: a host board that does not wait would let the semaphore overflow.
             if not semaphore.value:

@@ -13,11 +13,12 @@ from pydantic import ValidationError
 
 from rack.backplane.address_map import CLOCK, AddressMap
 from rack.backplane.errors import MailboxError
-from rack.backplane.layout import FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
+from rack.backplane.layout import ExchangeSpec, FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
 from rack.backplane.mailbox.host_ring import SPARE
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
+from rack.boards.config.exchange import asynchronous_queues, exchanges, strict_mistakes
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports, table_of
 from rack.boards.config.queues import queue_mistakes, queue_slots
@@ -63,7 +64,7 @@ class Wiring:
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
         self.config = config
-        self.mistakes: list[Mistake] = []
+        self.mistakes: list[Mistake] = [*strict_mistakes(config)]
         self._ports = all_ports(config, self.mistakes)
         self.tasks = [ports for ports in self._ports if ports.place.role != "host"]
         self.hosts = [ports for ports in self._ports if ports.place.role == "host"]
@@ -83,6 +84,7 @@ class Wiring:
         self._check_rest()
         crossing = list(self.sides.mistakes(self._unknown))
         self.mistakes += crossing or queue_mistakes(self)
+        self.mistakes += asynchronous_queues(self)
         self._check_params()
         if not broken & {"robot", "scene", "task"}:
             self._check_programs()
@@ -195,7 +197,7 @@ class Wiring:
             depth = depth_for(max(slowest + delay, self._kept_ticks), every)
             rests_on = tuple(box for box in ports.rests_on(name.partition(".")[2]) if self.protocol(box) != "queue")
             spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, rests_on=rests_on)
-            box = self._mailbox(name, output.type, sizes, spec)
+            box = self._mailbox(name, output.type, sizes, partial(spec, phase=writer.phase))
             mailboxes += self._queue(box, readers[0], writer) if box.protocol == "queue" else [box]
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
@@ -213,12 +215,13 @@ class Wiring:
     def _queue(self, box: MailboxSpec, reader: TaskSpec, writer: TaskSpec) -> Iterator[MailboxSpec]:
         """Yield a queue with its size, and the mailbox in which its reader writes its position for the writer."""
         delay, slowest = reader.every * reader.within_cycles, writer.every * writer.within_cycles
+        read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
         capacity = self.config.protocol.depth.get(box.name, UNREAD)
-        yield replace(
-            box, capacity=capacity, depth=queue_slots(capacity, box.every, box.delay + delay, self._kept_ticks)
-        )
-        depth = depth_for(max(slowest + delay, self._kept_ticks), reader.every)
-        spec = partial(MailboxSpec, writer=reader.name, every=reader.every, delay=delay, depth=depth)
+        slots = queue_slots(capacity, box.every, box.delay + delay, self._kept_ticks)
+        yield replace(box, capacity=capacity, depth=slots)
+        depth = depth_for(max(slowest + delay, self._kept_ticks), read.every)
+        visible = (read.phase + delay) % read.every
+        spec = partial(MailboxSpec, writer=reader.name, every=read.every, delay=delay, depth=depth, phase=visible)
         position = self._mailbox(taken_name(box.name), TAKEN, {}, spec)
         yield replace(position, readers=(writer.name,), protocol="time-slice")
 
@@ -235,6 +238,7 @@ class Wiring:
             within_cycles=self.config.board[place.board].within_cycles if place.role == "planner" else 1,
             depth=depth_for(self._kept_ticks, every),
             wake=self._wake(place),
+            phase=self.config.board[place.board].phase,
         )
 
     def _wake(self, place: TaskPlace) -> Wake:
@@ -253,6 +257,7 @@ class Wiring:
         return spec(
             name=name,
             readers=self.readers(name),
+            exchanges=tuple(self._exchanges(name)),
             protocol=self.protocol(name),
             message=kind.name,
             version=kind.version,
@@ -263,6 +268,11 @@ class Wiring:
     def readers(self, mailbox: str) -> tuple[str, ...]:
         """Return the tasks and host boards that read a mailbox."""
         return tuple(ports.task for ports in self._ports if any(mailbox == box for _, box in ports.sources))
+
+    def _exchanges(self, mailbox: str) -> Iterator[ExchangeSpec]:
+        for ports in self.tasks:
+            found = exchanges(self.config, ports.place.board) if ports.place.role == "executor" else {}
+            yield from (found[port] for port, box in ports.sources if box == mailbox and port in found)
 
     def protocol(self, mailbox: str) -> Protocol:
         """Return the protocol of a mailbox."""

@@ -246,6 +246,9 @@ def _rates(config: RackConfig) -> Iterator[Mistake]:
                 yield Mistake(
                     place, board.rate_hz, f"a cycle would take {every} ticks; permitted: up to {LONGEST_EVERY}"
                 )
+            if board.phase >= every:
+                why = f"must be less than the board's period; permitted: 0 to {every - 1} ticks"
+                yield Mistake(f"board.{name}.phase", board.phase, why)
 
 
 def _polling(config: RackConfig) -> Iterator[Mistake]:

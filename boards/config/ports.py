@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 from rack.backplane.layout import Role
 from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
+from rack.boards.config.exchange import exchange_mistakes
 from rack.boards.config.schema import RackConfig, Sources, TaskPlace
 from rack.boards.errors import Mistake
+from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
 from rack.levels.level import Executor, Input, Output, Planner
@@ -55,7 +57,8 @@ def all_ports(config: RackConfig, mistakes: list[Mistake]) -> list[TaskPorts]:
     wired = [_wired(config, place, mistakes) for place in (*config.tasks(), *config.hosts())]
     found = [ports for ports in wired if ports is not None]
     types = {box: ports.outputs[port].type for ports in found for port, box in ports.writes.items()}
-    return [_with_made_ports(config, ports, types) for ports in found]
+    whole = [_with_made_ports(config, ports, types) for ports in found]
+    return [_with_exchange(config, ports, mistakes) for ports in whole]
 
 
 def _with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]) -> TaskPorts:
@@ -72,6 +75,19 @@ def _with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, M
         writes={**ports.writes, **{port: f"{board}.{port}" for port in made.outputs}},
         is_whole=made.is_whole,
     )
+
+
+def _with_exchange(config: RackConfig, ports: TaskPorts, mistakes: list[Mistake]) -> TaskPorts:
+    """Add the mailbox of the exchange to a board whose config has one."""
+    board = ports.place.board
+    if ports.place.role != "executor" or not config.board[board].exchange or not ports.is_whole:
+        return ports
+    mistakes += exchange_mistakes(config, board, ports.inputs)
+    if EXCHANGE in ports.outputs:
+        why = "the executor writes a mailbox of that name itself; rename its output"
+        mistakes.append(Mistake(f"board.{board}.exchange", None, why))
+    outputs = {**ports.outputs, EXCHANGE: Output(exchange_message(ports.reads))}
+    return replace(ports, outputs=outputs, writes={**ports.writes, EXCHANGE: f"{board}.{EXCHANGE}"})
 
 
 def reference(config: RackConfig, place: TaskPlace) -> str:

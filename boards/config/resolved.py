@@ -21,6 +21,7 @@ from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
+from rack.boards.config.exchange import exchanges
 from rack.boards.config.faults import fault_mistakes, injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
@@ -247,6 +248,7 @@ class _Examined:
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
             guards_clock=is_executor and spec.every == min(task.every for task in layout.tasks),
             fails_self_test=fails_self_test,
+            exchange=exchanges(self._config, spec.board) if is_executor else {},
             transfer=BusTimes(**{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}),
         )
 
@@ -255,6 +257,7 @@ class _Examined:
         paces = {name: Pace(config.every(name), other.within_cycles) for name, other in config.board.items()}
         return replace(
             self._context_of(name, config.every(name), board.params),
+            phase=board.phase,
             within_cycles=board.within_cycles,
             above={other: paces[other] for other in board.above},
             below={other: paces[other] for other in board.below},

@@ -128,6 +128,18 @@ class TransferConfig(Table):
     update_ms: Milliseconds = Field(0.0, description="U: the planner writes its plan, ms")
 
 
+class ExchangeConfig(Table):
+    """`[board.<name>.exchange.<port>]`: when the executor reads one of its ports; default: in every cycle."""
+
+    every: int = Field(
+        1, ge=1, le=LONGEST_EVERY, description="read in every n-th cycle; in between, the last message stays"
+    )
+    phase: int = Field(0, ge=0, description="number, less than every, of the first cycle that reads it, cycles")
+    asynchronous: bool = Field(
+        False, description="read the newest message as soon as it is written; in real time, runs then differ"
+    )
+
+
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
@@ -135,6 +147,7 @@ class ProtocolConfig(Table):
     mailbox: dict[MailboxName, Protocol] = Field(
         {}, description="protocol by mailbox; queue: its one reader gets every message, in order"
     )
+    strict: bool = Field(False, description="refuse whatever makes a run depend on timing")
     depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
         {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
     )
@@ -163,6 +176,9 @@ class BoardConfig(Table):
     every: int | None = Field(
         None, ge=1, le=LONGEST_EVERY, description="instead of rate_hz: period of the executor, ticks"
     )
+    phase: int = Field(
+        0, ge=0, description="first tick of the board, less than its period; its releases follow every period, ticks"
+    )
     priority: Priority = Field(0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling")
     wake: Wake | None = Field(None, description="how this board waits for its next cycle; default: clock.wake")
     above: Neighbours = Field((), description="board of the level above, whose commands this level reads; or a list")
@@ -180,6 +196,9 @@ class BoardConfig(Table):
         {}, description="mailbox by port of the executor, or a list; overrides the level's own"
     )
     planner_reads: dict[str, Sources] = Field({}, description="mailbox by port of the planner, likewise")
+    exchange: dict[str, ExchangeConfig] = Field(
+        {}, description="when the executor reads a port, by port; also records the ages of all its messages"
+    )
     params: dict[str, Any] = Field({}, description="parameters of the level, declared by its class")
     budget: BudgetConfig | None = Field(None, description="worst-case processor times, for the timing model")
     transfer: TransferConfig = Field(TransferConfig(), description="emulation of a slower bus for this board")

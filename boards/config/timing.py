@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.layout import Layout
+from rack.backplane.layout import Layout, TickGrid
 from rack.boards.config.mistakes import PLANNER_BUDGET
 from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
 from rack.levels.timing.rack import BoardTiming, RackTiming
@@ -51,7 +51,18 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
         is_critical=is_critical(config, layout, name),
         budget=budget,
         plan_within_ns=None if within_ms is None else round(within_ms * NS_PER_MS),
+        queues=tuple(box.name for box in layout.mailboxes if box.capacity and name in box.readers),
+        phase=board.phase,
+        reads=_reads(layout, name),
     )
+
+
+def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
+    """Return the ticks at which an executor reads the messages of others, by writer, if not in every cycle."""
+    own = [
+        (box.writer, exchange.grid) for box in layout.mailboxes for exchange in box.exchanges if exchange.task == board
+    ]
+    return {writer: max(grid for other, grid in own if other == writer) for writer, _ in own}
 
 
 def tick_ns(config: RackConfig) -> int:

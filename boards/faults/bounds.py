@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from math import ceil
 
 from rack.backplane.address_map import CLOCK
@@ -35,7 +35,12 @@ def cycle_ticks(layout: Layout, board: str) -> int:
 def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
     """Return the ticks from the last message in any of these mailboxes until its slowest reader has read it."""
     boxes = [layout.mailbox(name) for name in mailboxes]
-    return max((box.delay + cycle_ticks(layout, reader) for box in boxes for reader in box.readers), default=0)
+    return max((box.delay + between_reads(layout, box, reader) for box in boxes for reader in box.readers), default=0)
+
+
+def between_reads(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
+    """Return the longest time between a task's reads of a mailbox, in ticks."""
+    return max(cycle_ticks(layout, reader), layout.read_grid(mailbox, reader).every)
 
 
 @dataclass(frozen=True)
@@ -92,10 +97,10 @@ class BoundCase:
     @property
     def read(self) -> int:
         """Longest time between reads, ticks: by the reader, or by the fastest reader of each mailbox."""
+        between = partial(between_reads, self.layout)
         if self.reader:
-            return cycle_ticks(self.layout, self.reader)
-        fastest = (min(cycle_ticks(self.layout, reader) for reader in m.readers) for m in self.mailboxes)
-        return max(fastest, default=0)
+            return max((between(m, self.reader) for m in self.mailboxes), default=cycle_ticks(self.layout, self.reader))
+        return max((min(between(m, reader) for reader in m.readers) for m in self.mailboxes), default=0)
 
 
 @dataclass(frozen=True)

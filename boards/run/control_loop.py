@@ -8,7 +8,7 @@ between cycles.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic_ns
 
@@ -16,6 +16,7 @@ from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag
 from rack.backplane.words import Block, Demand, System
+from rack.boards.exchange import EXCHANGE, ExchangeRecord
 from rack.boards.run.task import ClockGuard, Task, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
@@ -44,8 +45,21 @@ class VirtualControlLoop(Task):
         self._has_cycled = False
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
-        self.read_command_and_status = slowed(self.inputs.read_command_and_status, times.read_ns)
+        self.read_command_and_status = slowed(self._read(wiring), times.read_ns)
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
+
+    def _read(self, wiring: TaskWiring) -> Callable[[int], None]:
+        """Return the reading of a cycle; a board with an exchange also notes which messages it took."""
+        read = self.inputs.read_command_and_status
+        if not wiring.exchange:
+            return read
+        record = ExchangeRecord(self.inputs.taken, getattr(self.outputs.messages, EXCHANGE))
+
+        def read_and_note(tick: int) -> None:
+            read(tick)
+            record.fill(tick)
+
+        return read_and_note
 
     def run(self) -> None:
         """Cycle until the run is over."""

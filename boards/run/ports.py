@@ -6,13 +6,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
 from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.queue import ALL, QueueWriter, taken_name
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import watched
+from rack.backplane.watch.watched_reader import GridReader, watched
+from rack.boards.exchange import Taken
 from rack.boards.faults.kind import KINDS
 from rack.boards.faults.messages import FaultyWriter
 from rack.boards.run.queues import QueuePort, Write
@@ -31,7 +33,7 @@ def all_of(port: str) -> int:
 class InputPorts:
     """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port.
 
-    `readers` holds the reader of each mailbox.
+    `readers` holds the reader of each mailbox, `taken` every mailbox in the order of the ports.
     """
 
     def __init__(
@@ -40,32 +42,39 @@ class InputPorts:
         sources: Mapping[str, Source],
         alarms: AlarmWriter,
         plan: str = "",
+        *,
         room: Callable[[str], int] = all_of,
+        exchange: Mapping[str, ExchangeSpec] | None = None,
     ) -> None:
         """Read `sources` by port, from a queue as many messages as there is `room` for on its port.
 
-        `plan` is the mailbox that holds the task's own plan.
+        `plan` is the mailbox that holds the task's own plan, `exchange` the ports that are not simply read in every
+        cycle.
         """
         self.task = ReadingTask()
+        self.taken: list[Taken] = []
         self.values = Ports()
         self.readers: dict[str, Reader] = {}
         # Where each reading goes: the ports themselves, or the dict of a port that reads many mailboxes.
         self._plan: list[Line] = []
         self._rest: list[Line] = []
-        self._readers: list[Reader] = []
         for port, source in sources.items():
             by_board: dict[str, Reading] = {}
             boxes = {port: source} if isinstance(source, str) else source
             values = self.values.__dict__ if isinstance(source, str) else by_board
+            how = (exchange or {}).get(port)
+            open_port = partial(watched, segment, alarms=alarms, task=self.task, room=partial(room, port))
             for key, mailbox in boxes.items():
-                found = watched(segment, mailbox, alarms, self.task, partial(room, port))
+                found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
+                read = found.read if how is None else GridReader(found, how.grid).read
                 values[key] = Reading(found.reader.message, Verdict.NONE)
-                (self._plan if mailbox == plan else self._rest).append((values, key, found.read))
-                self._readers.append(found.reader)
+                (self._plan if mailbox == plan else self._rest).append((values, key, read))
+                self.taken.append(Taken(values, key, found.reader))
                 self.readers[mailbox] = found.reader
             if not isinstance(source, str):
                 setattr(self.values, port, by_board)
         self.reads_plan = bool(self._plan)
+        self._readers = [entry.reader for entry in self.taken]
         self._statistics = [reader.statistics for reader in self._readers]
         self._counted = self._traffic
 
@@ -178,7 +187,7 @@ class OutputPorts:
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [
-            (port, w, self._write_of(port), self._rests_on[port], w.spec.delay, w.spec.every)
+            (port, w, self._write_of(port), self._rests_on[port], w.spec.delay - w.spec.phase, w.spec.every)
             for port, w in self.writers.items()
         ]
 
@@ -197,9 +206,9 @@ class OutputPorts:
         `now`: the clock's tick, if the cycle's end may have passed.
         """
         in_time = True
-        for port, writer, write, source, delay, every in self._lines:
-            # A message that is not written in every cycle becomes visible at multiples of its period.
-            if (tick + delay) % every:
+        for port, writer, write, source, ahead, every in self._lines:
+            # A message that is not written in every cycle becomes visible at multiples of its period, from its phase.
+            if (tick + ahead) % every:
                 if port in self._faulty:
                     self._faulty[port].flush(tick, now)
                 continue

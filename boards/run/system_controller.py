@@ -147,16 +147,17 @@ class EndOfRun:
         self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
         self._silent = wiring.silent
         self._heard: int | None = None
-        # By ticks a message becomes visible at a boundary of its writer's period.
-        is_by_ticks = self._reader is not None and self._reader.spec.is_by_ticks
-        self._every = self._reader.spec.every if self._reader is not None and is_by_ticks else 1
+        # By ticks, a message becomes visible at a boundary of its writer's period.
+        self._every, self._phase = 1, 0
+        if self._reader is not None and self._reader.spec.is_by_ticks:
+            self._every, self._phase = self._reader.spec.every, self._reader.spec.phase
         self._next = 0
 
     def __call__(self, tick: int) -> int | None:
         """Return the tick at which the run stops, by the messages as of the tick before; None until it is known."""
         final = tick - 1
         if final >= self._next and self._stop_tick is None and self._reader is not None and self._writer is not None:
-            boundary = final - final % self._every
+            boundary = final - (final - self._phase) % self._every
             self._next = boundary + self._every
             reading = self._reader.read(boundary)
             if reading.is_new or self._heard is None or self._writer[Block.LOST]:
@@ -186,5 +187,5 @@ def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: A
     """Return the clock driver for the run's mode."""
     if not wiring.lockstep:
         return RealtimeDriver(segment, ended, alarms)
-    at_once = not all(mailbox.is_by_ticks for mailbox in segment.layout.mailboxes)
+    at_once = not all(mailbox.is_repeatable for mailbox in segment.layout.mailboxes)
     return LockstepDriver(segment, ended, at_once, wiring.history, alarms)

@@ -41,7 +41,14 @@ class Task(ABC):
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
         self.next_cycle = NextCycle(segment, wiring.task, self.alarms if wiring.guards_clock else None)
-        self.inputs = InputPorts(segment, wiring.inputs, self.alarms, f"{spec.board}.plan", level.room)
+        self.inputs = InputPorts(
+            segment,
+            wiring.inputs,
+            self.alarms,
+            f"{spec.board}.plan",
+            room=level.room,
+            exchange=wiring.exchange,
+        )
         self.inputs.task.now = self.clock.now
         self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs, wiring.sent)
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)

@@ -19,6 +19,7 @@ from rack.levels.servo.control import ArmParams
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.joint_torques import JointTorques
+from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
 from rack.levels.tables import read_params
 
@@ -104,6 +105,8 @@ class ArmExecutor(ArmDriver):
             return None
         self.joints.add_up()
         self.rests_on = self.joints.rests_on
+        if self.abandoned and self._is_astray():
+            return None
         self._defied = self._must_rest(stops, tick) and self.joints.moves
         if self._defied:
             self._waiting = "braked: the boards above did not bring it to rest"
@@ -112,6 +115,19 @@ class ArmExecutor(ArmDriver):
         if self.orders.standing is Operation.HOLD and not self.joints.moves:
             self.orders.done()
         return self.joints.wanted
+
+    def _is_astray(self) -> bool:
+        """Return whether the boards above want the arm elsewhere than where it is braked.
+
+        They do for two cycles when sensors are trusted again and show another position than was estimated.
+        """
+        away = self.joints.wanted.position - self.sensors.position
+        joint = int(np.abs(away).argmax())
+        astray = abs(away[joint]) > ASTRAY_RAD
+        if astray:
+            name = self.context.robot.joints[joint]
+            self._waiting = f"braked: joint '{name}' is wanted more than {ASTRAY_RAD:g} rad away from where it is"
+        return bool(astray)
 
     def _must_rest(self, stops: bool, tick: int) -> bool:
         """Return whether the arm `stops`, and the boards above have had enough time to bring it to rest."""

@@ -159,7 +159,7 @@ class ArmDriver(Executor):
         self.orders.report(write.status, self.rests_on)
         self.arm.save(write.state)
         self.stopping.remember(write.state)
-        if SCENES.is_due(tick, self.context.every):
+        if SCENES.is_due(tick, self.context.every, self.context.phase):
             self.arm.look(write.scene)
 
     def _catch_up(self, before: Reading, tick: int) -> bool:

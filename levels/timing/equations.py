@@ -15,6 +15,8 @@ from math import floor, gcd
 from statistics import pstdev
 from typing import Literal, NamedTuple
 
+from rack.backplane.layout import TickGrid
+
 SMALL_SHARE = 0.1
 """Share of a cycle that counts as much smaller than the cycle (eq. 3.10)."""
 
@@ -63,13 +65,22 @@ def system_response_ns(machine_cycles_ns: Sequence[float], goal_cycles_ns: Seque
     return sum(machine_cycles_ns) + sum(goal_cycles_ns)
 
 
-def response_ticks(cycles: Sequence[int]) -> int:
+def grid_wait(written: TickGrid, read: TickGrid) -> int:
+    """Return the longest time, ticks, from a message on the grid of its writer to the next read (eq. 3.7)."""
+    common = gcd(written.every, read.every)
+    return read.every - common + (read.phase - written.phase) % common
+
+
+def response_ticks(cycles: Sequence[int], waits: Sequence[int] | None = None) -> int:
     """Return the longest time from the first level's release to the end of the last level's cycle that acts on it.
 
-    `cycles` are in ticks, in the order in which the information passes. Each level takes its cycle (eq. 3.3); if one
-    cycle does not divide the next, a message also waits for the reader's next release on the common grid (eq. 3.7).
+    `cycles` are in ticks, in the order in which the information passes. Each level takes its cycle (eq. 3.3); a message
+    also waits for its next read on the common grid. `waits` are those times (`grid_wait`), by default of levels without
+    phases that read in every cycle: a wait is 0 if the reader's cycle divides the writer's.
     """
-    return sum(cycles) + sum(later - gcd(earlier, later) for earlier, later in pairwise(cycles))
+    if waits is None:
+        waits = [grid_wait(TickGrid(earlier), TickGrid(later)) for earlier, later in pairwise(cycles)]
+    return sum(cycles) + sum(waits)
 
 
 def executes_in_time(execution_ns: float, longest_cycle_ns: float) -> Relation:

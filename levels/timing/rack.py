@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from math import prod
 from typing import Any, Literal
 
-from rack.levels.timing.equations import communication_ns, residual_ns, response_ticks
+from rack.backplane.layout import TickGrid
+from rack.levels.timing.equations import communication_ns, grid_wait, residual_ns, response_ticks
 from rack.levels.timing.response_time import load_of
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
@@ -18,12 +20,14 @@ Coupling = Literal["tight", "loose", "none"]
 
 @dataclass(frozen=True)
 class BoardTiming:
-    """One board. `every` is its cycle in ticks; cores are those that the config asks for.
+    """One board. `every` is its cycle, `phase` its first release, in ticks; cores are those that the config asks for.
 
     `above` and `below` name each other: a board is above all that it lists below, and all that list it above.
 
     `is_critical` is true if the plan update is the paper's critical section: it keeps the executor waiting. `budget` is
-    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock.
+    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock. `queues` are the
+    mailboxes in which messages wait for it. `reads` holds the ticks at which it reads the messages of another board, by
+    that board, if not in every cycle.
     """
 
     name: str
@@ -40,6 +44,18 @@ class BoardTiming:
     is_critical: bool
     budget: Budget | None
     plan_within_ns: int | None = None
+    queues: tuple[str, ...] = ()
+    phase: int = 0
+    reads: Mapping[str, TickGrid] = field(default_factory=dict)
+
+    @property
+    def releases(self) -> TickGrid:
+        """The ticks at which its cycles begin."""
+        return TickGrid(self.every, self.phase)
+
+    def reads_from(self, board: str) -> TickGrid:
+        """Return the ticks at which it reads the messages of another board."""
+        return self.reads.get(board, self.releases)
 
     @property
     def is_plan_budgeted(self) -> bool:
@@ -201,7 +217,21 @@ class RackTiming:
     @property
     def hierarchy(self) -> ParallelChains:
         """The chains with the longest response; without levels above each other, none."""
-        return max(self.parallel, key=lambda found: response_ticks(found.cycles), default=ParallelChains((), ()))
+        return max(self.parallel, key=self.command_ticks, default=ParallelChains((), ()))
+
+    def command_ticks(self, chains: ParallelChains) -> int:
+        """Return the longest response of a command along any of these chains, ticks."""
+        return max((self.response_ticks(chain) for chain in chains.chains), default=0)
+
+    def status_ticks(self, chains: ParallelChains) -> int:
+        """Return the longest response of a status along any of these chains, ticks."""
+        return max((self.response_ticks(chain[::-1]) for chain in chains.chains), default=0)
+
+    def response_ticks(self, boards: Sequence[str]) -> int:
+        """Return the longest response along boards, in the order in which the information passes, ticks."""
+        passed = [self.boards[name] for name in boards]
+        waits = [grid_wait(one.releases, other.reads_from(one.name)) for one, other in pairwise(passed)]
+        return response_ticks([board.every for board in passed], waits)
 
     @cached_property
     def connected(self) -> tuple[frozenset[str], ...]:
@@ -280,6 +310,7 @@ class RackTiming:
             core=board.core,
             priority=board.priority,
             every_ns=board.every * self.tick_ns,
+            phase_ns=board.phase * self.tick_ns,
             parts=_nonzero(
                 Part(Unit.EXCHANGE, budget.exchange_ns if board.has_planner else 0),
                 Part(Unit.READ, budget.read_ns),

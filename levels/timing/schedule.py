@@ -75,7 +75,7 @@ class Chart:
 def simulate(
     tasks: Sequence[TimedTask], until_ns: int, context_switch_ns: int = 0, variants: Variants | None = None
 ) -> Chart:
-    """Return the exact schedule of `tasks` from their common release at 0 until `until_ns`.
+    """Return the exact schedule of `tasks` from 0 until `until_ns`; each is first released at its phase.
 
     A job takes two context switches, one before its parts and one after; they show as idle time. Ordinary scheduling,
     priority 0, is simulated as first come, first served.
@@ -115,7 +115,7 @@ class _Runner:
     def __init__(self, task: TimedTask, context_switch_ns: int, variants: Sequence[Sequence[Part]]) -> None:
         self.task = task
         self.spans: list[Span] = []
-        self.ready_at = task.jitter_ns
+        self.ready_at = task.phase_ns + task.jitter_ns
         self._switch = [_Step(None, context_switch_ns)] if context_switch_ns else []
         self._variants = variants
         self._steps: list[_Step] = []  # remaining steps of the job
@@ -156,7 +156,8 @@ class _Runner:
     def _take(self, now_ns: int) -> None:
         """Take up the oldest release that has not expired."""
         every, expected = self.task.every_ns, self.ready_at - self.task.jitter_ns
-        newest = (now_ns - self.task.jitter_ns) // every * every
+        first = self.task.phase_ns
+        newest = first + (now_ns - self.task.jitter_ns - first) // every * every
         self._release = max(expected, newest - self._slack_ns)
         if self.task.role != "planner":
             self._ends |= dict.fromkeys(range(expected, self._release, every))

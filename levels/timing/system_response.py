@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.layout import Layout, MailboxSpec, TickGrid
 from rack.backplane.mailbox.queue import is_position
-from rack.levels.timing.equations import response_ticks, system_response_bound_ns, system_response_ns
+from rack.levels.timing.equations import grid_wait, response_ticks, system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import RackTiming
 
 
@@ -36,35 +36,43 @@ def predict(rack: RackTiming) -> Prediction:
         levels=hierarchy.levels,
         bound_eq_3_2_ms=system_response_bound_ns(cycles or [0]) * tick_ms,
         sum_eq_3_3_ms=system_response_ns((), cycles) * tick_ms,
-        command_ms=response_ticks(cycles) * tick_ms,
-        status_ms=response_ticks(cycles[::-1]) * tick_ms,
+        command_ms=rack.command_ticks(hierarchy) * tick_ms,
+        status_ms=rack.status_ticks(hierarchy) * tick_ms,
         plan_ms={board.name: board.every * board.within_cycles * tick_ms for board in planned},
     )
 
 
 @dataclass(frozen=True)
 class CommandPath:
-    """The levels that an operator's command passes, from the commanded one to the lowest; `cycles` in ticks.
+    """The levels that an operator's command passes, from the commanded one to the lowest.
 
-    `delay` is the ticks until a given command can be read. `is_exact` is true if every message on the path is of
-    protocol time-slice: with all deadlines met, the releases below are then exact, otherwise bounds.
+    `releases` are the ticks at which each level begins its cycles, `reads` those at which it reads the command of the
+    one above it, the first the operator's. `delay` is the ticks until a given command can be read. `is_exact` is true
+    if every message on the path is of protocol time-slice: with all deadlines met, the releases below are then exact,
+    otherwise bounds.
     """
 
     levels: tuple[str, ...]
-    cycles: tuple[int, ...]
+    releases: tuple[TickGrid, ...]
+    reads: tuple[TickGrid, ...]
     delay: int
     is_exact: bool
 
+    @property
+    def cycles(self) -> tuple[int, ...]:
+        """The cycle of each level, ticks."""
+        return tuple(releases.every for releases in self.releases)
+
     def samples_at(self, visible_at: int) -> int:
         """Return the release of the first level that reads a command visible from that tick on."""
-        return _up(visible_at, self.cycles[0])
+        return self.reads[0].since(visible_at)
 
     def acts_at(self, visible_at: int) -> int:
         """Return the release of the lowest level's cycle that rests on the command."""
         release = self.samples_at(visible_at)
-        for earlier, later in zip(self.cycles, self.cycles[1:], strict=False):
+        for cycle, read in zip(self.cycles, self.reads[1:], strict=False):
             # Output is visible at the end of its cycle; the next level reads it at its next release (eq. 3.7).
-            release = _up(release + earlier, later)
+            release = read.since(release + cycle)
         return release
 
     def response(self, given: int, acts: int) -> int:
@@ -84,7 +92,8 @@ class CommandPath:
     @property
     def longest(self) -> int:
         """The longest response on the grid: given just too late for a release, waiting for every level's next one."""
-        return self.delay + self.cycles[0] - 1 + response_ticks(self.cycles)
+        waits = [grid_wait(written, read) for written, read in zip(self.releases, self.reads[1:], strict=False)]
+        return self.delay + self.reads[0].every - 1 + response_ticks(self.cycles, waits)
 
 
 def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
@@ -117,14 +126,11 @@ def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
             operator, rest = boxes.get(f"{level}.operator"), chain[at:]
             if operator is None or len(passed) < len(rest) - 1:
                 continue
-            cycles = tuple(rack.boards[name].every for name in rest)
             taken = (operator, *passed[len(passed) - len(rest) + 1 :])
-            is_exact = all(box.protocol == "time-slice" for box in taken)
-            path = CommandPath(rest, cycles, operator.delay, is_exact)
+            releases = tuple(rack.boards[name].releases for name in rest)
+            reads = tuple(layout.read_grid(box, name) for box, name in zip(taken, rest, strict=True))
+            is_exact = all(box.protocol == "time-slice" and box.is_repeatable for box in taken)
+            path = CommandPath(rest, releases, reads, operator.delay, is_exact)
             if level not in found or path.longest > found[level].longest:
                 found[level] = path
     return found
-
-
-def _up(tick: int, every: int) -> int:
-    return -(-tick // every) * every

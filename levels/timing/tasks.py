@@ -47,7 +47,7 @@ class Part:
 class TimedTask:
     """One task; all times in ns. A job is the work of one release, or of one plan.
 
-    The task is released every `every_ns`, all tasks together at 0. A job may take `within_cycles` cycles; the next
+    The task is released every `every_ns`, first at `phase_ns`. A job may take `within_cycles` cycles; the next
     job is released after those. `parts` are computed in order. `priority` is SCHED_FIFO's: a higher one preempts; tasks
     of equal priority run in the order of their releases, then of `name`. Ordinary scheduling is 0, below all. `ceiling`
     is the priority of parts that are not preemptible: a plan update blocks its own executor and every task that is not
@@ -64,6 +64,7 @@ class TimedTask:
     within_cycles: int = 1
     ceiling: int = 0
     jitter_ns: int = 0
+    phase_ns: int = 0
 
     @property
     def period_ns(self) -> int:

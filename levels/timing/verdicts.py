@@ -6,14 +6,14 @@ loads account for levels that share a core.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import chain
 from math import inf, isfinite
 from typing import Any
 
 from rack.levels.timing import equations
-from rack.levels.timing.equations import Relation, response_ticks
+from rack.levels.timing.equations import Relation
 from rack.levels.timing.rack import LevelTiming, ParallelChains, RackTiming
 from rack.levels.timing.response_time import response_times
 
@@ -89,9 +89,7 @@ def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
     cycles_ns = {name: board.every * rack.tick_ns for name, board in rack.boards.items()}
     for found in rack.parallel:
-        yield from _of_chain(
-            response_subject(rack, found), [cycle * rack.tick_ns for cycle in found.cycles], rack.tick_ns, goal_ns
-        )
+        yield from _of_chains(rack, found, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
             relation = Relation(cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns))
@@ -103,15 +101,15 @@ def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
     return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
 
 
-def _of_chain(subject: str, cycles_ns: Sequence[int], tick_ns: int, goal_ns: float | None) -> Iterator[EquationVerdict]:
+def _of_chains(rack: RackTiming, chains: ParallelChains, goal_ns: float | None) -> Iterator[EquationVerdict]:
+    subject, cycles_ns = response_subject(rack, chains), [cycle * rack.tick_ns for cycle in chains.cycles]
     bound, limit = goal_ns, "timing.response_ms"
     if bound is None:
         bound, limit = equations.system_response_bound_ns(cycles_ns), "n R_max"
     total = equations.system_response_ns((), cycles_ns)
     yield EquationVerdict.of("3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}")
-    for way, order in (("command", 1), ("status", -1)):
-        ticks = response_ticks([cycle // tick_ns for cycle in cycles_ns[::order]])
-        relation = Relation(ticks * tick_ns, "<=", bound)
+    for way, ticks in (("command", rack.command_ticks(chains)), ("status", rack.status_ticks(chains))):
+        relation = Relation(ticks * rack.tick_ns, "<=", bound)
         yield EquationVerdict.of("3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {limit}")
 
 

@@ -98,19 +98,23 @@ class RequestPlanner(Planner):
         self._bodies = context.scene.bodies
         self._goals: dict[int, Array] = {}  # joint positions (joints,), rad, at the end of each step planned
         self._sent: int | None = None  # newest request queued; None: not yet known, after a start
-        self._moved = 0, 0  # newest request taken below, and the tick at which it or `_sent` changed
+        self._taken = 0, 0  # newest request taken below, and the tick at which it or `_sent` changed
+        self._begun = 0, 0  # newest request begun below, and the tick at which it was seen
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether a step may be planned now."""
         below = read.status.value
         if not read.status.is_there or below.error:
             return False
-        if self._sent is None:
-            self._sent, self._moved = below.taken, (below.taken, tick)
-        if below.taken != self._moved[0]:
-            self._moved = below.taken, tick
-        if below.taken < self._sent and self._passed_s(tick) > PATIENCE_S and not read.status.is_lost:
-            self._sent, self._moved = below.taken, (below.taken, tick)
+        begun = max(below.current, below.done)
+        if begun != self._begun[0]:
+            self._begun = begun, tick
+        if self._sent is None or below.taken > self._sent:
+            self._sent = below.taken
+        if below.taken != self._taken[0]:
+            self._taken = below.taken, tick
+        elif below.taken < self._sent and self._since_s(self._taken, tick) > PATIENCE_S and not read.status.is_lost:
+            self._sent, self._taken = below.taken, (below.taken, tick)
         return self._may_send(self._sent, below.done, tick)
 
     def plan(self, read: Ports, write: Any, tick: int) -> None:
@@ -123,16 +127,18 @@ class RequestPlanner(Planner):
             if not write.send():
                 return
             self._sent += 1
-            self._moved = self._moved[0], tick
+            self._taken = self._taken[0], tick
 
-    def _passed_s(self, tick: int) -> float:
-        return (tick - self._moved[1]) * self.context.tick_s
+    def _since_s(self, event: tuple[int, int], tick: int) -> float:
+        return (tick - event[1]) * self.context.tick_s
 
     def _may_send(self, sent: int, done: int, tick: int) -> bool:
         if sent >= len(self._steps) or sent - done >= self._ahead:
             return False
         step = self._steps[sent]
-        return not isinstance(step, CancelStep) or self._passed_s(tick) >= step.after
+        if not isinstance(step, CancelStep):
+            return True
+        return self._begun[0] >= sent and self._since_s(self._begun, tick) >= step.after
 
     def _fill(self, request: Message, k: int, world: Message) -> None:
         """Make a request of step k."""

@@ -89,7 +89,7 @@ class CancelStep(Table):
     """Cancel what is under way or queued; the arm ramps to rest."""
 
     do: Literal["cancel"] = Field("cancel", description="the kind of step")
-    after: NotNegative = Field(description="time after the step before it was taken by the level below, s")
+    after: NotNegative = Field(description="time after the step before it began, s")
 
 
 Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | CancelStep

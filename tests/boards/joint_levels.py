@@ -30,6 +30,7 @@ class Swing(Executor):
         self._from, self._to = cell.home.copy(), cell.home + AWAY_RAD
         self._next = cell.home.copy()
         self._begun: int | None = None  # tick; None: waiting
+        self.opening = 0.04  # of the gripper, m
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Write the set point due two cycles later."""
@@ -38,7 +39,7 @@ class Swing(Executor):
         held = any(not one.is_there or one.is_lost or one.value.stopped for one in readings)
         write.status.state = State.HOLDING if held else State.EXECUTING
         write.status.reason = "a board below is stopped" if held else ""
-        command.opening, command.force = 0.04, 20.0
+        command.opening, command.force = self.opening, 20.0
         if held:
             self._begun, command.due = None, 0
             return

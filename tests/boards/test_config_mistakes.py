@@ -56,6 +56,21 @@ MISTAKES = {
         "a cycle would take 40000000 ticks; permitted: up to 1000000",
     ),
     "rate near zero": ("board.lower={ rate_hz = 5e-324 }", "board.lower.rate_hz = 5e-324: should be greater than or"),
+    "phase": ("board.upper.phase=8", "board.upper.phase = 8: must be less than the board's period; permitted: 0 to 7"),
+    "phase below zero": ("board.upper.phase=-1", "board.upper.phase = -1: should be greater than or equal to 0; first"),
+    "port of no executor": (
+        "board.upper.exchange={ command = { every = 2 } }",
+        "board.upper.exchange.command: no such port of the executor; ports: status",
+    ),
+    "exchange never": ("board.upper.exchange={ status = { every = 0 } }", "exchange.status.every = 0: should be gr"),
+    "exchange in no cycle": (
+        "board.upper.exchange={ status = { every = 3, phase = 3 } }",
+        "board.upper.exchange.status.phase = 3: must be less than every; permitted: 0 to 2 cycles",
+    ),
+    "rarely and at once": (
+        "board.upper.exchange={ status = { every = 2, asynchronous = true } }",
+        "board.upper.exchange.status.every = 2: an asynchronous port is read in every cycle; permitted: 1",
+    ),
     "own neighbour": ("board.lower.above=lower", "no other board has this name"),
     "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose" with a planner'),
     "no planner": ("board.upper.coupling=tight", 'permitted: "none" without a planner'),
@@ -210,6 +225,27 @@ def test_a_value_of_several_possible_types_makes_one_mistake(setting: str, place
 def test_lists_of_another_length_than_the_joints_are_reported_together() -> None:
     found = mistakes("nasrem", "robot.home=[0, 0]", "robot.jerk=[1]", "robot.model=none.xml")
     assert {mistake.place for mistake in found} == {"robot.home", "robot.jerk", "robot.model"}
+
+
+STRICT = {
+    "protocol": ("protocol.default=lock", 'protocol.default = "lock"'),
+    "mailbox": (
+        "protocol.mailbox={ 'lower.status' = 'double-buffer' }",
+        'protocol.mailbox.lower.status = "double-buffer"',
+    ),
+    "input": (
+        "board.upper.exchange={ status = { asynchronous = true } }",
+        "board.upper.exchange.status.asynchronous = true",
+    ),
+}
+
+
+@pytest.mark.parametrize(("setting", "place"), STRICT.values(), ids=STRICT)
+def test_what_depends_on_timing_is_refused_where_determinism_is_demanded(small: Path, setting: str, place: str) -> None:
+    assert resolve(load(small, [setting]))
+    (mistake,) = mistakes(small, setting, "protocol.strict=true")
+    why = "makes a run depend on timing, refused by protocol.strict = true; permitted: "
+    assert str(mistake).startswith(f"{place}: {why}")
 
 
 PARAMS = {

@@ -66,10 +66,10 @@ def test_a_fault_must_be_detected_within(
     assert bound(config, fault, reader) == ticks
 
 
-def test_a_weak_motor_of_a_fast_board_is_detected_within_the_time_that_its_gains_need(config: MakeConfig) -> None:
-    weak = {"kind": "actuator-saturated", "board": "driven"}
+@pytest.mark.parametrize(("kind", "ticks"), [("actuator-off", 13), ("actuator-saturated", 30)])
+def test_a_motor_of_a_fast_board_is_detected_within_a_time(config: MakeConfig, kind: str, ticks: int) -> None:
     rates = [f"board.{name}.rate_hz=1000" for name in ("wave", "watch", "driven")]
-    assert bound(config, weak, None, "clock.period_ms=1.0", *rates) == 30
+    assert bound(config, {"kind": kind, "board": "driven"}, None, "clock.period_ms=1.0", *rates) == ticks
 
 
 def test_a_held_lock_is_detected_within_the_bound_of_a_wait(config: MakeConfig) -> None:

@@ -101,7 +101,7 @@ class Task:
         kinds = self.level.outputs if isinstance(self.level, Executor) else {}
         for port, box in self._outputs.items():
             kind = kinds.get(port)
-            if not isinstance(kind, Output) or kind.is_due(tick, self.spec.every):
+            if not isinstance(kind, Output) or kind.is_due(tick, self.spec.every, 0):
                 box.publish(getattr(self.write, port), visible_at)
 
 

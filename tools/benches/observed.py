@@ -62,7 +62,8 @@ class Observed:
         Its record may be written after the last reading.
         """
         rows, last = self.traces[task], self.outcome.ticks - 1
-        due = -(-last // self.layout.task(task).every) - self.lost[task]
+        spec = self.layout.task(task)
+        due = max(0, -(-(last - spec.phase) // spec.every)) - self.lost[task]
         in_time = np.count_nonzero((rows["tick"] < last) & ~is_missed(rows))
         return CycleCount(due - int(in_time), due)
 

@@ -12,7 +12,7 @@ from rack.backplane.mailbox.queue import is_position
 from rack.boards.config.ports import all_ports
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.toml import to_toml
-from rack.boards.faults.bounds import cycle_ticks
+from rack.boards.faults.bounds import between_reads, cycle_ticks
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind
 from rack.levels.level import Executor
@@ -97,7 +97,7 @@ class Targets:
         if not kind.takes_mailbox:
             return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
         seen = [box for box in self.layout.mailboxes if self._is_seen(kind, box)]
-        readers = [min(map(self._cycle, box.readers)) for box in seen]
+        readers = [min(between_reads(self.layout, box, reader) for reader in box.readers) for box in seen]
         targets = zip(seen, readers, strict=True)
         return [Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader) for box, reader in targets]
 

@@ -77,7 +77,7 @@ def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
     chart = panel.chart
     row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
     if lane.cycle_ns >= CYCLE_COLUMNS * column_ns:
-        for start in range(-(-chart.start_ns // lane.cycle_ns) * lane.cycle_ns, chart.end_ns + 1, lane.cycle_ns):
+        for start in range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns):
             row[(start - chart.start_ns) // column_ns] = "|"
     for job in panel.late(lane):
         if job.deadline_ns >= chart.start_ns:

@@ -31,7 +31,7 @@ class Lane:
     """A row of a Gantt chart: the tasks of one board on one core.
 
     That is an executor, with its planner where they are tightly coupled, or a planner alone. `cycle_ns` is the level's
-    cycle, `slice_ns` the time for one plan; without a planner, one cycle.
+    cycle, `slice_ns` the time for one plan; without a planner, one cycle. `phase_ns` is the start of the first cycle.
     """
 
     core: int
@@ -41,6 +41,7 @@ class Lane:
     priority: int
     cycle_ns: int
     slice_ns: int
+    phase_ns: int = 0
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -51,6 +52,10 @@ class Lane:
     def name(self) -> str:
         """Name of the executor; of the planner where it is alone."""
         return self.tasks[0]
+
+    def cycle_from(self, time_ns: int) -> int:
+        """Return the start of its first cycle that begins at a time or later."""
+        return time_ns + (self.phase_ns - time_ns) % self.cycle_ns
 
     @property
     def title(self) -> str:
@@ -81,6 +86,7 @@ def _lane(core: int, tasks: list[TimedTask]) -> Lane:
         priority=max(task.priority for task in tasks),
         cycle_ns=tasks[0].every_ns,
         slice_ns=(planner or tasks[0]).period_ns,
+        phase_ns=tasks[0].phase_ns,
     )
 
 
@@ -125,9 +131,9 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
     `chart` must extend beyond the stretch by a slice.
     """
     counted = Patterns.none()
-    spans = _by_cycle([span for span in chart.spans if span.core == lane.core], lane.cycle_ns)
+    spans = _by_cycle([span for span in chart.spans if span.core == lane.core], lane)
     for start, cycles, is_plan in _beginnings(chart, lane, within):
-        first = start // lane.cycle_ns
+        first = (start - lane.phase_ns) // lane.cycle_ns
         of_cycles = [spans[first + cycle] for cycle in range(cycles)]
         if lane.executor is None:
             # The only cycles of a planner on its own processor are its plans.
@@ -142,11 +148,12 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
     return counted
 
 
-def _by_cycle(spans: Sequence[Span], cycle_ns: int) -> dict[int, list[Span]]:
-    """Return the spans of each cycle, with those that extend into it."""
+def _by_cycle(spans: Sequence[Span], lane: Lane) -> dict[int, list[Span]]:
+    """Return the spans of each cycle of a lane, with those that extend into it."""
     found: dict[int, list[Span]] = defaultdict(list)
+    first, cycle_ns = lane.phase_ns, lane.cycle_ns
     for span in spans:
-        for cycle in range(span.start_ns // cycle_ns, (span.end_ns - 1) // cycle_ns + 1):
+        for cycle in range((span.start_ns - first) // cycle_ns, (span.end_ns - 1 - first) // cycle_ns + 1):
             found[cycle].append(span)
     return found
 
@@ -156,7 +163,7 @@ def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
     planned = {plan + at * lane.cycle_ns for plan in plans for at in range(slices)}
-    for at in range(-(-within[0] // lane.cycle_ns) * lane.cycle_ns, within[1], lane.cycle_ns):
+    for at in range(lane.cycle_from(within[0]), within[1], lane.cycle_ns):
         if at in plans:
             yield at, slices, True
         elif at not in planned and lane.executor is not None:

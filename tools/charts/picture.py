@@ -93,8 +93,8 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
         if stop - begin >= LETTER * (chart.end_ns - chart.start_ns):
             axes.text((begin + stop) / 2 / NS_PER_MS, at, letter, ha="center", va="center")
     if lane.cycle_ns >= 2 * LETTER * (chart.end_ns - chart.start_ns):
-        first = -(-chart.start_ns // lane.cycle_ns) * lane.cycle_ns
-        marks = [time / NS_PER_MS for time in range(first, chart.end_ns + 1, lane.cycle_ns)]
+        starts = range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
+        marks = [time / NS_PER_MS for time in starts]
         axes.vlines(marks, low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)
     for job in panel.late(lane):
         _mark_late(axes, chart, job, low + BAR + 0.06)

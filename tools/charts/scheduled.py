@@ -45,11 +45,12 @@ class Schedule:
         return min((part.time_ns for task in self.tasks for part in task.parts), default=1)
 
     def panel(self, start_ns: int, end_ns: int) -> Panel:
-        """Return the panel of a window; the schedule begins with a common release of all tasks."""
-        # The schedule repeats with the least common multiple of all slices.
+        """Return the panel of a window."""
+        # The schedule repeats with the least common multiple of all slices; with phases, from the second time on.
         cycles = [len(self._variants.get(task.name, (task.parts,))) * task.every_ns for task in self.tasks]
         period = lcm(*cycles, *(task.period_ns for task in self.tasks))
-        skipped = start_ns // period * period
+        has_phases = any(task.phase_ns for task in self.tasks)
+        skipped = max(0, start_ns // period - has_phases) * period
         longest = max(task.period_ns for task in self.tasks)
         counted_ns = SLICES * longest
         until = max(end_ns - skipped, counted_ns + longest)

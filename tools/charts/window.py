@@ -34,7 +34,7 @@ class WindowOptions:
         that is too long, or one outside the run.
         """
         if self.cycles is not None:
-            start, end = self.cycles[0] * level.every_ns, (self.cycles[1] + 1) * level.every_ns
+            start, end = (level.phase_ns + at * level.every_ns for at in (self.cycles[0], self.cycles[1] + 1))
         else:
             start = start_ns if self.from_ns is None else self.from_ns
             end = start + SLICES * level.period_ns if self.to_ns is None else self.to_ns

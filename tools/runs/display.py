@@ -6,7 +6,7 @@ The table has a line a task; below it are the active faults, what holds the rack
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rack.boards.events import Event
+from rack.boards.exchange import PortAge
 from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
 from rack.tools.runs.host_side import EntryRow, HostRow
@@ -144,6 +145,7 @@ class RackView:
             yield from _host_side(rows, width)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
+        yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             why, *release = hold.parts
@@ -196,6 +198,12 @@ def _reasons(snapshot: Snapshot) -> list[str]:
     rows = [row for row in snapshot.tasks if row.reason and not (row.state == "holding" and row.task in held)]
     shown = [hold.why for hold in snapshot.holds]
     return [f"{row.task}: {row.reason}" for row in rows if is_news(row.reason, shown)]
+
+
+def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:
+    """Return the ages of a board's messages, as one line."""
+    shown = [f"{port} {found.age} ticks old, taken at tick {found.taken}" for port, found in ports.items()]
+    return f"exchange of {board}: {'; '.join(shown) or 'no message yet'}"
 
 
 def _style(column: str, text: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rack.boards.config import rack_timing
-from rack.levels.timing.equations import response_ticks, system_response_bound_ns, system_response_ns
+from rack.levels.timing.equations import system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import ParallelChains, RackTiming
 from rack.levels.timing.system_response import mailboxes_along
 from rack.levels.timing.trace_times import counts, distribution
@@ -48,12 +48,14 @@ def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) ->
         "levels": list(chains.levels),
         "bound_eq_3_2_ms": system_response_bound_ns(cycles) * tick_ms,
         "sum_eq_3_3_ms": system_response_ns((), cycles) * tick_ms,
-        "command": _way(recording, chains.chains, chains.levels),
-        "status": _way(recording, [boards[::-1] for boards in chains.chains], chains.levels[::-1]),
+        "command": _way(recording, rack, chains.chains, chains.levels),
+        "status": _way(recording, rack, [boards[::-1] for boards in chains.chains], chains.levels[::-1]),
     }
 
 
-def _way(recording: Recording, chains: Sequence[Sequence[str]], levels: Sequence[str]) -> dict[str, Any]:
+def _way(
+    recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
+) -> dict[str, Any]:
     """Judge the response along all of these chains, from their first board's release to the last one's cycle.
 
     `levels` are those over which it is measured: after a level that does not pass the information on, it begins anew.
@@ -62,8 +64,7 @@ def _way(recording: Recording, chains: Sequence[Sequence[str]], levels: Sequence
     ways = [(boards, mailboxes_along(layout, boards)) for boards in chains]
     passed = min(len(mailboxes) for _, mailboxes in ways)
     start = len(levels) - passed - 1 if passed else len(levels)
-    cycles = [layout.task(board).every for board in chains[0][start:]]
-    bound_ms = response_ticks(cycles) * layout.clock_ns * 1e-6
+    bound_ms = max(rack.response_ticks(boards[start:]) for boards in chains) * layout.clock_ns * 1e-6
     found = [_along(recording, boards[start:], boxes[-1].name, bound_ms) for boards, boxes in ways if passed]
     seen = np.concatenate([ms for ms, _, _ in found]) if found else np.zeros(0)
     beyond = list(chain(*(each for _, each, _ in found)))
@@ -90,10 +91,11 @@ def _along(
     tick_ms = layout.clock_ns * 1e-6
     basis, visible_at = recording.signal(mailbox, "basis"), recording.signal(mailbox, "visible_at")
     # Until the first level's messages arrive, those of the later levels rest on their own ticks.
-    real = np.flatnonzero(basis >= first)
+    real = np.flatnonzero(basis >= first + max(layout.task(name).phase for name in boards))
     arrived, at = np.unique(basis[real], return_index=True)
     at = real[at]
-    acts = -(-visible_at[at[1:]] // last) * last + last
+    visible, read = visible_at[at[1:]], layout.read_grid(layout.mailbox(mailbox), boards[-1])
+    acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
     seen = np.ones(len(ms), bool)
     if recording.lost.get(mailbox):

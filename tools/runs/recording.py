@@ -14,7 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.segment import mailbox_of
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, loads
 from rack.boards.errors import ConfigError
@@ -98,7 +99,7 @@ class Recording:
         """The rack's layout, without the fields of its messages: see `fields` and `signal`."""
         with _naming(self.folder / "signals.parquet"):
             text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
-            boxes = [MailboxSpec(**{**m, "readers": tuple(m["readers"]), "fields": ()}) for m in text["mailboxes"]]
+            boxes = [mailbox_of({**m, "fields": ()}) for m in text["mailboxes"]]
             # Earlier versions recorded no host boards.
             tasks, hosts = (tuple(TaskSpec(**task) for task in text.get(key, ())) for key in ("tasks", "hosts"))
             return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes), hosts)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
@@ -14,6 +14,7 @@ from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
+from rack.boards.exchange import EXCHANGE, PortAge, ages_of
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
 from rack.tools.runs.host_side import EntryRow, HostRow, entry_rows, host_rows
@@ -72,7 +73,7 @@ class Snapshot:
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
     the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
-    `queues` are all of them, empty ones too.
+    `queues` are all of them, empty ones too; `exchanges` the messages in use of boards with an exchange, by port.
     """
 
     rack: str
@@ -89,6 +90,7 @@ class Snapshot:
     hosts: tuple[HostRow, ...] = ()
     entries: tuple[EntryRow, ...] = ()
     queues: tuple[QueueFill, ...] = ()
+    exchanges: Mapping[str, Mapping[str, PortAge]] = field(default_factory=dict)
 
 
 class RackMonitor:
@@ -108,6 +110,9 @@ class RackMonitor:
             task.name: open_observer(segment, f"{task.name}.status")
             for task in segment.layout.tasks
             if f"{task.name}.status" in written
+        }
+        self._exchanges = {
+            box.writer: open_observer(segment, box.name) for box in segment.layout.mailboxes if box.message == EXCHANGE
         }
         whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
         self._whole = open_observer(segment, whole) if whole else None
@@ -131,6 +136,11 @@ class RackMonitor:
             hosts=host_rows(self._segment),
             entries=entry_rows(self._segment),
             queues=self._queues.look(),
+            exchanges={
+                board: ages_of(reading.value)
+                for board, reader in self._exchanges.items()
+                if (reading := reader.peek()).is_there
+            },
         )
 
     def _active_faults(self) -> Iterator[str]:

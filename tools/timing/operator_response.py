@@ -256,7 +256,7 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
 
     path, tick_ms = response.paths[level], response.tick_ms
     own = [command for command in response.measured if command.level == level]
-    wait = path.delay + path.cycles[0] - 1
+    wait = path.delay + path.reads[0].every - 1
     lines = (
         ((wait + path.sum_eq_3_3) * tick_ms, SUM, "-.", "longest wait to be read + sum, eq. 3.3"),
         (path.longest * tick_ms, GRID, "--", "longest on the grid"),

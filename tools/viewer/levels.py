@@ -97,6 +97,17 @@ class Moves:
         self._moves.write(block, moves, lambda move: verb_name(move[1]) if move[0] else "")
 
 
+class Requests:
+    """Writes the motion request under way of `MOTION_STATUS`es."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
+        self._requests = ValueLane(stream, mailbox.name.partition(".")[0], "request")
+
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        self._requests.write(block, block.messages["current"], lambda serial: f"request {serial}" if serial else "")
+
+
 def verb_name(verb: int) -> str:
     """Return the verb of an elemental move in words."""
     return Verb(verb).name.lower().replace("_", " ")

@@ -24,11 +24,12 @@ from rack.levels.messages import (
     WORLD_MODEL,
 )
 from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.trajectory.messages import MOTION_STATUS
 from rack.tools.viewer.blueprint import blueprint, write_document
 from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses
-from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Moves
+from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Moves, Requests
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
@@ -151,6 +152,8 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         parts.append(FiredRows(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
         parts.append(Moves(stream, mailbox).write)
+    if mailbox.message == MOTION_STATUS.name:
+        parts.append(Requests(stream, mailbox).write)
     if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name):
         parts.append(Fields(stream, mailbox).write)
     return parts

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
 from rack.levels.timing.trace_times import execution_ns, is_missed, lateness_ns, newest_visible, response_ns
 from rack.tools.viewer.levels import LEVELS, LOG
 from rack.tools.viewer.stream import Ints, RowBlock, Stream
@@ -115,7 +115,8 @@ class Age:
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec, layout: Layout) -> None:
         self._stream, self._lane = stream, (AGES, mailbox.name)
-        self._every = min([layout.task(reader).every for reader in mailbox.readers], default=mailbox.every)
+        own = TickGrid(mailbox.every, mailbox.phase)
+        self._releases = min([layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own)
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
         self._made: Ints = np.empty(0, dtype=np.int64)
         self._upto = -1
@@ -128,8 +129,7 @@ class Age:
 
     def advance(self, tick: int) -> None:
         """Write the ages at all releases before `tick`; every message visible before it has been taken."""
-        every = self._every
-        releases = np.arange((self._upto // every + 1) * every, tick, every)
+        releases = np.arange(self._releases.since(self._upto + 1), tick, self._releases.every)
         self._upto = max(self._upto, tick - 1)
         newest = newest_visible(releases, self._visible_at)
         releases, newest = releases[newest >= 0], newest[newest >= 0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -156,6 +157,27 @@ def test_a_task_is_released_at_its_own_grid_points(make_bus: MakeBus) -> None:
     # A tick sees the releases of the tick before it, even across skipped ticks.
     before = [tick for tick, _ in ticks][:-1]
     assert seen == [(-1, -1), *((tick, tick - tick % 4) for tick in before)]
+
+
+@pytest.mark.parametrize("skipped", [(), (5,), (4, 5, 6, 7, 8, 9, 10)])
+def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
+    make_bus: MakeBus, skipped: tuple[int, ...]
+) -> None:
+    specs = [replace(task(f"t{phase}", every=4, slot=2 + phase), phase=phase) for phase in (0, 1, 3)]
+    segment = make_bus(*specs)
+    driver = RealtimeDriver(segment, lambda _: None)
+    last, found = -1, dict[str, list[int]]()
+    for tick in (tick for tick in range(24) if tick not in skipped):
+        for due in driver.due(tick, last):
+            due.release(tick)
+            found.setdefault(due.spec.name, []).append(due.block[Block.RELEASED])
+        last = tick
+    # A release that fell into skipped ticks comes at the first tick after them, unless a newer one has come too.
+    for spec in specs:
+        releases = range(spec.phase, 24, 4)
+        made = [next(t for t in range(release, 24 + 4) if t not in skipped) for release in releases]
+        expected = [r for r, m, following in zip(releases, made, [*made[1:], 99], strict=True) if m < following]
+        assert found[spec.name] == expected
 
 
 def test_nothing_is_released_to_a_planner_within_its_time_slice(make_bus: MakeBus) -> None:

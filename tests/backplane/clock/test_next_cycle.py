@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -47,6 +48,22 @@ def start_grid(segment: Segment, passed_ns: int = 0, period_ns: int = PERIOD_NS)
 def release(segment: Segment, tick: int) -> None:
     segment.block("level")[Block.RELEASED] = tick
     wake_semaphore(segment.rack, "level").release()
+
+
+def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
+    bus = make_bus(replace(task("level", every=EVERY), phase=3))
+    cycle, seen = NextCycle(bus, "level"), []
+    for tick in (3, 7, 19):
+        release(bus, tick)
+        seen.append((cycle.wait(), cycle.skipped))
+    assert seen == [(3, 0), (7, 0), (19, 2)]
+    # A new process takes the next release on the same grid, and a plan ends on it.
+    cycle = NextCycle(bus, "level")
+    release(bus, 23)
+    assert (cycle.wait(), cycle.skipped) == (23, 0)
+    cycle.hold_until(32)
+    release(bus, 35)
+    assert (cycle.wait(), cycle.skipped) == (35, 0)
 
 
 @WAKES

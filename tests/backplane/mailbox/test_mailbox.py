@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from random import Random
+
 import pytest
 
 from rack.backplane.errors import MailboxError
@@ -67,6 +70,28 @@ def test_a_late_message_becomes_visible_at_its_writers_next_boundary(make_bus: M
     assert not write(writer, 4, now=9)
     assert [seen(reader, tick) for tick in (4, 8, 11)] == [(1, NEW), (1, OLD), (1, OLD)]
     assert seen(reader, 12) == (2, NEW)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(make_bus: MakeBus, seed: int) -> None:
+    rng = Random(seed)
+    every, within = rng.randint(1, 6), rng.choice((1, 1, 3))
+    phase = rng.randrange(every)
+    spec = replace(mailbox(every=every, delay=every * within, depth=64), phase=phase)
+    writer, reader = ends(make_bus(spec))
+    visible, tick = [], phase
+    for _ in range(16):
+        # Written at `now`: often before its slice ends, sometimes well after.
+        now = tick + rng.choice((0, 1, spec.delay - 1, spec.delay, spec.delay + rng.randrange(3 * every)))
+        in_time = now < tick + spec.delay
+        assert write(writer, tick, now) == in_time
+        # By counting: the end of its slice or, once that has come, the next tick on the writer's grid.
+        due = tick + spec.delay if in_time else next(t for t in range(now + 1, now + 99) if (t - phase) % every == 0)
+        visible.append(due)
+        # A late writer takes the newest release.
+        tick = max(tick + every * within, now - (now - phase) % every)
+    for at in range(visible[-1] + 1):
+        assert seen(reader, at)[0] == sum(due <= at for due in visible)
 
 
 def test_a_message_at_the_very_boundary_is_late(make_bus: MakeBus) -> None:

@@ -57,6 +57,11 @@ class JointRig:
         return cast(ArmExecutor, self.rack.tasks["arm"].level)
 
     @property
+    def swing(self) -> Swing:
+        """The present level above the boards that servo joints."""
+        return cast(Swing, self.rack.tasks["swing"].level)
+
+    @property
     def status(self) -> Message:
         """The status that the board of the arm wrote last."""
         return cast(Message, self.rack.tasks["arm"].write.status)

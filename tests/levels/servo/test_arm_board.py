@@ -125,6 +125,19 @@ def test_fault_between_level_and_arm_brakes_it_within_limits(
     assert_goes_on(rig)
 
 
+def test_arm_is_not_released_towards_where_its_sensors_did_not_see_it() -> None:
+    rig = JointRig(TOGETHER, following=0.01)
+    rig.run(WARM_UP + 60)  # at its fastest: blind, it is thought to stop earlier or later than it does
+    rig.inject("sensor-dropout")
+    rig.run(200)
+    rig.heal()
+    rig.run(30)
+    assert np.abs(np.diff(rig.positions[-30:], axis=0)).max() > 0.01
+    assert Alarm.ACTUATOR not in [finding.alarm for _, finding in rig.found]
+    rig.run(100)
+    assert_goes_on(rig)
+
+
 class Nonsense(JointServo):
     """Writes NaN for a while."""
 

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from random import Random
+
 import numpy as np
 import pytest
 
+from rack.backplane.layout import TickGrid
 from rack.boards.config import load, rack_timing, wire
 from rack.levels.timing.system_response import CommandPath, command_paths
 
-NASREM = CommandPath(("task", "elemental_move", "primitive", "servo"), (400, 100, 8, 1), 1, True)
+
+def path_of(levels: Sequence[str], grids: Sequence[TickGrid], reads: Sequence[TickGrid] | None = None) -> CommandPath:
+    """Return a path whose first command takes a tick; each level reads in every cycle, or at `reads`."""
+    return CommandPath(tuple(levels), tuple(grids), tuple(reads or grids), 1, True)
+
+
+NASREM = path_of(("task", "elemental_move", "primitive", "servo"), [TickGrid(every) for every in (400, 100, 8, 1)])
 
 
 @pytest.mark.parametrize(
@@ -36,11 +46,26 @@ def test_bounds_are_those_of_the_paper_and_of_the_grid() -> None:
 
 @pytest.mark.parametrize("cycles", [(400, 100, 8, 1), (12, 8, 3), (7, 5), (30, 12, 9, 2), (4,)])
 def test_the_longest_on_the_grid_is_met_and_never_passed(cycles: tuple[int, ...]) -> None:
-    path = CommandPath(tuple(map(str, cycles)), cycles, 1, True)
+    path = path_of([str(cycle) for cycle in cycles], [TickGrid(cycle) for cycle in cycles])
     grid = int(np.lcm.reduce(cycles))
     found = [path.response(given, path.acts_at(given + 1)) for given in range(2 * grid)]
     assert max(found) <= path.longest
     if len(cycles) <= 2:
+        assert max(found) == path.longest
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_with_phases_and_rare_reads_the_longest_is_met_by_two_levels_and_never_passed(seed: int) -> None:
+    rng = Random(seed)
+    grids = [TickGrid(every, rng.randrange(every)) for every in rng.choices(range(1, 13), k=rng.choice((2, 2, 3)))]
+    # Each level reads in every n-th of its cycles.
+    ratios = [rng.randint(1, 3) for _ in grids]
+    reads = [TickGrid(n * g.every, g.phase + rng.randrange(n) * g.every) for n, g in zip(ratios, grids, strict=True)]
+    path = path_of([str(grid) for grid in grids], grids, reads)
+    period = int(np.lcm.reduce([grid.every for grid in reads]))
+    found = [path.response(given, path.acts_at(given + 1)) for given in range(2 * period)]
+    assert max(found) <= path.longest
+    if len(grids) == 2 and ratios[0] == 1:
         assert max(found) == path.longest
 
 
@@ -49,5 +74,5 @@ def test_paths_begin_at_every_level_that_can_be_commanded() -> None:
     layout = wire(config)
     found = command_paths(rack_timing(config, layout), layout)
     assert found["task"] == NASREM
-    assert found["primitive"] == CommandPath(("primitive", "servo"), (8, 1), 1, True)
+    assert found["primitive"] == path_of(("primitive", "servo"), [TickGrid(8), TickGrid(1)])
     assert list(found) == ["task", "elemental_move", "primitive", "servo"]

@@ -20,7 +20,7 @@ WITHIN = (1.0, 1.0, 1.0, 1.0, 0.3, 1.0)  # joint 5 is near a limit at home
 
 
 @given(requests, st.floats(0.1, 4.0), st.sampled_from(["cancel", "hold", "nothing"]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_no_chain_of_requests_exceeds_a_limit(chain: list, at: float, what: str) -> None:
     rig = TrajectoryRig()
     acted = False
@@ -33,7 +33,9 @@ def test_no_chain_of_requests_exceeds_a_limit(chain: list, at: float, what: str)
     act(rig, what)
     rig.run(1.0)
     act(rig, "resume")
-    status = rig.run(12.0)
+    while rig.write.status.current and rig.tick < 30_000:
+        rig.cycle()
+    status = rig.run(0.5)
     speed, acceleration = rig.excess()
     assert speed <= 1.0
     assert acceleration <= 1.0

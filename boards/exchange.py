@@ -1,0 +1,83 @@
+"""The exchange of a board: which message of each port is in use, its age, and when the board took it.
+
+A board whose config has tables `[board.<name>.exchange.<port>]` writes this into its mailbox `<name>.exchange` in every
+cycle, so that ages and arrivals are on record like any other message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
+from rack.backplane.message import Field, Message, MessageType
+from rack.boards.wiring import Source
+
+EXCHANGE = "exchange"
+"""Port, and message type, of the exchange."""
+AGE, TAKEN = "age", "taken"
+"""Ends of the names of its fields."""
+NEVER = -1
+"""Tick at which a message was taken before there is one."""
+
+
+def exchange_message(reads: Mapping[str, Source]) -> MessageType:
+    """Return the message type for a board that reads these ports: two fields for each mailbox."""
+    fields = [field for label in _labels(reads) for field in _fields(label)]
+    return MessageType(EXCHANGE, 1, tuple(fields))
+
+
+def _labels(reads: Mapping[str, Source]) -> Iterator[str]:
+    for port, source in reads.items():
+        yield from [port] if isinstance(source, str) else [f"{port}_{board}" for board in source]
+
+
+def _fields(label: str) -> tuple[Field, Field]:
+    age = "from the release of the message in use to that of this cycle; negative: released later; 0 before the first"
+    taken = f"release of the cycle that took it; {NEVER} before the first"
+    return Field(f"{label}_{AGE}", "i8", "tick", age), Field(f"{label}_{TAKEN}", "i8", "tick", taken)
+
+
+@dataclass(frozen=True)
+class PortAge:
+    """Age and arrival of the message in use, as in the exchange message: both in ticks."""
+
+    age: int
+    taken: int
+
+
+def ages_of(exchange: Message) -> dict[str, PortAge]:
+    """Return the inputs of an exchange message that have a message in use, by label."""
+    names, values = exchange.record.dtype.names or (), iter(exchange.raw.cast("q"))
+    labels = [name.removesuffix(f"_{AGE}") for name in names[::2]]
+    found = {label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)}
+    return {label: port for label, port in found.items() if port.taken != NEVER}
+
+
+class Taken(NamedTuple):
+    """The last reading of one mailbox, `readings[key]`, and its reader."""
+
+    readings: Mapping[str, Reading]
+    key: str
+    reader: Reader
+
+
+class ExchangeRecord:
+    """Fills a board's exchange message from its inputs, which come in the order of `exchange_message`."""
+
+    def __init__(self, inputs: Sequence[Taken], message: Message) -> None:
+        self._inputs = tuple(inputs)
+        # Age and tick of each input, in turn.
+        self._values = message.raw.cast("q")
+        for at in range(len(self._inputs)):
+            self._values[2 * at + 1] = NEVER
+
+    def fill(self, tick: int) -> None:
+        """Note the messages in use, after the reads of the cycle released at `tick`."""
+        values, at = self._values, 0
+        for readings, key, reader in self._inputs:
+            if readings[key].verdict is Verdict.NEW:
+                values[at + 1] = tick
+            values[at] = tick - reader.newest if reader.serial else 0
+            at += 2

@@ -1,0 +1,138 @@
+"""A command environment on the host side: motions as plain Python calls, in a script or at a prompt.
+
+    move(joints)                  a straight line in joint space
+    line(position, ...)           a straight line of the tool, in the world's frame or that of a body
+    stay(seconds), grip(opening)  at rest
+    cancel()                      drop everything; the arm ramps to rest
+    done(), wait()                whether all is done; wait until it is
+
+A call returns as soon as the request is on its way: requests are queued, and blended. It waits only while the queue is
+full.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from rack.levels.errors import LevelError
+from rack.levels.host_program import Bus, HostProgram
+from rack.levels.level import Input, LevelContext
+from rack.levels.tables import RobotConfig, SceneConfig, Table, read_params
+from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, MotionKind, RequestEnd
+
+DOWN = (0.0, 1.0, 0.0, 0.0)
+"""Orientation of a tool that points straight down, w, x, y, z."""
+LOOK_S = 0.25
+WORLD = -1
+
+
+class Motions:
+    """Motion requests as calls. Every call returns the number of its request."""
+
+    def __init__(self, bus: Bus, robot: RobotConfig, scene: SceneConfig) -> None:
+        self._bus, self._robot, self._bodies = bus, robot, scene.bodies
+
+    def move(self, joints: Sequence[float] | None = None, **times: float) -> int:
+        """Go to joint positions, rad, in a straight line in joint space; default: home."""
+        goal = self._robot.home if joints is None else joints
+        return self._request(kind=MotionKind.JOINTS, joints=goal, **times)
+
+    def line(
+        self,
+        position: Sequence[float],
+        quaternion: Sequence[float] = DOWN,
+        body: str = "",
+        live: bool = False,
+        **times: float,
+    ) -> int:
+        """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live` goal follows."""
+        row = self._bodies.index(body) if body else WORLD
+        pose = {"position": position, "quaternion": quaternion}
+        return self._request(kind=MotionKind.POSE, body=row, live=live, **pose, **times)
+
+    def stay(self, seconds: float) -> int:
+        """Stay at the goal before."""
+        return self._request(kind=MotionKind.STAY, segment=seconds)
+
+    def grip(self, opening: float | None = None, force: float | None = None) -> int:
+        """Bring the gripper to an opening, m, with at most `force`, N; default: close it."""
+        gripper = self._robot.gripper
+        if gripper is None:
+            raise LevelError("grip: the arm has no gripper")
+        wanted = gripper.closed if opening is None else opening
+        return self._request(kind=MotionKind.GRIP, opening=wanted, force=gripper.force if force is None else force)
+
+    def release(self) -> int:
+        """Open the gripper."""
+        gripper = self._robot.gripper
+        return self.grip(None if gripper is None else gripper.open)
+
+    def cancel(self) -> int:
+        """End the motion under way and drop all others; the arm ramps to rest."""
+        return self._request(kind=MotionKind.CANCEL)
+
+    def end_of(self, request: int) -> RequestEnd:
+        """Return how a request ended: NONE until it has, or if it is too long ago."""
+        status = self._bus.read("motion").value
+        ends = dict(zip(status.ended.tolist(), status.ends.tolist(), strict=True))
+        return RequestEnd(ends.get(request, RequestEnd.NONE))
+
+    def done(self, request: int | None = None) -> bool:
+        """Return whether a request, by default the newest, has ended."""
+        return bool(self._bus.read("motion").value.done >= (self._bus.sent("requests") if request is None else request))
+
+    def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
+        """Wait until a request, by default the newest, has ended; False if `until` holds before, or the run ends."""
+        while not self.done(request):
+            if until() or self._bus.is_over:
+                return False
+            self._bus.wait(LOOK_S)
+        return True
+
+    def where(self) -> list[float]:
+        """Return the tool position commanded last, m."""
+        return [round(float(x), 4) for x in self._bus.read("motion").value.tool]
+
+    def _request(self, **fields: Any) -> int:
+        while not self._bus.send("requests", **{"body": WORLD, **fields}):
+            if self._bus.is_over:
+                raise LevelError("the run is over")
+            self._bus.wait(LOOK_S)
+        return self._bus.sent("requests")
+
+
+class ScriptParams(Table):
+    """`[host.<name>.params]`."""
+
+    script: str = Field(description="Python script to run, in a folder of python_path")
+
+
+class CommandEnvironment(HostProgram):
+    """Runs a script that commands motions by name; a prompt offers the same names."""
+
+    inputs = {"motion": Input(MOTION_STATUS, "below.motion")}
+    outputs = {"requests": MOTION_REQUEST}
+    params = ScriptParams
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._script = read_params(ScriptParams, context.params).script
+
+    def run(self, bus: Bus) -> None:
+        """Run the script; raises `LevelError` if there is no such file."""
+        found = next((path for folder in sys.path if (path := Path(folder) / self._script).is_file()), None)
+        if found is None:
+            raise LevelError(f"params.script = {self._script}: not in a folder of python_path")
+        runpy.run_path(str(found), {"bus": bus, "program": self, **self.names(bus)}, "__main__")
+
+    def names(self, bus: Bus) -> Mapping[str, Any]:
+        """Return the calls of `Motions`, by name."""
+        motions = Motions(bus, self.context.robot, self.context.scene)
+        calls = ("move", "line", "stay", "grip", "release", "cancel", "done", "wait", "end_of", "where")
+        return {"motions": motions, **{name: getattr(motions, name) for name in calls}}

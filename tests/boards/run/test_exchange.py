@@ -1,0 +1,188 @@
+"""The exchange of a board: ports read in every n-th cycle or asynchronously, and the record of ages and arrivals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.mailbox import Verdict
+from rack.boards import Rack
+from rack.boards.config import resolve
+from rack.boards.errors import ConfigError
+from rack.boards.exchange import PortAge
+from rack.boards.faults.config import FaultConfig
+from rack.tools.runs.snapshot import RackMonitor
+from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.messages import Written
+
+WAVE, NOTES = (2, 1), (3, 2)
+"""Period and phase of the writer and of the reader, ticks."""
+SPARSE = (4, 1)
+"""Period and phase of the port that is read now and then, cycles."""
+TEXT = f"""{CLOCK}
+[board.wave]
+slot = 2
+every = {WAVE[0]}
+phase = {WAVE[1]}
+executor = "wave_levels:Wave"
+
+[board.notes]
+slot = 3
+every = {NOTES[0]}
+phase = {NOTES[1]}
+below = "wave"
+executor = "exchange_levels:Notes"
+
+[board.notes.exchange]
+sparse = {{ every = {SPARSE[0]}, phase = {SPARSE[1]} }}
+early = {{ asynchronous = true }}
+"""
+TICKS = 100
+SECONDS = 0.25
+
+
+def written(rack: Rack, seconds: float = SECONDS) -> Written:
+    with rack:
+        rack.run(seconds)
+        return Written.on(rack.segment)
+
+
+def newest(tick: int, delay: int) -> int:
+    """Return the release of the wave's newest message that is visible at a tick; negative: none is."""
+    every, phase = WAVE
+    return tick - delay - (tick - delay - phase) % every
+
+
+def ages(rows: np.ndarray, port: str) -> list[tuple[int, int]]:
+    """Return age and tick of arrival of a port, cycle by cycle."""
+    fields = rows["message"]
+    return list(zip(fields[f"{port}_age"].tolist(), fields[f"{port}_taken"].tolist(), strict=True))
+
+
+def model(port: str) -> list[tuple[int, int]]:
+    """Return what the record of a port must show in each cycle."""
+    (every, phase), found, made, taken = NOTES, [], -1, -1
+    for cycle, tick in enumerate(range(phase, TICKS, every)):
+        if port != "sparse" or cycle % SPARSE[0] == SPARSE[1]:
+            # The faster board goes first in a tick.
+            seen = newest(tick, 0 if port == "early" else WAVE[0])
+            if seen > made:
+                made, taken = seen, tick
+        found.append((tick - made if made >= 0 else 0, taken))
+    return found
+
+
+def test_ages_and_arrivals_are_those_of_the_configured_exchange(config: MakeConfig) -> None:
+    found = written(Rack(config(text=TEXT)))
+    for port in ("plain", "sparse", "early"):
+        assert ages(found.messages["notes.exchange"], port) == model(port)
+
+
+def test_a_level_sees_the_last_reading_as_old_until_the_next_exchange(config: MakeConfig) -> None:
+    found = written(Rack(config(text=TEXT))).messages
+    seen, record = found["notes.status"], found["notes.exchange"]["message"]
+    for at, port in enumerate(("plain", "sparse", "early")):
+        taken = record[f"{port}_taken"]
+        made = seen["tick"] - record[f"{port}_age"]
+        values = np.where(taken < 0, 0.0, 0.5 * made)
+        assert seen["message"]["value"][:, at].tolist() == values.tolist()
+        verdicts = np.where(taken < 0, Verdict.NONE, np.where(taken == seen["tick"], Verdict.NEW, Verdict.OLD))
+        assert seen["message"]["verdict"][:, at].tolist() == verdicts.tolist()
+        assert not seen["message"]["lost"][:, at].any()
+
+
+def test_a_snapshot_shows_the_messages_in_use(config: MakeConfig) -> None:
+    with Rack(config(text=TEXT)) as rack:
+        rack.run(SECONDS)
+        found = RackMonitor(rack.segment).look()
+    assert found.exchanges == {"notes": {port: PortAge(*model(port)[-1]) for port in ("plain", "sparse", "early")}}
+
+
+def test_lockstep_with_an_asynchronous_port_repeats(config: MakeConfig) -> None:
+    racks = [Rack(config(text=TEXT)) for _ in range(3)]
+    assert len({str(written(rack).until(TICKS)) for rack in racks}) == 1
+
+
+def test_a_port_that_is_read_rarely_raises_no_alarm(config: MakeConfig) -> None:
+    with Rack(config("board.notes.exchange.sparse.every=50", text=TEXT)) as rack:
+        rack.run(1.5)
+        assert [event for event in rack.events if event.kind == "detection"] == []
+
+
+NO_TABLE = TEXT.partition("[board.notes.exchange]")[0]
+QUEUE = (
+    "protocol.mailbox={ 'wave.status' = 'queue' }",
+    "board.notes.executor='wave_levels:Watch'",
+    "board.notes.exchange={ status = { every = 4, phase = 1 } }",
+)
+
+
+def test_in_real_time_an_asynchronous_port_has_what_ticks_permit_or_newer(config: MakeConfig) -> None:
+    with Rack(config("clock.mode=realtime", text=TEXT)) as rack:
+        rack.run(SECONDS)
+        rows = Written.on(rack.segment).messages["notes.exchange"]
+        # All messages are whole, in order and in time, however early or late they are taken.
+        assert [event for event in rack.events if event.kind == "detection"] == []
+    made = {port: rows["tick"] - rows["message"][f"{port}_age"] for port in ("plain", "early")}
+    both = rows["message"]["plain_taken"] >= 0
+    assert both.any()
+    assert (made["early"][both] >= made["plain"][both]).all()
+
+
+def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(config: MakeConfig) -> None:
+    with Rack(config(*QUEUE, text=NO_TABLE)) as rack:
+        rack.run(1.5)
+        assert [event for event in rack.events if event.kind == "detection"] == []
+        found = Written.on(rack.segment).messages
+    (every, phase), (cycles, first) = NOTES, SPARSE
+    taken, sent = found["wave.status_taken"], found["wave.status"]
+    assert taken["tick"].tolist() == list(range(phase + every * first, 600, every * cycles))
+    counts = [int(np.sum(sent["visible_at"] <= tick)) for tick in taken["tick"]]
+    assert taken["message"]["taken"].tolist() == counts
+    assert not taken["message"]["unread"].any()
+
+
+def test_a_queue_is_not_read_asynchronously(config: MakeConfig) -> None:
+    wanted = "board.notes.exchange={ status = { asynchronous = true } }"
+    with pytest.raises(
+        ConfigError, match=r"^board.notes.exchange.status.asynchronous = true: 'wave.status' is a queue"
+    ):
+        resolve(config(*QUEUE[:2], wanted, text=NO_TABLE))
+
+
+def killed(config: MakeConfig, victim: str) -> Any:
+    """Return the rows of the reader's record and status after the death of a board at tick 41."""
+    plain = config("supervision.lockstep_restart_s=0.1", text=TEXT)
+    rack = Rack(plain.model_copy(update={"fault": (FaultConfig(kind="kill", board=victim, tick=41),)}))
+    return written(rack, 2 * SECONDS).messages
+
+
+def test_a_restarted_board_keeps_the_grid_of_its_exchange(config: MakeConfig) -> None:
+    rows = killed(config, "notes")["notes.exchange"]
+    back = int(np.flatnonzero(np.diff(rows["tick"]) > NOTES[0])[0]) + 1
+    assert rows["tick"][back] > 41
+    taken = rows["message"]["sparse_taken"]
+    fresh = sorted({int(tick) for tick in taken[taken >= 0]})
+    every, first = NOTES[0] * SPARSE[0], NOTES[1] + NOTES[0] * SPARSE[1]
+    assert {tick % every for tick in fresh} == {first}
+    assert fresh[0] < 41 < fresh[-1]
+    # Its new process knows no message before its first exchange.
+    waiting = rows["tick"][back:] < next(tick for tick in fresh if tick >= rows["tick"][back])
+    assert (taken[back:][waiting] == -1).all()
+
+
+def test_a_lost_writer_shows_between_two_exchanges(config: MakeConfig) -> None:
+    rows = killed(config, "wave")["notes.status"]
+    lost = rows["message"]["lost"][(rows["tick"] > 42) & (rows["tick"] < 41 + 40)]
+    assert len(lost) > 2 * SPARSE[0]
+    assert lost.all()
+    assert not rows["message"]["lost"][rows["tick"] > 41 + 40 + 3 * NOTES[0] * SPARSE[0]].any()
+
+
+def test_a_level_that_writes_a_mailbox_of_that_name_cannot_have_an_exchange(config: MakeConfig) -> None:
+    with pytest.raises(
+        ConfigError, match=r"^board.notes.exchange: the executor writes a mailbox of that name itself; "
+    ):
+        resolve(config("board.notes.executor='exchange_levels:Exchanging'", text=TEXT))

@@ -1,0 +1,134 @@
+"""Phases of boards: a static cyclic schedule on one core, what boards see across phases, and restarts."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.words import Block
+from rack.boards import Rack
+from rack.boards.config import wire
+from rack.boards.config.timing import rack_timing
+from rack.boards.faults.config import FaultConfig
+from rack.levels.timing.schedule import simulate
+from rack.tools.charts.gantt import Subject, gantt_of
+from rack.tools.charts.window import WindowOptions
+from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.messages import Written
+
+BOARD = """
+[board.{name}]
+slot = {slot}
+core = 0
+every = {every}
+phase = {phase}
+executor = "wave_levels:{kind}"
+{below}
+budget = {{ process_ms = {process_ms} }}
+"""
+MINOR = {"wave": (2, 0, 1.5), "left": (4, 1, 2.2), "right": (4, 3, 2.2)}
+"""A minor cycle of two ticks of 2.5 ms: the wave in the first, the watches in the second in turn."""
+
+
+def cyclic(phases: bool = True) -> str:
+    """Return a static cyclic schedule of three boards on one core."""
+    boards = [
+        BOARD.format(
+            name=name,
+            slot=2 + at,
+            every=every,
+            phase=phase * phases,
+            kind="Watch" if at else "Wave",
+            below=f'below = "{list(MINOR)[at - 1]}"' if at else "",
+            process_ms=process_ms,
+        )
+        for at, (name, (every, phase, process_ms)) in enumerate(MINOR.items())
+    ]
+    return f"{CLOCK}{''.join(boards)}\n[timing]\ncontext_switch_ms = 0.0\n"
+
+
+def written(rack: Rack, seconds: float = 0.25) -> Written:
+    with rack:
+        rack.run(seconds)
+        return Written.on(rack.segment)
+
+
+def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConfig) -> None:
+    first, again = Rack(config(text=cyclic())), Rack(config(text=cyclic()))
+    found = written(first)
+    assert found.until(100) == written(again).until(100)
+    assert first.outcome is not None
+    assert again.outcome is not None
+    assert first.outcome.digest == again.outcome.digest
+    # In lockstep a cycle ends before its deadline, not always before the next tick: the order is that of the releases.
+    released = sorted((int(row["tick"]), name) for name, rows in found.cycles.items() for row in rows)
+    assert released == [(tick, ("wave", "left", "wave", "right")[tick % 4]) for tick in range(100)]
+
+
+def test_messages_are_visible_by_ticks_whatever_the_phases(config: MakeConfig) -> None:
+    found = written(Rack(config(text=cyclic())))
+    for name, below in (("left", "wave"), ("right", "left")):
+        made, seen = found.messages[f"{below}.status"], found.messages[f"{name}.status"]
+        every = MINOR[below][0]
+        assert made["visible_at"].tolist() == (made["tick"] + every).tolist()
+        for row in seen:
+            visible = made[made["visible_at"] <= row["tick"]]
+            expected = visible["message"]["value"][-1] if len(visible) else 0.0
+            assert row["message"]["value"] == expected
+
+
+def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(config: MakeConfig) -> None:
+    def is_whole(phases: bool) -> bool:
+        rack = config("board.wave.priority=2", "board.left.priority=1", text=cyclic(phases))
+        chart = simulate(rack_timing(rack, wire(rack)).tasks, 400_000_000)
+        assert not any(chart.late(name) for name in MINOR)
+        spans = [(span.task, span.release_ns) for span in chart.spans]
+        waits = any(span.start_ns > span.release_ns for span in chart.spans)
+        assert all(one.end_ns <= other.start_ns for one, other in pairwise(chart.spans))
+        return len(spans) == len(set(spans)) and not waits
+
+    assert is_whole(phases=True)
+    assert not is_whole(phases=False)
+
+
+@pytest.mark.parametrize("victim", ["left", "wave"])
+def test_a_restart_keeps_the_phase(config: MakeConfig, victim: str) -> None:
+    plain = config("supervision.lockstep_restart_s=0.06", text=cyclic())
+    kill = FaultConfig(kind="kill", board=victim, tick=42)
+    rack = Rack(plain.model_copy(update={"fault": (kill,)}))
+    ticks = written(rack, 0.5).cycles[victim]["tick"].tolist()
+    every, phase, _ = MINOR[victim]
+    assert ticks[0] == phase
+    assert {tick % every for tick in ticks} == {phase}
+    steps = [later - earlier for earlier, later in pairwise(ticks)]
+    assert max(steps) > 4 * every
+    assert steps.count(every) == len(steps) - 1
+
+
+def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
+    rack = Rack(config("clock.mode=realtime", text=cyclic()))
+    found = written(rack)
+    for name, (every, phase, _) in MINOR.items():
+        rows, block = found.cycles[name], rack.segment.block(name)
+        assert len(rows)
+        assert {int(tick) % every for tick in rows["tick"]} == {phase % every}
+        # What was not taken was skipped, and counted.
+        last = int(rows["tick"][-1])
+        assert len(rows) + block[Block.SKIPPED] == (last - phase) // every + 1
+
+
+def test_gantt_draws_the_cyclic_schedule_without_preemption(config: MakeConfig, tmp_path: Path) -> None:
+    found = config(text=cyclic())
+    gantt = gantt_of(Subject(found, wire(found), None, tmp_path), WindowOptions(), {}, lambda part: None)
+    text = gantt.text()
+    rows = [line.split()[-1] for line in text.splitlines() if line.startswith("core 0 ")]
+    # One stretch of each job, from its release on: the first of the watch "right" is at tick 3.
+    stretches = [[match.start() for match in re.finditer("X+", row)] for row in rows]
+    assert [len(found) for found in stretches] == [4, 2, 2]
+    tick = (stretches[0][1] - stretches[0][0]) / 2
+    assert [found[0] / tick for found in stretches] == pytest.approx([0, 1, 3], abs=1 / tick)
+    assert "wave: X -: 20 of 20 cycles" in text
+    assert "right: X -: 10 of 10 cycles" in text

@@ -1,0 +1,142 @@
+"""Parts of boards that servo joints, and of the arm's: loads on the way between references, torques added up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message
+from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_TORQUE
+from rack.levels.level import LevelContext, Pace
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.servo.joint_control import AT, DUE, JointLoads
+from rack.levels.servo.joint_torques import JointTorques
+from tests.levels.arms import cell, config
+from tests.levels.servo.joint_rig import CLOCK_NS, JOINTS, JointRig
+
+SIZES = {"joints": len(JOINTS)}
+TICK = 100
+
+
+def reference(due: int, inertia: float, load: float) -> Message:
+    message = Message(JOINT_REFERENCE.dtype(SIZES))
+    message.due, message.inertia, message.load = due, np.full(6, inertia), np.full(6, load)
+    return message
+
+
+def torque(sampled: int, joint: int, newton_metres: float) -> Message:
+    message = Message(JOINT_TORQUE.dtype(SIZES))
+    message.sampled = sampled
+    message.torque[joint], message.target[joint], message.target_velocity[joint] = newton_metres, 0.1 * joint, 0.2
+    return message
+
+
+def joint_torques() -> JointTorques:
+    """Return those of two boards, one as fast as the arm, one of half its rate."""
+    robot, scene = config("puma560")
+    pace = {"fast": Pace(1, 1), "slow": Pace(2, 1)}
+    return JointTorques(LevelContext("arm", 1, 1, CLOCK_NS, 0, robot, scene, {}, SIZES, pace), len(JOINTS))
+
+
+def readings(fast: Message, slow: Message) -> dict[str, Reading]:
+    return {"fast": Reading(fast, Verdict.NEW), "slow": Reading(slow, Verdict.OLD)}
+
+
+def test_loads_go_evenly_from_one_reference_to_the_next() -> None:
+    loads = JointLoads(cell("puma560"))
+    loads.take(reference(due=20, inertia=2.0, load=5.0), tick=0)
+    loads.take(reference(due=40, inertia=4.0, load=9.0), tick=20)
+    begin, end = loads.table[AT], loads.table[DUE]
+    assert [loads.part(tick) for tick in (20, 25, 40, 60)] == [0.0, 0.25, 1.0, 1.0]
+    assert (begin[:, 0].tolist(), end[:, 0].tolist()) == ([2.0, 5.0], [4.0, 9.0])
+
+
+def test_loads_of_an_arm_that_holds_are_computed_where_it_is_and_again_only_far_from_there() -> None:
+    puma = cell("puma560")
+    loads, still = JointLoads(puma), np.zeros(6)
+    loads.hold(puma.home)
+    at_home = loads.table.copy()
+    expected = Dynamics(puma).terms(puma.home, still)
+    assert np.array_equal(at_home[1], expected.bias)
+    assert np.array_equal(at_home[0], np.diagonal(expected.inertia))
+    loads.hold(puma.home + 0.005)
+    assert np.array_equal(loads.table, at_home)
+    loads.hold(puma.home + 0.02)
+    assert not np.array_equal(loads.table, at_home)
+
+
+def test_an_arm_that_holds_a_part_carries_it() -> None:
+    puma = cell("puma560")
+    empty, loaded = JointLoads(puma), JointLoads(puma)
+    message = reference(due=20, inertia=1.0, load=0.0)
+    message.payload_mass = 2.0
+    loaded.take(message, tick=0)
+    for loads in (empty, loaded):
+        loads.hold(puma.home)
+    assert np.abs(loaded.table[1] - empty.table[1]).max() > 1.0
+
+
+@pytest.mark.parametrize(("inertia", "load"), [(0.0, 1.0), (math.nan, 1.0), (math.inf, 1.0), (1.0, math.nan)])
+def test_a_reference_on_which_no_torque_can_rest_is_not_taken(inertia: float, load: float) -> None:
+    assert JointLoads.are_good(reference(20, 1.0, 1.0))
+    assert not JointLoads.are_good(reference(20, inertia, load))
+
+
+def test_torques_of_all_boards_are_added_up() -> None:
+    torques, fast, slow = joint_torques(), torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0)
+    slow.grip_force, slow.payload_mass, slow.payload_offset, slow.operator = 12.0, 0.3, (0.0, 0.1, 0.2), 4
+    assert torques.missing(readings(fast, slow), TICK, since=0) == ""
+    torques.add_up()
+    assert torques.torque.tolist() == [7.0, 0.0, 0.0, 0.0, 0.0, -3.0]
+    assert torques.wanted.position.tolist() == [0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
+    assert (torques.moves, torques.rests_on, torques.grip_force) == (True, 4, 12.0)
+    assert (torques.payload.mass, torques.payload.offset.tolist()) == (0.3, [0.0, 0.1, 0.2])
+
+
+MISSING: dict[str, tuple[Callable[[dict[str, Reading]], object], int, str]] = {
+    "lost": (
+        lambda read: read.update(slow=read["slow"]._replace(is_lost=True)),
+        0,
+        "board 'slow' is lost: braked until it is back",
+    ),
+    "never sent": (
+        lambda read: read.update(fast=read["fast"]._replace(verdict=Verdict.NONE)),
+        0,
+        "no torque from board 'fast' yet",
+    ),
+    "sent before the arm's first status": (
+        lambda read: setattr(read["fast"].value, "sampled", -1),
+        0,
+        "no torque from board 'fast' yet",
+    ),
+    "stale, by its own cycle": (
+        lambda read: setattr(read["slow"].value, "sampled", TICK - 8),
+        0,
+        "torque of board 'slow' is stale: it rests on a status more than 7 ticks old",
+    ),
+    "from before the brakes engaged": (lambda read: None, TICK - 2, "braked until the boards above have seen it"),
+}
+
+
+@pytest.mark.parametrize("case", MISSING)
+def test_a_torque_that_must_not_move_the_arm_is_named(case: str) -> None:
+    spoil, since, reason = MISSING[case]
+    read = readings(torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0))
+    spoil(read)
+    assert joint_torques().missing(read, TICK, since) == reason
+
+
+def test_the_board_of_the_gripper_closes_it_and_keeps_it_closed_after_a_restart() -> None:
+    rig = JointRig()
+    rig.run(100)
+    rig.swing.opening = 0.0
+    rig.run(400)
+    closed = rig.status.opening
+    assert closed < 0.001
+    rig.rack.lose("servo", ticks=20)
+    rig.run(200)
+    assert abs(rig.status.opening - closed) < 1e-4
