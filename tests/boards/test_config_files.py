@@ -215,9 +215,9 @@ def test_every_impossible_override_is_reported(small: Path) -> None:
 
 
 def test_a_fault_script_by_name_is_the_racks_own_before_a_bundled_one(write: Write) -> None:
-    rack = write("mine", 'name = "mine"')
+    rack = write("mine.toml", 'name = "mine"')
     bundled = assembled(rack, faults="overload")["fault"]
-    write("overload", "[[fault]]\nkind = 'kill'\nboard = 'lower'\ntick = 5")
+    write("overload.toml", "[[fault]]\nkind = 'kill'\nboard = 'lower'\ntick = 5")
     own = assembled(rack, faults="overload")["fault"]
     assert (len(own), own[0]["board"]) == (1, "lower")
     assert bundled != own

@@ -61,5 +61,5 @@ Settings = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")
 ]
 Faults = Annotated[
-    str | None, typer.Option(metavar="FILE", help="fault script, by name (one of the rack comes first) or path; added to the config's own faults")
+    str | None, typer.Option(metavar="FILE", help="fault script, by name or path; added to the config's own faults")
 ]

@@ -139,7 +139,7 @@ def test_no_message_of_a_burst_is_lost_to_a_slower_reader(link: MakeQueue) -> No
     assert rack.refused == rack.alarms("writer") == rack.alarms("reader") == []
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     capacity=st.integers(1, 6),
     rates=st.tuples(st.integers(1, 6), st.integers(1, 6)),
