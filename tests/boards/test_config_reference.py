@@ -102,6 +102,7 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
         ("[board.servo.budget]", ["board.budget"]),
         ("board.servo", ["board"]),
         ("board.servo.params", ["board.servo.params"]),
+        ("board.servo.params.modifications", ["board.servo.params.modifications"]),
         ("board.<name>", ["board"]),
         ("task", ["task.action.goto", "task.action.home", "task.action.transfer"]),
     ],
