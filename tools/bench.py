@@ -311,6 +311,47 @@ def launch(
     _show(found, plot, as_json)
 
 
+@bench.command()
+def systems(
+    configs: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[CONFIG]...", help="configs by name, or paths", autocompletion=config_names),
+    ] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e6, help="simulated time of one run")] = 10.0,
+    share: Share = False,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Compare racks with each other: what their configs promise, and what one short run each shows.
+
+    Without CONFIG these are nasrem and the bundled racks that model other systems. Of each config: the levels of its
+    longest chain, boards, processes, rates, the longest cycle R_max, the response R_s by eqs 3.2 and 3.3 and on the
+    clock's grid, the loads of its cores, and whether it fits.
+
+    Of a run in lockstep: how many times faster than real time. Of a run in real time: the cycles of the fastest boards
+    missed, next to those of `cyclictest` at that rate on those cores; the response down and up, measured by what each
+    message rests on; the age of commands when the lowest level reads them, and of its statuses when they are read; and
+    the response to an operator's hold of the highest level that takes one and responds within the run, from giving it
+    to the end of the cycle that acts on it.
+
+    Exit status: 0 all racks ran; 1 a run failed; 2 a bad config.
+
+    \b
+    Examples:
+      rack bench systems
+      rack bench systems nasrem fig2 --seconds 5 --plot pictures
+    """
+    from rack.tools.benches.observed import Runs
+    from rack.tools.benches.systems import measure
+    from rack.tools.benches.systems import systems as bundled
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(configs or bundled(), Runs(seconds, 1, share), progress)
+    _show(found, plot, as_json)
+    raise typer.Exit(0 if found.worked else 1)
+
+
 def _show(found: BenchResult, plot: Path | None, as_json: bool) -> None:
     """Print what a bench has found and, if asked for, plot it."""
     from rack.tools.console.tables import terminal_width

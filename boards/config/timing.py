@@ -51,6 +51,7 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
         is_critical=is_critical(config, layout, name),
         budget=budget,
         plan_within_ns=None if within_ms is None else round(within_ms * NS_PER_MS),
+        queues=tuple(box.name for box in layout.mailboxes if box.capacity and name in box.readers),
         phase=board.phase,
         reads=_reads(layout, name),
     )

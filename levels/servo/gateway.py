@@ -9,7 +9,7 @@ from pydantic import Field
 
 from rack.backplane.message import Message, State
 from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_STATUS
-from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
+from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
 from rack.levels.tables import NotNegative, Table, read_params
 
 LEAD_CYCLES = 2
@@ -35,7 +35,7 @@ class JointGateway(Executor):
         "command": Input(JOINT_REFERENCE, "above.command"),
         "statuses": Input(JOINT_STATUS, "below.status", many=True),
     }
-    outputs = {"command": JOINT_REFERENCE, "status": JOINT_STATUS}
+    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_STATUS, rests_on="statuses")}
     params = GatewayParams
 
     def __init__(self, context: LevelContext) -> None:

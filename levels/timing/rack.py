@@ -25,8 +25,9 @@ class BoardTiming:
     `above` and `below` name each other: a board is above all that it lists below, and all that list it above.
 
     `is_critical` is true if the plan update is the paper's critical section: it keeps the executor waiting. `budget` is
-    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock. `reads` holds
-    the ticks at which it reads the messages of another board, by that board, if not in every cycle.
+    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock. `queues` are the
+    mailboxes in which messages wait for it. `reads` holds the ticks at which it reads the messages of another board, by
+    that board, if not in every cycle.
     """
 
     name: str
@@ -43,6 +44,7 @@ class BoardTiming:
     is_critical: bool
     budget: Budget | None
     plan_within_ns: int | None = None
+    queues: tuple[str, ...] = ()
     phase: int = 0
     reads: Mapping[str, TickGrid] = field(default_factory=dict)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rack.backplane.message import Message, State
 from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_STATUS
-from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output, Ports
 from rack.levels.messages import WORLD_MODEL
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.planning.ik import InverseKinematics
@@ -43,7 +43,7 @@ class TrajectoryExecutor(Executor):
         "last_state": Input(MOTION_STATE, "own.state"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"command": JOINT_REFERENCE, "status": MOTION_STATUS, "state": MOTION_STATE}
+    outputs = {"command": JOINT_REFERENCE, "status": Output(MOTION_STATUS, rests_on="boards"), "state": MOTION_STATE}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = TrajectoryParams
 

@@ -102,6 +102,12 @@ def test_chains_of_equal_cycles_are_one_only_if_they_are_every_combination() -> 
     assert [sorted(boards) for boards in crossed.connected] == [["a", "b", "c", "d"]]
 
 
+def test_a_response_through_a_queue_is_said_to_be_that_of_an_empty_one() -> None:
+    notes = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
+    assert notes[0] == "the system's response is that of empty queues: plan.requests"
+    assert not any("queue" in note for note in Forecast.of(arm_of(*JOINTS)).notes)
+
+
 def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
     found = rack(*boards, goal_ns=60 * 2.0 * MS).longest_cycles
