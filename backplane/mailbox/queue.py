@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from struct import Struct
 
-from rack.backplane.layout import MailboxSpec
+from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import Slots, pid_of
 from rack.backplane.message import Field, Message, MessageType
@@ -56,6 +56,12 @@ def taken_name(queue: str) -> str:
 def is_position(spec: MailboxSpec) -> bool:
     """Say whether a mailbox holds the position of a queue's reader: the board itself writes it."""
     return spec.message == TAKEN.name
+
+
+def queues_of(layout: Layout) -> list[MailboxSpec]:
+    """Return the queues between tasks; the rings of host boards are not by ticks, so they have no position."""
+    names = {box.name for box in layout.mailboxes}
+    return [box for box in layout.mailboxes if box.protocol == "queue" and taken_name(box.name) in names]
 
 
 class QueueWriter(Writer):

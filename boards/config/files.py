@@ -23,9 +23,10 @@ def assembled(name_or_path: str | Path, overrides: Sequence[str] = (), faults: s
 
     Paths in an override are relative to the current folder. Raises `ConfigError`.
     """
-    tables = read(name_or_path)
+    path = _path(name_or_path, "config", CONFIGS)
+    tables = _read(path, (), {})
     if faults is not None:
-        tables = with_faults(tables, faults)
+        tables = with_faults(tables, faults, path.parent)
     return anchor(override(tables, overrides), Path.cwd())
 
 
@@ -45,12 +46,13 @@ def read(name_or_path: str | Path) -> Tables:
     return _read(_path(name_or_path, "config", CONFIGS), (), {})
 
 
-def with_faults(tables: Tables, name_or_path: str | Path) -> Tables:
+def with_faults(tables: Tables, name_or_path: str | Path, own: Path | None = None) -> Tables:
     """Return config tables with the faults of a script appended.
 
-    A script contains `[[fault]]` tables and nothing else. A name means a bundled script. Raises `ConfigError`.
+    A script contains `[[fault]]` tables and nothing else. A name means a script in the folder of the rack, `own`, if it
+    has one of its own, else a bundled script. Raises `ConfigError`.
     """
-    path = _path(name_or_path, "--faults", FAULTS)
+    path = _path(name_or_path, "--faults", *([] if own is None or own == CONFIGS else [own]), FAULTS)
     script = _tables(path)
     wrong = [
         Mistake(f"{path.name}: {key}", None, "a fault script contains [[fault]] tables and nothing else")
@@ -109,12 +111,14 @@ def portable(model: Path) -> str:
     return model.relative_to(CONFIGS).as_posix() if model.is_relative_to(CONFIGS) else str(model)
 
 
-def _path(name_or_path: str | Path, place: str, folder: Path) -> Path:
+def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
-    found = file_at(Path(text)) if is_path else _named(text, folder)
+    files = [file_at(Path(text))] if is_path else [_named(text, folder) for folder in folders]
+    found = next((file for file in files if file is not None), None)
     if found is None:
-        raise ConfigError([Mistake(place, text, f"no such file; by name: {', '.join(names(folder))}; or a path")])
+        by_name = ", ".join(names(folders[-1]))
+        raise ConfigError([Mistake(place, text, f"no such file; by name: {by_name}; or a path")])
     return found
 
 

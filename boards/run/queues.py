@@ -40,5 +40,5 @@ class QueuePort:
         in_time = onward(tick, now, basis)
         if writer.refused != self._refused:
             refused, self._refused = writer.refused - self._refused, writer.refused
-            self._episodes.find(Alarm.QUEUE_FULL, writer.refused, tick, refused)
+            self._episodes.find(Alarm.QUEUE_FULL, writer.serial + writer.refused, tick, refused)
         return in_time

@@ -7,20 +7,23 @@ Pre-emptive Scheduling*, Software Engineering Journal 8 (1993):
     R = w + J,  w = B + C + sum over all tasks above of ceil((w + J_j) / T_j) C_j.
 
 This is the response of a job released together with all tasks above it. A rack without phases releases all tasks
-together at tick 0, so the bound is attained; boards with phases may respond sooner, never later. Times are integers in
-one unit; a rack uses ns.
+together at tick 0, so the bound is attained. Phases may keep tasks apart for ever, as in a static cyclic schedule: then
+response times are those of the schedule itself, which repeats. Times are integers in one unit; a rack uses ns.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from functools import partial
+from itertools import pairwise
 from math import lcm
 from typing import Any
 
-from rack.levels.timing.tasks import TimedTask
+from rack.levels.timing.schedule import simulate
+from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 Load = tuple[int, int, int]
 """Demand of a task on its core: cost C of a job, period T, release jitter J."""
@@ -29,6 +32,8 @@ TURN_NS = 4_000_000
 """Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own slice is 3 ms)."""
 HORIZON_DEADLINES = 10
 """The search for a response time ends after this many deadlines: near full load it converges too slowly."""
+MAX_JOBS = 20_000
+"""Limit on the jobs of a schedule that is computed for its response times; beyond it the bound must do."""
 MAX_STEPS = 10_000
 """Limit on the steps of one search: a 10 us tick against a plan of hours takes too many before any deadline."""
 
@@ -106,7 +111,8 @@ def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> di
     A job takes two context switches, into it and out of it (eq. 3.9); its response includes both. None: no bound, or
     none within `HORIZON_DEADLINES` deadlines. Tasks of equal priority delay each other by whole jobs; tasks under
     ordinary scheduling (priority 0) take turns. The bound is exact for tasks of different priorities without blocking;
-    it does not credit a job for its own parts that cannot be preempted.
+    it does not credit a job for its own parts that cannot be preempted. On a core with phases the schedule itself is
+    exact, if it repeats.
     """
     busy = [task for task in tasks if task.cost_ns]
     found = {}
@@ -122,7 +128,36 @@ def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> di
             sharing=[_load(other, context_switch_ns) for other in shares],
             horizon=HORIZON_DEADLINES * task.period_ns,
         )
+    for core in {task.core for task in busy if task.phase_ns}:
+        found |= _scheduled([task for task in busy if task.core == core], context_switch_ns)
     return found
+
+
+def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, int]:
+    """Return the response times of the tasks of one core, from their schedule; empty where it decides nothing.
+
+    In the worst case every job takes its whole budget: under fixed priorities shorter jobs delay no other. A planner
+    may plan at any release, so its jobs have no fixed place. Tasks of equal priority must never wait at the same time,
+    since their order is not fixed either.
+    """
+    period, first = lcm(*(task.period_ns for task in tasks)), max(task.phase_ns for task in tasks)
+    until = first + 2 * period
+    is_open = any(task.role == "planner" or task.jitter_ns for task in tasks)
+    if is_open or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
+        return {}
+    whole = [replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),)) for task in tasks]
+    chart = simulate(whole, until + max(task.period_ns for task in tasks))
+    priorities = {task.name: task.priority for task in tasks}
+    spent, found = defaultdict[int, list[tuple[int, int]]](list), dict.fromkeys(priorities, 0)
+    for job in chart.jobs:
+        if job.release_ns >= until:
+            continue
+        if job.end_ns is None or job.end_ns > job.deadline_ns:
+            return {}
+        found[job.task] = max(found[job.task], job.end_ns - job.release_ns)
+        spent[priorities[job.task]].append((job.release_ns, job.end_ns))
+    shared = any(later[0] < earlier[1] for jobs in spent.values() for earlier, later in pairwise(sorted(jobs)))
+    return {} if shared else found
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@
     cancel()                      drop everything; the arm ramps to rest
     done(), wait()                whether all is done; wait until it is
 
-A call returns as soon as the request is on its way: requests are a queue, and blended. It waits only while that is full.
+A call returns as soon as the request is on its way: requests are queued, and blended. It waits only while the queue is
+full.
 """
 
 from __future__ import annotations

@@ -214,6 +214,15 @@ def test_every_impossible_override_is_reported(small: Path) -> None:
     ]
 
 
+def test_a_fault_script_by_name_is_the_racks_own_before_a_bundled_one(write: Write) -> None:
+    rack = write("mine.toml", 'name = "mine"')
+    bundled = assembled(rack, faults="overload")["fault"]
+    write("overload.toml", "[[fault]]\nkind = 'kill'\nboard = 'lower'\ntick = 5")
+    own = assembled(rack, faults="overload")["fault"]
+    assert (len(own), own[0]["board"]) == (1, "lower")
+    assert bundled != own
+
+
 def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
     named = {"executor": "mine:Arm", "planner": "mine:Planner"}
     boards = {"one": named, "two": {"executor": "mine:Arm"}, "odd": 3, "wrong": {"executor": 7}}

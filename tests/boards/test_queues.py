@@ -70,7 +70,7 @@ def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> 
     faults = tuple(FaultConfig(kind="kill", board=board, tick=tick) for board, tick in (("upper", 97), ("lower", 501)))
     found = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES).model_copy(update={"fault": faults})
     digests = set()
-    for _ in range(3):
+    for _ in range(2):
         with Rack(found) as rack:
             digests.add(rack.run(4.0).digest)
             assert counts(rack, "upper")["refused"] > 0
@@ -84,10 +84,10 @@ def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
     runs = []
     for mode in ("lockstep", "realtime"):
         with Rack(config(f"clock.mode={mode}", "board.lower.params.most=4", depth, text=QUEUES)) as rack:
-            rack.run(1.5)
+            rack.run(1.0)
             runs.append(Written.on(rack.segment))
     exact, real = runs
-    same = real.first_miss(600)
+    same = real.first_miss(400)
     assert same > 0
     assert real.until(same) == exact.until(same)
 
@@ -111,20 +111,20 @@ REALTIME = ("clock.mode=realtime", "supervision.restarts=100", *FAST)
 def test_a_killed_reader_repeats_nothing_and_loses_at_most_the_cycle_it_died_in(config: MakeConfig) -> None:
     with Rack(config(*REALTIME, "board.lower.params.most=8", text=QUEUES)) as rack:
         rack.start(60.0)
-        kill_often(rack, "lower", 3, random.Random(1))
+        kill_often(rack, "lower", 2, random.Random(1))
         found = settle(rack, "lower")
         rows, lost = MailboxRing(rack.segment, "upper.requests").drain()
         assert not lost
         # A cycle that the writer misses on a busy machine sends nothing.
         sent = int(np.count_nonzero(rows["message"]["id"] <= found["newest"]))
-        assert 0 <= sent - found["taken"] <= 3 * 8
+        assert 0 <= sent - found["taken"] <= 2 * 8
         assert found["repeated"] == counts(rack, "upper")["refused"] == 0
 
 
 def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfig) -> None:
     with Rack(config(*REALTIME, text=QUEUES)) as rack:
         rack.start(60.0)
-        kill_often(rack, "upper", 3, random.Random(2))
+        kill_often(rack, "upper", 2, random.Random(2))
         found = settle(rack, "lower")
         rows, lost = MailboxRing(rack.segment, "upper.requests").drain()
     assert not lost
@@ -134,7 +134,7 @@ def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfi
     assert [ticks.count(tick) for tick in set(ticks)] == [3] * len(set(ticks))
     assert found["repeated"] == 0
     assert found["missing"] % 3 == 0
-    assert len(set(rows["epoch"].tolist())) == 4
+    assert len(set(rows["epoch"].tolist())) == 3
 
 
 def settle(rack: Rack, board: str) -> dict[str, int]:

@@ -52,7 +52,7 @@ class Post:
 
     def write(self, tick: int, cycle: int) -> None:
         """Write the message in the cycle of `cycle` ticks released at `tick`, if this is one that writes it."""
-        if not (tick + cycle) % self.spec.every:
+        if not (tick + cycle - self.spec.phase) % self.spec.every:
             self.serial += 1
             self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
@@ -148,8 +148,11 @@ class BareTask:
 def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:
     """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it.
 
-    Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes there is none.
+    Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes there is none; and
+    for one with an exchange, which belongs to the board.
     """
+    if exchanged := [spec.name for spec in layout.mailboxes if spec.exchanges]:
+        raise Failure(f"{', '.join(exchanged)}: read at a rate of its own; only racks without any run without boards")
     if queues := [spec.name for spec in layout.mailboxes if spec.capacity]:
         raise Failure(f"{', '.join(queues)}: a queue; only racks without any run without mailboxes")
     posts = {spec.name: Post(spec) for spec in layout.mailboxes}
@@ -157,7 +160,7 @@ def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareR
     try:
         for task in tasks:
             task.level.self_test()
-        cycles = [(task.spec.every, task.cycle) for task in tasks]
+        cycles = [(*task.spec.grid, task.cycle) for task in tasks]
         with _undisturbed():
             start_ns = time.process_time_ns()
             _run(cycles, ticks)
@@ -174,10 +177,10 @@ def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareR
     )
 
 
-def _run(cycles: Sequence[tuple[int, Callable[[int], None]]], ticks: int) -> None:
+def _run(cycles: Sequence[tuple[int, int, Callable[[int], None]]], ticks: int) -> None:
     for tick in range(ticks):
-        for every, cycle in cycles:
-            if not tick % every:
+        for every, phase, cycle in cycles:
+            if tick % every == phase:
                 cycle(tick)
 
 

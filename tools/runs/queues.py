@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.mailbox.queue import taken_name
+from rack.backplane.mailbox.queue import queues_of, taken_name
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
@@ -36,10 +36,8 @@ class Queues:
     """Looks at the queues of a rack, from the host side."""
 
     def __init__(self, segment: Segment) -> None:
-        # Those of host boards are queues whose readers write no position.
-        tasks = {task.name for task in segment.layout.tasks}
-        boxes = [box for box in segment.layout.mailboxes if box.protocol == "queue" and box.writer in tasks]
-        self._ends = [(open_observer(segment, b.name), open_observer(segment, taken_name(b.name))) for b in boxes]
+        names = [box.name for box in queues_of(segment.layout)]
+        self._ends = [(open_observer(segment, name), open_observer(segment, taken_name(name))) for name in names]
 
     def look(self) -> tuple[QueueFill, ...]:
         """Return every queue as it is now."""
@@ -59,20 +57,17 @@ def queues(recording: Recording) -> list[dict[str, Any]]:
     """
     refused = recording.ended.get("refused", {})
     found = []
-    for box in recording.layout.mailboxes:
-        if box.protocol == "queue":
-            position = taken_name(box.name)
-            taken, unread = (recording.signal(position, field) for field in ("taken", "unread"))
-            before = np.concatenate(([0], taken[:-1]))
-            sent = recording.signal(box.name, "serial")
-            found.append(
-                {
-                    "mailbox": box.name,
-                    "capacity": box.capacity,
-                    "sent": int(sent[-1]) if len(sent) else 0,
-                    "taken": int(taken[-1]) if len(taken) else 0,
-                    "waiting": int((taken + unread - before).max()) if len(taken) else 0,
-                    "refused": refused.get(box.name),
-                }
-            )
+    for box in queues_of(recording.layout):
+        taken, unread = (recording.signal(taken_name(box.name), field) for field in ("taken", "unread"))
+        before, sent = np.concatenate(([0], taken[:-1])), recording.signal(box.name, "serial")
+        found.append(
+            {
+                "mailbox": box.name,
+                "capacity": box.capacity,
+                "sent": int(sent[-1]) if len(sent) else 0,
+                "taken": int(taken[-1]) if len(taken) else 0,
+                "waiting": int((taken + unread - before).max()) if len(taken) else 0,
+                "refused": refused.get(box.name),
+            }
+        )
     return found

@@ -139,7 +139,7 @@ def test_no_message_of_a_burst_is_lost_to_a_slower_reader(link: MakeQueue) -> No
     assert rack.refused == rack.alarms("writer") == rack.alarms("reader") == []
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     capacity=st.integers(1, 6),
     rates=st.tuples(st.integers(1, 6), st.integers(1, 6)),
@@ -181,6 +181,10 @@ def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
     rack.room = 9
     rack.run(30, 34, lambda tick: 0)
     assert rack.taken == [1, 2]
+    rack.run(34, 80, lambda tick: tick % 2)
+    rack.room = 0
+    rack.run(80, 90, lambda tick: 1)
+    assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
 
 
 def test_room_comes_back_one_cycle_of_the_reader_after_it_has_taken(link: MakeQueue) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
@@ -231,3 +232,57 @@ def levels_drawn(draw: random.Random) -> list[TimedTask]:
         own, ceiling = priority - 49, 0 if parts[1].preemptible else priority
         tasks.append(TimedTask(f"{name}.planner", name, "planner", core, own, every, parts, within, ceiling))
     return tasks
+
+
+def stepped(tasks: list[TimedTask], until: int) -> dict[str, int] | None:
+    """Return the longest response of each task, by giving the processor away unit by unit; None if one is late."""
+    left: dict[str, tuple[int, int]] = {}
+    worst = dict.fromkeys((task.name for task in tasks), 0)
+    for now in range(until):
+        for task in tasks:
+            if now >= task.phase_ns and (now - task.phase_ns) % task.every_ns == 0:
+                if task.name in left:
+                    return None
+                left[task.name] = now, task.cost_ns
+        for task in sorted(tasks, key=lambda task: -task.priority):
+            if task.name in left:
+                release, cost = left.pop(task.name)
+                if cost > 1:
+                    left[task.name] = release, cost - 1
+                else:
+                    worst[task.name] = max(worst[task.name], now + 1 - release)
+                break
+    return worst
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_phases_responses_are_those_of_the_schedule_and_never_longer_than_without(seed: int) -> None:
+    draw, exact = random.Random(seed), 0
+    for _ in range(SETS):
+        plain = drawn(draw)
+        together = [timed(f"t{at}", 0, 9 - at, t.period, computing(t.cost)) for at, t in enumerate(plain)]
+        tasks = [replace(task, phase_ns=draw.randrange(task.every_ns)) for task in together]
+        found, bound = response_times(tasks), response_times(together)
+        expected = stepped(tasks, 360)
+        assert all(found[name] <= limit for name, limit in bound.items() if limit is not None)
+        if expected is not None and any(task.phase_ns for task in tasks):
+            assert found == expected
+            exact += found != bound
+    assert exact > SETS // 4
+
+
+def test_tasks_of_one_priority_that_may_wait_together_keep_their_bound() -> None:
+    def pair(phase: int) -> list[TimedTask]:
+        first = timed("a", 0, 0, 10, computing(4))
+        return [first, replace(first, name="b", board="b", phase_ns=phase)]
+
+    assert response_times(pair(5)) == {"a": 4, "b": 4}
+    assert response_times(pair(3)) == response_times(pair(0))
+
+
+def test_a_planner_has_no_fixed_place_in_a_schedule() -> None:
+    executor = replace(timed("a", 0, 2, 10, computing(4)), phase_ns=5)
+    planner = replace(executor, name="a.planner", role="planner", priority=1, within_cycles=2)
+    other = timed("b", 0, 3, 20, computing(4))
+    tasks = [executor, planner, other]
+    assert response_times(tasks) == response_times([replace(task, phase_ns=0) for task in tasks])
