@@ -82,8 +82,8 @@ class SystemFigures(MissesBeyond):
     """One rack: what its config promises, and what its runs have shown; times in ms of simulated time.
 
     `missed` is the share of the cycles of its fastest boards. `command_ms` and `status_ms` are the response measured
-    down and up the hierarchy, down from `commanded`, below a queue if there is one. Ages are those of commands when the lowest level reads them, and of its statuses when
-    they are read above. None: the rack has no such thing.
+    down the hierarchy from `commanded`, which is below a queue if there is one, and up. Ages are those of commands when
+    the lowest level reads them, and of its statuses when they are read above. None: the rack has no such thing.
     """
 
     rack: str
