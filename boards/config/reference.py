@@ -133,8 +133,9 @@ def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Pl
         yield known[ref.rpartition("/")[2]], at._replace(variant=variant)
     if isinstance(entry.get("items"), dict):
         yield from _inner(entry["items"], known, at._replace(is_list=True))
-    if isinstance(entry.get("additionalProperties"), dict):
-        yield from _inner(entry["additionalProperties"], known, at._replace(path=f"{at.path}.<name>"))
+    for held in (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values()):
+        if isinstance(held, dict):
+            yield from _inner(held, known, at._replace(path=f"{at.path}.<name>"))
 
 
 def _key(name: str, entry: Schema, is_required: bool) -> Key:
