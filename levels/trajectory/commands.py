@@ -64,6 +64,8 @@ class Motions:
         **times: float,
     ) -> int:
         """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live` goal follows."""
+        if body and body not in self._bodies:
+            raise LevelError(f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}")
         row = self._bodies.index(body) if body else WORLD
         pose = {"position": position, "quaternion": quaternion}
         return self._request(kind=MotionKind.POSE, body=row, live=live, **pose, **times)
