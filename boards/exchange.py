@@ -18,6 +18,7 @@ EXCHANGE = "exchange"
 """Port, and message type, of the exchange."""
 AGE, TAKEN = "age", "taken"
 """Ends of the names of its fields."""
+_NEW = Verdict.NEW  # for the hot path
 NEVER = -1
 """Tick at which a message was taken before there is one."""
 
@@ -77,7 +78,7 @@ class ExchangeRecord:
         """Note the messages in use, after the reads of the cycle released at `tick`."""
         values, at = self._values, 0
         for readings, key, reader in self._inputs:
-            if readings[key].verdict is Verdict.NEW:
+            if readings[key].verdict is _NEW:
                 values[at + 1] = tick
             values[at] = tick - reader.newest if reader.serial else 0
             at += 2

@@ -102,7 +102,7 @@ class BusAdapter(Executor):
             for port, message in self._before.items():
                 getattr(write, port).raw[:] = message
             self._before.clear()
-        cycle = tick // self.context.every
+        cycle = (tick - self.context.phase) // self.context.every
         for table, entry in self._entries:
             if table.is_due(cycle):
                 entry.exchange(read, write, tick)

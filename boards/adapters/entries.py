@@ -41,7 +41,7 @@ ENTRY = MessageType(
 
 
 class EntryConfig(Table):
-    """One mailbox that a bridge passes across."""
+    """`[board.<name>.params.pass.<port>]`: one mailbox that a bus adapter passes across."""
 
     source: str = Key(alias="from", description="mailbox to pass, as in program.requests; its side is the direction")
     every: int = Key(1, ge=1, le=LAST_TICK, description="exchange in every n-th cycle of the bridge, cycles")
@@ -63,7 +63,7 @@ class EntryConfig(Table):
 
 
 class AdapterParams(Table):
-    """`[board.<bridge>.params]`."""
+    """`[board.<name>.params]` of a bus adapter."""
 
     entries: dict[str, EntryConfig] = Key({}, alias="pass", description="mailboxes to pass, by port of the bridge")
 

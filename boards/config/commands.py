@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,20 @@ def commandable(config: RackConfig) -> dict[str, Commands]:
         if any(port.source == OWN_OPERATOR for port in executor.inputs.values()):
             found[name] = executor.commands
     return found
+
+
+def takes(config: RackConfig, board: str, commands: Commands) -> str:
+    """Return the commands that a level takes as text, with the names that it knows: "hold, resume, table saw|slow"."""
+    table = config.board[board]
+    executor = find_class(table.executor, Executor)
+    words = []
+    for what, goals in commands.items():
+        names = ""
+        # A table may be in the middle of being edited.
+        with suppress(LevelError):
+            names = "|".join(executor.wording(what, table.params, config.scene)) if what in NAMED else ""
+        words.append(" ".join(word for word in (what.name.lower(), names, goal_names(goals)) if word))
+    return ", ".join(words)
 
 
 def setting_name(config: RackConfig, board: str, number: int) -> str:

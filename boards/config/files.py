@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,17 +93,20 @@ def anchor(tables: Tables, folder: Path) -> Tables:
         anchored["python_path"] = [str((folder / item).resolve()) for item in own]
     boards = tables.get("board")
     if isinstance(boards, dict):
-        anchored["board"] = {name: _with_tables(board, folder) for name, board in boards.items()}
+        anchored["board"] = {
+            name: with_table_files(board, lambda file: str(_find(file, folder) or folder / file))
+            for name, board in boards.items()
+        }
     return anchored
 
 
-def _with_tables(board: Any, folder: Path) -> Any:
-    """Return a board with absolute paths of its level's state tables."""
+def with_table_files(board: Any, path: Callable[[str], str]) -> Any:
+    """Return a board's table with `path` applied to the files of its level's state tables, if it has any."""
     params = board.get("params") if isinstance(board, dict) else None
     if not isinstance(params, dict) or not isinstance(files := params.get("tables"), dict):
         return board
-    paths = {name: str(_find(file, folder) or folder / file) for name, file in files.items() if isinstance(file, str)}
-    return {**board, "params": {**params, "tables": {**files, **paths}}}
+    found = {name: path(file) if isinstance(file, str) else file for name, file in files.items()}
+    return {**board, "params": {**params, "tables": found}}
 
 
 def portable(model: Path) -> str:

@@ -1,19 +1,19 @@
 """Every key of a config with type, unit, range, default and meaning, from the models that validate it.
 
-`[task]` and `[board.<name>.params]` are declared by the levels' classes, so those tables depend on the config.
+`[task]` and the tables `params` of boards are declared by the levels' classes, so those tables depend on the config.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
 from rack.boards.config.files import EXTENDS
-from rack.boards.config.ports import all_ports
+from rack.boards.config.ports import all_ports, table_of
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake, shown
 from rack.boards.faults.kind import KINDS
@@ -76,8 +76,8 @@ def key_tables(config: RackConfig) -> list[KeyTable]:
     found = [replace(whole, keys=(extends, *whole.keys)), *found, *_fault_kinds()]
     for program in dict.fromkeys(p.kind.program for p in ports if p.kind.program is not None):
         found += _tables(program, "task", Place("task"))
-    for board, params in dict.fromkeys((p.place.board, p.kind.params) for p in ports if p.kind.params is not None):
-        name = f"board.{board}.params"
+    for board, params in dict.fromkeys((table_of(p.place), p.kind.params) for p in ports if p.kind.params is not None):
+        name = f"{board}.params"
         found += _tables(params, name, Place(name))
     return found
 
@@ -88,13 +88,19 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     wanted = name.strip("[]")
     start, _, rest = wanted.partition(".")
     board, _, rest = rest.partition(".")
-    if start == "board" and board in (*config.board, "<name>") and wanted not in known:
-        wanted = f"board.{rest}" if rest else "board"
-    found = [known[wanted]] if wanted in known else [t for n, t in known.items() if n.startswith(f"{wanted}.")]
+    is_own = bool(rest) and bool(_within(wanted, known))
+    if start in ("board", "host") and board in (*getattr(config, start), "<name>") and not is_own:
+        wanted = f"{start}.{rest}" if rest else start
+    found = [known[wanted]] if wanted in known else [known[name] for name in _within(wanted, known)]
     if not found:
         top = dict.fromkeys(name.partition(".")[0] for name in known)
         raise LookupError(f"no such table; tables: {', '.join(top)}, and others listed by 'rack schema'")
     return found
+
+
+def _within(name: str, known: Iterable[str]) -> list[str]:
+    """Return the names of a table and of those in it."""
+    return [other for other in known if f"{other}.".startswith(f"{name}.")]
 
 
 def _tables(model: type[BaseModel], name: str, place: Place) -> Iterator[KeyTable]:
@@ -127,8 +133,9 @@ def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Pl
         yield known[ref.rpartition("/")[2]], at._replace(variant=variant)
     if isinstance(entry.get("items"), dict):
         yield from _inner(entry["items"], known, at._replace(is_list=True))
-    if isinstance(entry.get("additionalProperties"), dict):
-        yield from _inner(entry["additionalProperties"], known, at._replace(path=f"{at.path}.<name>"))
+    for held in (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values()):
+        if isinstance(held, dict):
+            yield from _inner(held, known, at._replace(path=f"{at.path}.<name>"))
 
 
 def _key(name: str, entry: Schema, is_required: bool) -> Key:

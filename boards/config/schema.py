@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, StringConstraints
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Protocol, Role, Sampled, Wake
-from rack.boards.config.files import portable
+from rack.boards.config.files import portable, with_table_files
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.levels.operator import NAME_BYTES, Goal, Operation
@@ -341,4 +341,7 @@ class RackConfig(Table):
         tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:
             tables["robot"]["model"] = portable(self.robot.model)
+        tables["board"] = {
+            name: with_table_files(board, lambda file: portable(Path(file))) for name, board in tables["board"].items()
+        }
         return to_toml(tables)

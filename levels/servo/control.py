@@ -57,7 +57,7 @@ class ArmParams(Table):
         return reference
 
 
-class ServoParams(ArmParams, LoopGains, ModifiableParams):
+class ServoParams(ModifiableParams, ArmParams, LoopGains):
     """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
 
 

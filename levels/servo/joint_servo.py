@@ -32,7 +32,7 @@ from rack.levels.tables import read_params
 ARM_LOST = "no status from the board of the arm: waiting for it"
 
 
-class JointServoParams(LoopGains, ModifiableParams):
+class JointServoParams(ModifiableParams, LoopGains):
     """`[board.<name>.params]`: the joints that a board servoes, and the gains of their loop."""
 
     joints: tuple[str, ...] | None = Field(None, description="joints of `robot.joints` that it servoes; default: all")

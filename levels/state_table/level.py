@@ -290,7 +290,9 @@ class StateTableExecutor(Executor):
         shown.table, shown.checksum, shown.in_state = self.table_name, self.table.checksum, self.state
         shown.row, shown.fired = (row.number, row.name) if row is not None else (0, "")
         shown.words, shown.ordered, shown.done = self._words, serial * is_operators, self._done
-        if self.resting if self.orders.standing is Operation.HOLD else state is State.DONE:
+        if is_operators and serial == self.orders.serial and state is State.ERROR:
+            self.orders.fail(reason)
+        elif self.resting if self.orders.standing is Operation.HOLD else state is State.DONE:
             self.orders.done()
         if "command" in write.__dict__:
             write.command.operator = self._rests_on

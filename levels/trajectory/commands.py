@@ -6,14 +6,15 @@
     cancel()                      drop everything; the arm ramps to rest
     done(), wait()                whether all is done; wait until it is
 
-A call returns as soon as the request is on its way: requests are queued, and blended. It waits only while the queue is
-full.
+A call returns as soon as its request is on its way: requests are queued, and blended. It waits only while the queue is
+full. A request that is lost, with a board that died as it held it, is sent again by the next call that waits.
 """
 
 from __future__ import annotations
 
 import runpy
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,14 +30,25 @@ from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, Motio
 DOWN = (0.0, 1.0, 0.0, 0.0)
 """Orientation of a tool that points straight down, w, x, y, z."""
 LOOK_S = 0.25
+PATIENCE_S = 2.0
+"""Time for which nothing is under way, though requests are open, before they are sent again."""
 WORLD = -1
 
 
 class Motions:
-    """Motion requests as calls. Every call returns the number of its request."""
+    """Motion requests as calls. Every call returns the number of its request.
+
+    What a former process of the board has left in the queue is cancelled first.
+    """
 
     def __init__(self, bus: Bus, robot: RobotConfig, scene: SceneConfig) -> None:
         self._bus, self._robot, self._bodies = bus, robot, scene.bodies
+        # No request of a former process has a greater number than it has sent messages.
+        self._newest = bus.sent("requests")
+        self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
+        self._idle_since: float | None = None  # time since when nothing is under way, though requests are open
+        if self._newest:
+            self.cancel()
 
     def move(self, joints: Sequence[float] | None = None, **times: float) -> int:
         """Go to joint positions, rad, in a straight line in joint space; default: home."""
@@ -52,6 +64,8 @@ class Motions:
         **times: float,
     ) -> int:
         """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live` goal follows."""
+        if body and body not in self._bodies:
+            raise LevelError(f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}")
         row = self._bodies.index(body) if body else WORLD
         pose = {"position": position, "quaternion": quaternion}
         return self._request(kind=MotionKind.POSE, body=row, live=live, **pose, **times)
@@ -85,14 +99,14 @@ class Motions:
 
     def done(self, request: int | None = None) -> bool:
         """Return whether a request, by default the newest, has ended."""
-        return bool(self._bus.read("motion").value.done >= (self._bus.sent("requests") if request is None else request))
+        return bool(self._bus.read("motion").value.done >= (self._newest if request is None else request))
 
     def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
         """Wait until a request, by default the newest, has ended; False if `until` holds before, or the run ends."""
         while not self.done(request):
             if until() or self._bus.is_over:
                 return False
-            self._bus.wait(LOOK_S)
+            self._look()
         return True
 
     def where(self) -> list[float]:
@@ -100,15 +114,33 @@ class Motions:
         return [round(float(x), 4) for x in self._bus.read("motion").value.tool]
 
     def _request(self, **fields: Any) -> int:
-        while not self._bus.send("requests", **{"body": WORLD, **fields}):
+        request = {"body": WORLD, **fields, "id": self._newest + 1}
+        while not self._bus.send("requests", **request):
             if self._bus.is_over:
                 raise LevelError("the run is over")
-            self._bus.wait(LOOK_S)
-        return self._bus.sent("requests")
+            self._look()
+        self._newest += 1
+        self._open[self._newest] = request
+        return self._newest
+
+    def _look(self) -> None:
+        """Wait for news; send the requests again that are lost: nothing is under way, and not all are done."""
+        self._bus.wait(LOOK_S)
+        status, now = self._bus.read("motion").value, time.monotonic()
+        self._open = {number: request for number, request in self._open.items() if number > status.done}
+        if status.current or not self._open:
+            self._idle_since = None
+        elif self._idle_since is None:
+            self._idle_since = now
+        elif now - self._idle_since > PATIENCE_S:
+            self._idle_since = None
+            # One that only waits is there twice then, and done once.
+            for request in self._open.values():
+                self._bus.send("requests", **request)
 
 
 class ScriptParams(Table):
-    """`[host.<name>.params]`."""
+    """`[host.<name>.params]`: the script of a command environment."""
 
     script: str = Field(description="Python script to run, in a folder of python_path")
 

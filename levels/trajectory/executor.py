@@ -73,7 +73,8 @@ class TrajectoryExecutor(Executor):
 
     def room(self, port: str) -> int:
         """Return how many requests to take: the rest waits in the queue."""
-        return self._agenda.room
+        # None before the level has recalled those that it has already.
+        return 0 if self._tick is None else self._agenda.room
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take requests, go on with the motion, write the set point of two cycles later."""

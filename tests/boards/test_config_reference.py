@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ DIMENSIONLESS = {
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
     "for",  # s, or text with its unit
 }
-WHOLE = ("reads", "planner_reads", "mailbox")
+WHOLE = ("reads", "planner_reads", "mailbox", "depth", "tables")
 """Keys whose tables hold names of the user's own."""
 
 
@@ -36,23 +36,29 @@ def used(tables: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, str]]:
     """Yield table and key for everything that plain tables hold."""
     for key, value in tables.items():
         for item in value if isinstance(value, list) else [value]:
-            if isinstance(item, dict) and key not in WHOLE:
+            # A class named in parameters declares its own: what it takes is not in the reference.
+            is_whole = key in WHOLE or (key == "params" and ".params." in at)
+            if isinstance(item, dict) and not is_whole:
                 yield from used(item, f"{at}.{key}".lstrip("."))
             else:
                 yield at, key
 
 
-def general(place: str) -> str:
-    """Return the place of a table as the reference has it: boards are alike, except for their parameters."""
-    parts = place.split(".")
-    return ".".join(["board", "<name>", *parts[2:]]) if parts[0] == "board" and parts[-1] != "params" else place
+def general(place: str, known: Iterable[str]) -> str:
+    """Return the place of a table as the reference has it, with "<name>" for a name of the user's own."""
+
+    def fits(pattern: str) -> bool:
+        parts, own = pattern.split("."), place.split(".")
+        return len(parts) == len(own) and all(part in (name, "<name>") for part, name in zip(parts, own, strict=True))
+
+    return next(filter(fits, known), place)
 
 
 @pytest.mark.parametrize("name", names())
 def test_the_reference_has_every_key_of_every_shipped_config(name: str) -> None:
     known = reference(name)
     tables = read(name)
-    assert {(at, key) for at, key in used(tables) if key not in known.get(general(at), {})} == set()
+    assert {(at, key) for at, key in used(tables) if key not in known.get(general(at, known), {})} == set()
 
 
 def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
@@ -102,6 +108,7 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
         ("[board.servo.budget]", ["board.budget"]),
         ("board.servo", ["board"]),
         ("board.servo.params", ["board.servo.params"]),
+        ("board.servo.params.modifications", ["board.servo.params.modifications"]),
         ("board.<name>", ["board"]),
         ("task", ["task.action.goto", "task.action.home", "task.action.transfer"]),
     ],

@@ -23,6 +23,10 @@ MISTAKES = {
         [f"host.own={{ program = '{IDLE}' }}"],
         "host.own: invalid name for a board; permitted: a-z",
     ),
+    "where determinism is demanded": (
+        ["protocol.strict=true"],
+        "host.program: a board without real time makes a run depend on timing, refused by protocol.strict = true",
+    ),
     "below": (["host.program.below=brigde"], 'host.program.below = "brigde": no board has this name; boards: bridge'),
     "no bridge below": (["host.program.below=[]"], "host.program.below: missing; port 'sum' of the host needs it"),
     "real time reads the host side": (

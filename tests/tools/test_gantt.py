@@ -122,7 +122,7 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nosuch"], "no such file; by name: crossing, fig2"),
+        (["nosuch"], "no such file; by name: "),
         (["runs/nosuch"], "runs/nosuch: no such run's folder, and no such config"),
         (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),

@@ -82,8 +82,8 @@ class SystemFigures(MissesBeyond):
     """One rack: what its config promises, and what its runs have shown; times in ms of simulated time.
 
     `missed` is the share of the cycles of its fastest boards. `command_ms` and `status_ms` are the response measured
-    down and up the hierarchy. Ages are those of commands when the lowest level reads them, and of its statuses when
-    they are read above. None: the rack has no such thing.
+    down the hierarchy from `commanded`, which is below a queue if there is one, and up. Ages are those of commands when
+    the lowest level reads them, and of its statuses when they are read above. None: the rack has no such thing.
     """
 
     rack: str
@@ -92,6 +92,7 @@ class SystemFigures(MissesBeyond):
     missed: float
     late: float | None
     loads: Mapping[int, float]
+    commanded: str
     command_ms: Distribution | None
     status_ms: Distribution | None
     command_age_ms: Distribution | None
@@ -162,6 +163,8 @@ class Systems:
         if self.absent is not None:
             yield f"{self.absent.line}; every miss counts against the rack"
         for one in self.figures:
+            if one.commanded not in ("", *one.predicted.levels[:1]):
+                yield f"{one.rack}: down is measured from {one.commanded}: what waits above it is no response"
             if one.failure:
                 yield f"{one.rack}: {one.failure}"
             elif one.hold is not None and one.hold.beyond:
@@ -175,8 +178,8 @@ class Systems:
             self._draw_responses(axes[0])
             self._draw_ages(axes[1])
             _bars(axes[2], [one.lockstep_speed for one in self.figures], "lockstep, times real time")
-            _bars(axes[3], [100 * one.missed for one in self.figures], "missed, % of the fastest cycles")
             late = [None if one.late is None else 100 * one.late for one in self.figures]
+            _bars(axes[3], [100 * one.missed for one in self.figures], "missed, % of the fastest cycles", late)
             _mark(axes[3], late, Marks("D", PEER, "cyclictest: late by a cycle"))
             axes[0].set_yticks(range(len(self.figures)), [one.rack for one in self.figures])
             axes[0].invert_yaxis()
@@ -221,11 +224,12 @@ def _mark(axes: Axes, values: Sequence[float | None], marks: Marks, lower: float
         axes.plot(*zip(*places, strict=True), marks.shape, color=marks.colour, markersize=5, label=marks.label)
 
 
-def _bars(axes: Axes, values: Sequence[float], label: str) -> None:
+def _bars(axes: Axes, values: Sequence[float], label: str, others: Sequence[float | None] = ()) -> None:
+    """Draw a bar in each row; `others` have their place on the axis, too."""
     axes.barh(range(len(values)), values, 0.6, color=GRID)
     for row, value in enumerate(values):
         axes.annotate(shown(value), (value, row), (3, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.set_xlim(0.0, 1.25 * max(values) or 1.0)
+    axes.set_xlim(0.0, 1.25 * max(filter(None, (*values, *others)), default=0.8))
     axes.set_xlabel(label)
 
 

@@ -46,9 +46,8 @@ AFTER_HOLD_S = 0.1
 
 
 def systems() -> list[str]:
-    """Return the bundled racks to compare: the default rack, and those that have a page of their own."""
-    pages = (page.parent.name for page in CONFIGS.glob("*/README.md"))
-    return ["nasrem", *sorted(name for name in pages if (CONFIGS / name / f"{name}.toml").is_file())]
+    """Return the bundled racks to compare: the default rack, and those that have a folder of their own."""
+    return ["nasrem", *sorted(path.stem for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name)]
 
 
 def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:
@@ -135,6 +134,7 @@ class _System:
             missed=missed_share(counts),
             late=None if ran.late_us is None else overdue(ran.late_us, self._grid().period_ns),
             loads=core_loads(ran.recording, cycles, self._timing) if cycles else {},
+            commanded="" if response is None else next(iter(response["command"]["levels"]), ""),
             command_ms=None if response is None else response["command"]["measured_ms"],
             status_ms=None if response is None else response["status"]["measured_ms"],
             command_age_ms=ages_ms(ran.recording, self._timing, down=True),

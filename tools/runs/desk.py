@@ -18,10 +18,10 @@ from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestSt
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads
-from rack.boards.config.commands import asked, commandable, request
+from rack.boards.config.commands import asked, commandable, request, takes
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
-from rack.levels.operator import Answer, Operation, listed
+from rack.levels.operator import Answer, Operation
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import table
 from rack.tools.runs.holds import resume_command
@@ -95,7 +95,8 @@ class LiveDesk:
         """Return the commands that each level takes, and the one in force, as plain data."""
         known = commandable(self._config)
         return [
-            {"level": name, "in_force": self._in_force(name), "takes": listed(takes)} for name, takes in known.items()
+            {"level": name, "in_force": self._in_force(name), "takes": takes(self._config, name, commands)}
+            for name, commands in known.items()
         ]
 
     def text(self, width: int | None = None) -> Iterator[str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rack.backplane.layout import MailboxSpec
 from rack.boards.config import rack_timing
 from rack.levels.timing.equations import system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import ParallelChains, RackTiming
@@ -65,7 +66,11 @@ def _way(
     passed = min(len(mailboxes) for _, mailboxes in ways)
     start = len(levels) - passed - 1 if passed else len(levels)
     bound_ms = max(rack.response_ticks(boards[start:]) for boards in chains) * layout.clock_ns * 1e-6
-    found = [_along(recording, boards[start:], boxes[-1].name, bound_ms) for boards, boxes in ways if passed]
+    found = [
+        _along(recording, boards[start:], boxes[-passed:], bound_ms)
+        for boards, boxes in ways
+        if passed and {box.name for box in boxes} <= set(recording.mailboxes)
+    ]
     seen = np.concatenate([ms for ms, _, _ in found]) if found else np.zeros(0)
     beyond = list(chain(*(each for _, each, _ in found)))
     return {
@@ -79,22 +84,23 @@ def _way(
 
 
 def _along(
-    recording: Recording, boards: Sequence[str], mailbox: str, bound_ms: float
+    recording: Recording, boards: Sequence[str], boxes: Sequence[MailboxSpec], bound_ms: float
 ) -> tuple[np.ndarray, list[dict[str, Any]], int]:
-    """Return the responses along one chain by its last `mailbox`, ms, those beyond the bound, and the number unseen.
+    """Return the responses along one chain by its mailboxes, ms, those beyond the bound, and the number unseen.
 
     The worst case is information that just misses a release whose message went all the way: it waits for the next one
     that does.
     """
-    layout = recording.layout
+    layout, mailbox = recording.layout, boxes[-1].name
     first, last = (layout.task(boards[at]).every for at in (0, -1))
     tick_ms = layout.clock_ns * 1e-6
     basis, visible_at = recording.signal(mailbox, "basis"), recording.signal(mailbox, "visible_at")
-    # Until the first level's messages arrive, those of the later levels rest on their own ticks.
-    real = np.flatnonzero(basis >= first + max(layout.task(name).phase for name in boards))
+    # A message that nothing had reached when it was written rests on its own tick: before all that counts here.
+    begun = max(int(recording.signal(box.name, "visible_at")[0]) for box in boxes)
+    real = np.flatnonzero(basis >= begun)
     arrived, at = np.unique(basis[real], return_index=True)
     at = real[at]
-    visible, read = visible_at[at[1:]], layout.read_grid(layout.mailbox(mailbox), boards[-1])
+    visible, read = visible_at[at[1:]], layout.read_grid(boxes[-1], boards[-1])
     acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
     seen = np.ones(len(ms), bool)

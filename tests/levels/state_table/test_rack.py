@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.message import State
 from rack.boards import Rack
-from rack.boards.config import CONFIGS, load
+from rack.boards.config import CONFIGS, load, loads
 from rack.boards.config.resolved import resolve
 from rack.boards.errors import ConfigError
 
@@ -69,4 +69,6 @@ def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -
 
 @pytest.mark.parametrize("variant", [FOLDER / "nist-state-table.toml", FOLDER / "direct.toml"])
 def test_its_configs_are_sound(variant: Path) -> None:
-    assert resolve(load(variant)).layout.tasks
+    config = load(variant)
+    assert resolve(config).layout.tasks
+    assert loads(config.text()) == config

@@ -19,7 +19,7 @@ from tests.tools.command_line import rack
 PROMISED = SystemPrediction(("top", "low"), 2, 0, 3, (50.0, 400.0), 20.0, 40.0, 22.5, 22.5, 40.0, {0: 0.5}, True)
 TIMES = {"min": 20.0, "p50": 22.5, "p99": 22.5, "p99_9": 22.5, "max": 22.5}
 HOLD = HoldResponse("top", "acted on", 30.0, 42.5, 31.0)
-FOUND = SystemFigures("one", PROMISED, 8.0, 0.002, 0.0015, {0: 0.4}, TIMES, TIMES, TIMES, TIMES, HOLD, "")
+FOUND = SystemFigures("one", PROMISED, 8.0, 0.002, 0.0015, {0: 0.4}, "top", TIMES, TIMES, TIMES, TIMES, HOLD, "")
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def jointed(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_default_is_nasrem_and_every_bundled_rack_with_a_page() -> None:
+def test_the_default_is_nasrem_and_every_bundled_rack_with_a_folder() -> None:
     assert systems()[0] == "nasrem"
     assert len(set(systems())) == len(systems())
     for name in systems():
@@ -106,6 +106,9 @@ def test_a_rack_fails_by_its_run_and_a_late_hold_is_named() -> None:
     assert list(Systems((FOUND, failed), 1.0, None).lines())[-1] == "one: board lost: servo"
     *_, last = Systems((FOUND, late), 1.0, None).lines()
     assert last == "late: the response to the hold took longer than the longest on the grid"
+    queued = replace(FOUND, commanded="low")
+    below = "one: down is measured from low: what waits above it is no response"
+    assert below in Systems((queued,), 1.0, None).lines()
     assert any("overtaken" in line for line in Systems((overtaken,), 1.0, None).lines())
     assert FOUND.held
     assert replace(FOUND, missed=0.02).verdict == "1.85 % missed beyond cyclictest"

@@ -101,7 +101,7 @@ def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
 def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
     rows = {row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)}
     assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
-    assert rows["lower"]["takes"] == "hold, resume, modify on|off"
+    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off"
 
 
 REFUSED = {
