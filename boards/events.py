@@ -12,7 +12,7 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
 
-OfRun = Literal["launch", "waiting", "ready", "start", "printed", "died", "stop", "end", "recorder", "command"]
+OfRun = Literal["launch", "waiting", "ready", "start", "printed", "died", "done", "stop", "end", "recorder", "command"]
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
 

@@ -46,7 +46,7 @@ class HostBoards:
         block = self._segment.block(end.name)
         self._stopped.discard(end.name)
         if block[Block.STATE] == TaskState.ENDED:
-            self._journal.add("died", end.name, f"host board '{end.name}' ended: its program is done", "done")
+            self._journal.add("done", end.name, f"host board '{end.name}': its program is done", "done")
             return True
         text = f"host board '{end.name}' ended: {why}"
         self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
