@@ -17,8 +17,7 @@ they hold the arm.
 from __future__ import annotations
 
 from rack.backplane.message import Field, command, status
-from rack.backplane.words import Demand
-from rack.levels.messages import JOINT_SET_POINT, SERVO_STATUS
+from rack.levels.messages import DRIVEN_ARM, JOINT_SET_POINT, SERVO_STATUS
 from rack.levels.operator import ANSWER, RESTS_ON
 
 JOINT_REFERENCE = command(
@@ -72,22 +71,7 @@ ARM_STATUS = status(
     1,
     *ANSWER,
     Field("tick", "i8", "tick", "tick at which the arm was sensed"),
-    Field("position", "f8", "rad", "joint positions, measured; estimated for suspect sensors", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
-    Field("torque", "f8", "N m", "torque given to the arm in this cycle, after the limit gate", ("joints",)),
-    Field("target", "f8", "rad", "where the boards above want the joints", ("joints",)),
-    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
-    Field("opening", "f8", "m", "gripper joint position, measured"),
-    Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
-    Field("grip_force", "f8", "N", "force given to the gripper"),
-    Field("holding", "u1", "1", "1: the arm does not move by set points"),
-    Field("stopped", "u1", "1", "1: torques of the boards above are not followed"),
-    Field("braked", "u1", "1", "1: the brakes are engaged"),
-    Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
-    Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque"),
-    Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
-    Field("violations", "u4", "1", "substeps in which the arm drove a position, velocity or torque beyond its limit"),
-    Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
+    *DRIVEN_ARM,
 )
 """From the board of the arm to those that servo joints; a servo level's status without set points of its own."""
 

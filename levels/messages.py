@@ -241,15 +241,12 @@ SERVO_PLAN = MessageType(
     ),
 )
 
-SERVO_STATUS = status(
-    "servo_status",
-    4,
-    *ANSWER,
+DRIVEN_ARM = (
     Field("position", "f8", "rad", "joint positions, measured; estimated for suspect sensors", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
     Field("torque", "f8", "N m", "torque given to the arm in this cycle, after the limit gate", ("joints",)),
-    Field("target", "f8", "rad", "set point interpolated for this cycle", ("joints",)),
-    Field("target_velocity", "f8", "rad/s", "set point interpolated for this cycle", ("joints",)),
+    Field("target", "f8", "rad", "where the joints are wanted in this cycle", ("joints",)),
+    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
     Field("opening", "f8", "m", "gripper joint position, measured"),
     Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
     Field("grip_force", "f8", "N", "force given to the gripper"),
@@ -262,6 +259,9 @@ SERVO_STATUS = status(
     Field("violations", "u4", "1", "substeps in which the arm drove a position, velocity or torque beyond its limit"),
     Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
 )
+"""Fields of the status of a level that drives an arm."""
+
+SERVO_STATUS = status("servo_status", 4, *ANSWER, *DRIVEN_ARM)
 
 ARM_STATE = MessageType(
     "arm_state",

@@ -315,7 +315,9 @@ def launch(
 def systems(
     configs: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[CONFIG]...", help="configs by name, or paths", autocompletion=config_names),
+        typer.Argument(
+            metavar="CONFIG", help="config by name, or path to a .toml file; several", autocompletion=config_names
+        ),
     ] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e6, help="simulated time of one run")] = 10.0,
     share: Share = False,

@@ -117,8 +117,8 @@ class Stepper:
         executors = {task.name: task for task in self._executors()}
         if level is not None and level not in executors:
             raise Failure(f"--until {level}: no such level; levels: {', '.join(executors)}", 2)
-        every = executors[level].every if level is not None else max(task.every for task in executors.values())
-        return at + -at % every + (cycles - 1) * every + 1
+        task = executors[level] if level is not None else max(executors.values(), key=lambda task: task.every)
+        return task.grid.since(at) + (cycles - 1) * task.every + 1
 
     def look(self) -> Stepped:
         """Return the rack as it is held."""

@@ -17,7 +17,7 @@ takes five times as long.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from struct import Struct
 from time import monotonic_ns
 
@@ -160,6 +160,14 @@ class Slots:
         """Copy a message into the local record; False when it is not whole, or another one."""
         self.record[:] = self.places[serial & self.mask]
         return self.words[_SERIAL] == serial and self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])
+
+    def between(self, before: int, newest: int) -> Iterator[Message]:
+        """Yield a copy of each good message between two serials, as far as the slots reach back."""
+        for serial in range(max(before + 1, newest - self.mask), newest):
+            if self.fetch(serial) and self.is_lawful(0):
+                message = Message(self.dtype)
+                message.copy_from(self.message)
+                yield message
 
     def copy(self, serial: int) -> bool:
         """Copy that serial's slot, without any check, into the local record; False when it was reused meanwhile."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
@@ -10,7 +10,6 @@ from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.mailbox.protocols import open_reader
 from rack.backplane.mailbox.queue import ALL
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter, Episodes
 from rack.backplane.watch.message_watch import MessageWatch, ReadFindings
@@ -108,21 +107,12 @@ class SporadicReader:
             self._task.troubles += 1
             self._findings.report(tick)
         if self.reader.serial > before + 1:
-            return reading._replace(earlier=tuple(self._between(before, self.reader.serial)))
+            return reading._replace(earlier=tuple(self._slots.between(before, self.reader.serial)))
         return reading
 
     def is_writer_lost(self, tick: int) -> bool:
         """Return False: a lost clock ends no silence, and releases nobody."""
         return False
-
-    def _between(self, before: int, newest: int) -> Iterator[Message]:
-        """Yield a copy of each good message between two serials, as far as the slots reach back."""
-        slots = self._slots
-        for serial in range(max(before + 1, newest - slots.mask), newest):
-            if slots.fetch(serial) and slots.is_lawful(0):
-                message = Message(slots.dtype)
-                message.copy_from(slots.message)
-                yield message
 
 
 class GridReader:

@@ -102,7 +102,7 @@ class EntryCount:
         self.written = NEVER if age == NEVER else tick - age
 
     def passes(self, tick: int, written: int) -> None:
-        """EntryCount a message."""
+        """Count a message that reaches the other side at `tick`."""
         self.passed += 1
         self.arrived, self.written = tick, written
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from rack.backplane.byte_lock import ByteLock
@@ -13,7 +13,6 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.host_ring import HostWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block, System, TaskState
@@ -112,17 +111,8 @@ class HostInlet:
         before = self._reader.serial
         reading = self._reader.peek()
         if before and self._reader.serial > before + 1:
-            return reading._replace(earlier=tuple(self._between(before, self._reader.serial)))
+            return reading._replace(earlier=tuple(self._slots.between(before, self._reader.serial)))
         return reading
-
-    def _between(self, before: int, newest: int) -> Iterator[Message]:
-        """Yield a copy of each good message between two serials, as far as the slots reach back."""
-        slots = self._slots
-        for serial in range(max(before + 1, newest - slots.mask), newest):
-            if slots.fetch(serial) and slots.is_lawful(0):
-                message = Message(slots.dtype)
-                message.copy_from(slots.message)
-                yield message
 
 
 def _claim(segment: Segment, board: str) -> ByteLock:

@@ -118,6 +118,8 @@ class StateTableExecutor(Executor):
         super().__init__(context)
         params = read_params(StateTableParams, context.params)
         self.tables = {name: self.read(path, context.scene) for name, path in params.tables.items()}
+        if found := [f"{name}: {why}" for name, why in self._unlike(self.tables, context.scene)]:
+            raise TableError(found)
         self.state = ""  # of the table
         self._since: int | None = None  # tick at which it began; None: in this cycle
         self.use(next(iter(self.tables)))
@@ -129,6 +131,7 @@ class StateTableExecutor(Executor):
         self._done = 0  # newest command of the level above that is done
         self._newest: tuple[bool, int, str] = (False, 0, "")  # the newest command likewise, and its words
         self._kept = ""  # why this level, or the one above, is held; empty: it is not
+        self._recalled = 0  # newest command of an operator that the last status before a restart had answered
         self._started = False
 
     @classmethod
@@ -157,13 +160,25 @@ class StateTableExecutor(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterator[tuple[str, Any, str]]:
-        """Yield every mistake in every table."""
-        for name, path in read_params(StateTableParams, context.params).tables.items():
+        """Yield every mistake in every table, and commands that one of them does not know."""
+        files, tables = read_params(StateTableParams, context.params).tables, {}
+        for name, path in files.items():
             try:
-                cls.read(path, context.scene)
+                tables[name] = cls.read(path, context.scene)
             except TableError as error:
                 for flaw in error.flaws:
                     yield f"params.tables.{name}", path.name, flaw
+        for name, why in cls._unlike(tables, context.scene):
+            yield f"params.tables.{name}", files[name].name, why
+
+    @classmethod
+    def _unlike(cls, tables: Mapping[str, StateTable], scene: SceneConfig) -> Iterator[tuple[str, str]]:
+        """Yield tables that do not know a command that another one does, and why: the one in force outlives a swap."""
+        known = {name: [*phrases(cls.vocabulary.commands, cls.lexicon(scene, t.plan))] for name, t in tables.items()}
+        for name in tables:
+            lacking = {phrase: other for other in tables for phrase in known[other] if phrase not in known[name]}
+            for phrase, other in lacking.items():
+                yield name, f"does not know '{phrase}', as '{other}' does; all tables of a level know the same commands"
 
     @classmethod
     def wording(cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig) -> Sequence[str]:
@@ -230,8 +245,9 @@ class StateTableExecutor(Executor):
             return
         last = read.last_status.value
         write.status.copy_from(last)
-        # The table in force follows from the operator's commands, which come again.
-        self.state = last.in_state if last.in_state in self.table.rows else self.table.start
+        self.state = last.in_state
+        self.use(last.table if last.table in self.tables else self.table_name)
+        self._recalled = last.order
         self._words, self._done = last.words, last.done
         self._taken = (True, last.ordered) if last.ordered else (False, last.echo)
 
@@ -261,10 +277,10 @@ class StateTableExecutor(Executor):
     def _judge(self, order: Message) -> None:
         """Take up an operator's command for this kind of level."""
         if order.what == Operation.TABLE:
-            if order.name in self.tables:
-                self.use(order.name)
-            else:
+            if order.name not in self.tables:
                 self.orders.refuse(f"no table '{order.name}'; tables: {', '.join(self.tables)}")
+            elif order.id > self._recalled:
+                self.use(order.name)
         elif order.what == Operation.DO:
             lexicon = self.lexicon(self.context.scene, self.table.plan)
             if why := objection(order.name, self.vocabulary.commands, lexicon):

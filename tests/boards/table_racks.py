@@ -59,11 +59,19 @@ do = ["count up"]
 status = "executing"
 """
 SLOW = f"""
-start = "up"
-{RESET.replace('["up", "down"]', '"up"')}
+start = "settling"
+{RESET.replace('["up", "down"]', '["settling", "resting"]').replace('next = "up"', 'next = "same"')}
+[[row]]
+name = "settle"
+state = "settling"
+else = true
+next = "resting"
+do = []
+status = "idle"
+
 [[row]]
 name = "rest"
-state = "up"
+state = "resting"
 else = true
 next = "same"
 do = []

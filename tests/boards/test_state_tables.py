@@ -61,6 +61,8 @@ def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -
 def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
     statuses, _ = counted(counter(commands(SWAP), 'fault=[{ kind = "kill", board = "counter", at = 0.15 }]'), 0.9)
     assert statuses["table"][-1] == b"slow"
+    assert [name.decode() for name in statuses["fired"][9:12]] == ["count up", "settle", "rest"]
+    assert set(statuses["fired"][11:].tolist()) == {b"rest"}
     assert set(statuses["count"][10:].tolist()) == {10}
 
 

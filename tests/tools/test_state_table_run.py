@@ -33,17 +33,24 @@ def test_the_report_counts_the_rows_that_fired(folder: Path) -> None:
         ("saw", 3, "count up", 10),
         ("saw", 4, "turn", 1),
         ("saw", 5, "count down", 4),
-        ("slow", 3, "rest", 10),
+        ("slow", 3, "settle", 1),
+        ("slow", 4, "rest", 9),
     ]
     assert rows[1]["first_s"] == 0.1
-    assert "| counter | saw, then slow | 4          | 25     |" in (folder / "report.md").read_text()
+    assert "| counter | saw, then slow | 5          | 25     |" in (folder / "report.md").read_text()
 
 
 def test_the_viewer_has_a_lane_of_rows_and_a_line_a_change(folder: Path) -> None:
     states = read(folder / "run.rrd", "/levels/counter/row", "StateChange:state")
     lines = read(folder / "run.rrd", "/log/rows", "TextLog:text")
-    assert states.ticks.tolist() == [0, 40, 44, 60]
-    assert [str(value) for value in states.values.ravel()] == ["3 count up", "4 turn", "5 count down", "3 rest"]
+    assert states.ticks.tolist() == [0, 40, 44, 60, 64]
+    assert [str(value) for value in states.values.ravel()] == [
+        "3 count up",
+        "4 turn",
+        "5 count down",
+        "3 settle",
+        "4 rest",
+    ]
     assert "counter: row 4 'turn', now in 'down', table saw" in {str(value) for value in lines.values.ravel()}
 
 

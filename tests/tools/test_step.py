@@ -59,7 +59,7 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(held: subprocess.Popen[str], ra
     given = rack("command", rack_name, "counter", "table", "slow")
     assert given.stdout == "command to 'counter', table slow: waits for the next step of the rack, which is held\n"
     tick, level = stepped(rack_name, "--cycles", "2", "--until", "counter")
-    assert (tick, level["row"]) == (49, "row 3 'rest', now in 'up', table slow")
+    assert (tick, level["row"]) == (49, "row 4 'rest', now in 'resting', table slow")
     text = rack("step", rack_name, "--ticks", "1").stdout
     assert f"{rack_name}: held before tick 50, 0.125 s" in text
     assert f"HELD: 'rack step {rack_name}' lets it go on" in rack("status", rack_name).stdout

@@ -67,6 +67,18 @@ def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -
     assert expected in str(caught.value)
 
 
+def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "careful.toml"
+    lines = (FOLDER / "tables" / "elemental_move_careful.toml").read_text().splitlines()
+    path.write_text("\n".join(line for line in lines if not line.startswith("left =")))
+    with pytest.raises(ConfigError) as caught:
+        resolve(load("nist-state-table", [f"board.elemental_move.params.tables.careful={path}"]))
+    assert str(caught.value) == (
+        "board.elemental_move.params.tables.careful = \"careful.toml\": does not know 'place left', as 'normal' does; "
+        "all tables of a level know the same commands"
+    )
+
+
 @pytest.mark.parametrize("variant", [FOLDER / "nist-state-table.toml", FOLDER / "direct.toml"])
 def test_its_configs_are_sound(variant: Path) -> None:
     config = load(variant)

@@ -184,6 +184,8 @@ def test_more_than_the_level_holds_waits_in_the_queue() -> None:
     rig = TrajectoryRig()
     for k in range(HELD + 4):
         rig.joints([0.01 * k, 0, 0, 0, 0, 0])
+    rig.cycle()  # it takes none before it has recalled what it holds
+    assert rig.write.status.taken == 0
     rig.cycle()
     assert len(rig.queue) == 4
     assert rig.write.status.taken == HELD
