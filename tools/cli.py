@@ -37,7 +37,7 @@ COMMANDS = (
     (
         "prompt",
         "rack.tools.prompt:prompt",
-        "Open a Python prompt, or run a script, on the host side of a running rack.",
+        "Open a Python prompt on the host side of a rack.",
     ),
     ("inject", "rack.tools.inject:app", "Inject a fault into a running rack."),
     ("estop", "rack.tools.estop:estop", "Engage the brakes of the arm at once, until --reset."),
