@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.message import Field, Message, MessageType
-from rack.boards.wiring import Source
+
+if TYPE_CHECKING:
+    # A look at a running rack must not import the levels.
+    from rack.boards.wiring import Source
 
 EXCHANGE = "exchange"
 """Port, and message type, of the exchange."""
