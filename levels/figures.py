@@ -51,10 +51,9 @@ class FigureParams(Table):
         return round(self.plan_ms * NS_PER_MS)
 
 
-class FigureExecutor(Executor):
-    """Computes for X of processor time in every cycle, and reports which plan is in force."""
+class FigureLoop(Executor):
+    """Computes for X of processor time in every cycle: a level without a planner."""
 
-    inputs = {"plan": Input(FIGURE_PLAN, "own.plan")}
     outputs = {"status": FIGURE_STATUS}
     params = FigureParams
 
@@ -66,11 +65,25 @@ class FigureExecutor(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Report, then compute; time spent preempted does not count."""
         end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
-        status, plan = write.status, read.plan
+        status = write.status
         status.state = State.EXECUTING
         status.cycle = tick
-        status.plan = plan.value.made_at if plan.is_there else -1
+        status.plan = self.plan_in_force(read)
         compute_until(end)
+
+    def plan_in_force(self, read: Ports) -> int:
+        """Return the release that the plan in force answers; -1: there is none."""
+        return -1
+
+
+class FigureExecutor(FigureLoop):
+    """Reports which plan is in force, too."""
+
+    inputs = {"plan": Input(FIGURE_PLAN, "own.plan")}
+
+    def plan_in_force(self, read: Ports) -> int:
+        """Return the release that the plan in force answers; -1: there is none yet."""
+        return read.plan.value.made_at if read.plan.is_there else -1
 
 
 class FigurePlanner(Planner):

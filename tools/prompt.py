@@ -63,7 +63,7 @@ def prompt(rack: RackName, board: HostName = None, script: Script = None) -> Non
 
 
 def _wiring(segment: Segment, board: str | None) -> HostWiring:
-    """Return the wiring of the external board. Raises `Failure` if it cannot be told which."""
+    """Return the wiring of the external board. Raises `Failure` if there is none, or a choice of several."""
     found = {host.board: host for host in resolve(loads(segment.config)).hosts if host.is_external}
     names = ", ".join(found) or "none"
     if board is None and len(found) != 1:

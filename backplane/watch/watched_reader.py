@@ -111,7 +111,7 @@ class SporadicReader:
         return reading
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Return False: a lost clock ends no silence, and releases nobody."""
+        """Return False: a lost clock releases no board, so silence proves nothing."""
         return False
 
 

@@ -50,7 +50,7 @@ class MotionRequest(NamedTuple):
         return self.kind in MOTIONS
 
     def misfit(self, ranges: Array) -> str:
-        """Return why nobody could do it, whatever the arm; empty: it may be possible. `ranges` (joints, 2), rad."""
+        """Return why no arm could do it; empty: it may be possible. `ranges` (joints, 2), rad."""
         if self.kind not in set(MotionKind) - {MotionKind.NONE}:
             return f"kind {self.kind}; permitted: {MotionKind.JOINTS.value} to {MotionKind.GRIP.value}"
         numbers = self.record["acceleration"], self.record["segment"], self.record["opening"], self.record["force"]

@@ -119,7 +119,7 @@ class LiveDesk:
         if _Patience(segment, "").is_in_vain:
             raise Failure(f"rack '{segment.rack}': its run is over")
         if segment.words[System.HELD]:
-            # Without a client: whoever gives it steps the rack afterwards.
+            # Without a client: the user steps the rack afterwards.
             entry = self._table.add(wanted)
             return Reply(0, command.level, describe(message_of(entry, segment.layout)), -1, "waiting")
         # However the wait ends, leaving the claim withdraws a request that has not been given.

@@ -107,7 +107,7 @@ def test_a_rack_fails_by_its_run_and_a_late_hold_is_named() -> None:
     *_, last = Systems((FOUND, late), 1.0, None).lines()
     assert last == "late: the response to the hold took longer than the longest on the grid"
     queued = replace(FOUND, commanded="low")
-    below = "one: down is measured from low: what waits above it is no response"
+    below = "one: down is measured from low: the wait in the queue above it does not count as response"
     assert below in Systems((queued,), 1.0, None).lines()
     assert any("overtaken" in line for line in Systems((overtaken,), 1.0, None).lines())
     assert FOUND.held
