@@ -164,7 +164,8 @@ class Systems:
             yield f"{self.absent.line}; every miss counts against the rack"
         for one in self.figures:
             if one.commanded not in ("", *one.predicted.levels[:1]):
-                yield f"{one.rack}: down is measured from {one.commanded}: the wait in the queue above it does not count as response"
+                queued = "the wait in the queue above it does not count as response"
+                yield f"{one.rack}: down is measured from {one.commanded}: {queued}"
             if one.failure:
                 yield f"{one.rack}: {one.failure}"
             elif one.hold is not None and one.hold.beyond:
