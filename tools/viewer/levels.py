@@ -20,6 +20,8 @@ LEVELS, LOG = "levels", "log"
 HIERARCHY = "hierarchy"
 ROW, COLUMN = 45.0, 110.0
 """Distance between nodes, in the graph's units; a letter is about 7 wide."""
+WIDEST = 3
+"""Boards of one level in a row: more would make the graph too small to read."""
 
 
 class ValueLane:
@@ -182,9 +184,15 @@ def _names(rows: np.ndarray) -> np.ndarray:
 def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
     """Return the places of the tasks: levels in rows, their planners to the right, other boards to the left.
 
-    Boards of the same level are next to each other.
+    Boards of the same level are next to each other, in several rows if they are many.
     """
-    placed = {board: (2 * at, row) for row, boards in enumerate(rack.ranks) for at, board in enumerate(boards)}
+    placed: dict[str, tuple[int, int]] = {}
+    first = 0
+    for boards in rack.ranks:
+        step = 1 + any(rack.boards[board].has_planner for board in boards)
+        for at, board in enumerate(boards):
+            placed[board] = at % WIDEST * step, first + at // WIDEST
+        first += -(-len(boards) // WIDEST)
     others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in placed]
     placed |= {board: (-1, row) for row, board in enumerate(others)}
     return {
