@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from rack.tools.benches.mailbox import CASES, MESSAGE, SIZES, Case, Exchange, co
 from rack.tools.benches.transports import PEERS, REFERENCES, Peer, Transport, raw_copy
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from tests.processes import BOUND_S, RACK, exit_status, fork
+from tests.processes import BOUND_S, RACK
 from tests.tools.benches.test_comparison import Hidden
 from tests.tools.command_line import ROOT
 
@@ -50,10 +51,15 @@ def test_messages_have_the_sizes_that_the_cases_name() -> None:
 def test_every_reader_receives_every_message_and_nothing_is_left(peer: Peer, tmp_path: Path) -> None:
     if absent_package(peer.name, peer.module) is not None:
         pytest.skip(f"{peer.module} is not installed")
-    # In a process of its own: threads of zenoh outlive its sessions.
-    pid = fork(lambda: use(peer, tmp_path))
-    assert exit_status(pid) == 0
-    assert not left_by(pid)
+    # In a new process: threads of zenoh outlive its sessions, and do not start in a fork of a process with threads.
+    user = get_context("spawn").Process(target=use, args=(peer, tmp_path))
+    user.start()
+    try:
+        user.join(BOUND_S)
+        assert user.exitcode == 0
+    finally:
+        user.kill()
+    assert not left_by(user.pid or 0)
     assert not list(tmp_path.iterdir())
 
 
