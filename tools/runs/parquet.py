@@ -2,7 +2,8 @@
 
 cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks. signals.parquet is what the
 tasks wrote to their mailboxes: one row a message. Each of its row groups holds rows of one mailbox, whose own columns
-are filled; those of all others are null.
+are filled; those of all others are null. Its metadata hold the checksum of the config.toml next to it: a config that is
+cut off at the end of a table is a valid config.
 """
 
 from __future__ import annotations
@@ -16,17 +17,25 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from xxhash import xxh3_64_hexdigest
 
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.backplane.trace import FIELDS
 from rack.tools.runs.cores import UNMEASURED, CoreRecord
 
 TRACE_SCHEMA = pa.schema([pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS)])
+CONFIG = "config.toml"
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
 """Columns that the messages of all mailboxes have."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS, MESSAGE_BYTES = 8192, 16 << 20
 """Rows are written in large blocks: a file's footer has an entry for every column of every block."""
+
+
+def config_check(folder: Path) -> str:
+    """Return the checksum of a run's config.toml; empty where there is none."""
+    path = folder / CONFIG
+    return xxh3_64_hexdigest(path.read_bytes()) if path.is_file() else ""
 
 
 class CyclesFile:
@@ -74,7 +83,8 @@ class SignalsFile:
             *(pa.field(name, pa.uint64() if name == "chain" else pa.int64()) for name in HEAD),
         ]
         fields = head + [column.field for columns in self._columns.values() for column in columns]
-        self._schema = pa.schema(fields, metadata={"layout": json.dumps(asdict(layout))})
+        metadata = {"layout": json.dumps(asdict(layout)), "config": config_check(path.parent)}
+        self._schema = pa.schema(fields, metadata=metadata)
         texts = [column.name for columns in self._columns.values() for column in columns if column.kind[1] == "S"]
         self._writer = pq.ParquetWriter(
             path,

@@ -22,7 +22,7 @@ from rack.boards.errors import ConfigError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.runs.cores import UNMEASURED, CoreRecord
-from rack.tools.runs.parquet import HEAD
+from rack.tools.runs.parquet import CONFIG, HEAD, config_check
 from rack.tools.runs.spool import mend
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
@@ -37,13 +37,17 @@ class Recording:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.config = self._text("config.toml")
+        self.config = self._text(CONFIG)
         """The resolved config, as TOML text."""
         with _naming(folder):
             if mend(folder):
                 _note(f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and signals.parquet")
         self._cycles = self._open("cycles.parquet", ("task", "tick"))
         self._signals = self._open("signals.parquet", ("mailbox", *HEAD))
+        # Earlier versions stored no checksum.
+        recorded = (self._signals.schema_arrow.metadata or {}).get(b"config", b"").decode()
+        if recorded and recorded != config_check(folder):
+            raise Failure(f"{folder / CONFIG}: not the config of this run: it was cut off or changed later", 2)
 
     @cached_property
     def rack_config(self) -> RackConfig:

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from rack.boards.config import loads
 from rack.tools.analysis.analysis import Analysis
 from rack.tools.analysis.report import write_report
 from rack.tools.charts.gantt import subject_of
@@ -56,6 +57,15 @@ def test_a_damaged_file_is_named(damaged: Path, name: str, damage: str) -> None:
     path = damaged / name
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     refused(damaged, name)
+
+
+def test_a_config_cut_off_at_the_end_of_a_table_is_named(damaged: Path) -> None:
+    path = damaged / "config.toml"
+    whole = path.read_text()
+    path.write_text(whole[: whole.rindex("\n[") + 1])
+    # It is a valid config still.
+    loads(path.read_text())
+    refused(damaged, path.name)
 
 
 @pytest.mark.parametrize("name", ["config.toml", *PARQUET])
