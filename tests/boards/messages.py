@@ -7,8 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, trace_ring
+from rack.backplane.words import Block
+from tests.processes import wait_until
 
 WHAT = ("serial", "tick", "visible_at", "basis", "chain")
 
@@ -22,7 +25,9 @@ class Written:
 
     @classmethod
     def on(cls, segment: Segment) -> Written:
-        """Read everything from a segment."""
+        """Read everything from a segment, once the cycles that were under way at the end of the run have ended."""
+        blocks = [segment.block(task.name) for task in segment.layout.tasks]
+        wait_until(lambda: all(b[Block.DONE] >= b[Block.RELEASED] or not is_alive(b[Block.PID]) for b in blocks))
         messages, cycles = {}, {}
         for mailbox in segment.layout.mailboxes:
             messages[mailbox.name], lost = MailboxRing(segment, mailbox.name).drain()
