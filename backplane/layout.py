@@ -82,7 +82,9 @@ class MailboxSpec:
     become visible at multiples of `every`, counted from tick `phase`. `depth` is the number of slots, a power of two.
     `rests_on` names the mailboxes on whose information its messages rest, all read by its writer; queues, in which
     messages wait, are not among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
-    `exchanges` are the readers that do not simply read it in every cycle.
+    `exchanges` are the readers that do not simply read it in every cycle. `max_age`, ticks: of a mailbox written only
+    when there is something new, the age of its information from which readers take the writer for lost; 0: it is
+    written in every period.
     """
 
     name: str
@@ -100,6 +102,7 @@ class MailboxSpec:
     capacity: int = 0
     phase: int = 0
     exchanges: tuple[ExchangeSpec, ...] = ()
+    max_age: int = 0
 
     @property
     def is_by_ticks(self) -> bool:

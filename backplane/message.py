@@ -6,7 +6,7 @@ resolved type travel through a mailbox.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from operator import attrgetter
@@ -17,7 +17,7 @@ import numpy as np
 from rack.backplane.errors import MailboxError
 
 REASON_BYTES = 120
-NO_QUEUE = "only messages of a queue are sent: declare the port as Output(..., queued=True)"
+NOT_SENT = "its board writes this message in every cycle: declare the port as Output(..., queued=True) to send it"
 
 
 class State(IntEnum):
@@ -130,16 +130,17 @@ class Message:
         """Copy the bytes of a message of the same type."""
         self.raw[:] = other.raw
 
-    def send(self) -> bool:
+    def send(self, basis: int | None = None) -> bool:
         """Put a copy into the queue to which an output port leads; return False if the queue is full.
 
-        Messages of other mailboxes are written by the board: there it raises `MailboxError`.
+        Of a port that is written on demand: have the board write it in this cycle, resting on information of tick
+        `basis`. Messages of other mailboxes are written in every cycle: there it raises `MailboxError`.
         """
-        raise MailboxError(NO_QUEUE)
+        raise MailboxError(NOT_SENT)
 
     def room(self) -> int:
         """Return how many messages the queue still takes in this cycle; raises as `send` does."""
-        raise MailboxError(NO_QUEUE)
+        raise MailboxError(NOT_SENT)
 
     if TYPE_CHECKING:
         # Field names come from the layout: a type checker cannot know them.
@@ -182,3 +183,14 @@ def _property(slot: str, dtype: np.dtype) -> property:
 
         return property(lambda self: view(self).item().decode("ascii", "replace"), store_text)
     return property(lambda self: view(self).item(), store)
+
+
+def sending(plain: Message, dtype: np.dtype, send: Callable[..., bool], room: Callable[[], int]) -> Message:
+    """Return a message on the bytes of `plain` that has these methods `send` and `room`."""
+    kind = type("Message", (type(plain),), {"__slots__": ("room", "send")})
+    message: Message = object.__new__(kind)
+    message.__init__(dtype, plain.raw)  # type: ignore[misc]
+    # Their slots hide the methods of `Message`.
+    setattr(message, "send", send)  # noqa: B010
+    setattr(message, "room", room)  # noqa: B010
+    return message

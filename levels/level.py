@@ -104,6 +104,10 @@ class Output(NamedTuple):
     """The input whose information it passes on; default: the input of the same name, if there is one. Its messages
     carry the tick of that information, of an input that reads many the oldest, of none their own release. By these
     ticks the response of the whole hierarchy is measured."""
+    max_age_s: float = 0.0
+    """Above 0: written only in cycles in which the level calls `write.port.send(basis)`, `basis` being the tick of the
+    information. Readers find the message old in between, and its writer lost when the information is older than this,
+    s of simulated time."""
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
         """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`, writes it."""

@@ -22,13 +22,13 @@ whether a queue is full would depend on which process is faster.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from struct import Struct
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
-from rack.backplane.mailbox.slots import Slots, pid_of
-from rack.backplane.message import Field, Message, MessageType
+from rack.backplane.mailbox.slots import pid_of
+from rack.backplane.message import Field, Message, MessageType, sending
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
@@ -78,7 +78,7 @@ class QueueWriter(Writer):
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before this.
         self._shared[_SENT] = self.serial
-        self.message = _sending(slots, self._send, self.room)
+        self.message = sending(slots.message, slots.dtype, self._send, self.room)
         self.taken = 0
         self.refused = 0
         """Messages refused by this writer, because the queue was full."""
@@ -90,7 +90,7 @@ class QueueWriter(Writer):
         unread = self.serial - self.taken + self.held + len(self._pending)
         return max(0, self.spec.capacity - unread)
 
-    def _send(self) -> bool:
+    def _send(self, basis: int | None = None) -> bool:
         if not self.room():
             self.refused += 1
             self._shared[_REFUSED] += 1
@@ -139,18 +139,6 @@ class QueueWriter(Writer):
         """Show everything published: by one store each, first to observers, then to the reader."""
         self._shared[_HEAD] = serial = self.serial
         self._shared[_SENT] = serial
-
-
-def _sending(slots: Slots, send: Callable[[], bool], room: Callable[[], int]) -> Message:
-    """Return the outgoing message of a queue: it has the methods `send` and `room`."""
-    plain = slots.message
-    kind = type("Message", (type(plain),), {"__slots__": ("room", "send")})
-    message: Message = object.__new__(kind)
-    message.__init__(slots.dtype, plain.raw)  # type: ignore[misc]
-    # Their slots hide the methods of `Message`.
-    setattr(message, "send", send)  # noqa: B010
-    setattr(message, "room", room)  # noqa: B010
-    return message
 
 
 class QueueReader(Reader):

@@ -2,7 +2,8 @@
 
 Executors write in every cycle, so the age of their messages has a limit; plans have none. Silence alone is a reason to
 hold (`is_lost`) but does not prove a fault. For an alarm the writer must be dead or stopped, or must have finished
-cycles for which no message came.
+cycles for which no message came. A mailbox that is written only when there is something new has a limit of its own, for
+the age of its information; its writer reports why nothing comes.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class SilenceWatch:
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes, task: ReadingTask) -> None:
         spec = reader.spec
         is_periodic = segment.layout.task(spec.writer).role == "executor"
-        self.quiet = MUTE_CYCLES * spec.every if is_periodic else NOT_YET
+        self.quiet = 0 if spec.max_age else MUTE_CYCLES * spec.every if is_periodic else NOT_YET
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
         self._reader, self._episodes, self._task = reader, episodes, task
@@ -80,6 +81,8 @@ class SilenceWatch:
 
     def is_lost(self, tick: int) -> bool:
         """Say whether the writer is lost or has been silent for too long; raise an alarm if the cause is proven."""
+        if max_age := self._reader.spec.max_age:
+            return tick - self._reader.basis > max_age or self.is_writer_lost(tick)
         newest = self._reader.newest
         age = tick - newest
         if age >= self.quiet:

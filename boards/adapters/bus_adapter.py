@@ -23,6 +23,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Field, Message, MessageType, State, status
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
+from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import (
     ENTRY,
     NEVER,
@@ -35,13 +36,11 @@ from rack.boards.adapters.entries import (
     Replayed,
     Rows,
 )
-from rack.levels.level import Executor, Input, LevelContext, MadePorts, Output, Ports
+from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.tables import read_params
 
-STATUS = "status"
 
-
-class BusAdapter(Executor):
+class BusAdapter(Adapter):
     """Passes mailboxes between the two sides. Its status is done when the programs of all its host boards are."""
 
     params = AdapterParams

@@ -197,7 +197,8 @@ class Wiring:
             depth = depth_for(max(slowest + delay, self._kept_ticks), every)
             rests_on = tuple(box for box in ports.rests_on(name.partition(".")[2]) if self.protocol(box) != "queue")
             spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, rests_on=rests_on)
-            box = self._mailbox(name, output.type, sizes, partial(spec, phase=writer.phase))
+            max_age = round(output.max_age_s * 1e9 / self.config.clock_ns)
+            box = self._mailbox(name, output.type, sizes, partial(spec, phase=writer.phase, max_age=max_age))
             mailboxes += self._queue(box, readers[0], writer) if box.protocol == "queue" else [box]
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, StringConstraints
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Protocol, Role, Sampled, Wake
 from rack.boards.config.files import portable, with_table_files
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
+from rack.boards.lan.config import LanTable
 from rack.levels.operator import NAME_BYTES, Goal, Operation
 from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
 
@@ -214,6 +215,35 @@ class BoardConfig(Table):
     )
 
 
+LAN = "lan"
+"""Name of the board that exchanges mailboxes with other racks."""
+LAN_ADAPTER = "rack.boards.lan.adapter:LanAdapter"
+
+
+class LanConfig(LanTable):
+    """`[adapter.lan]`: the board that exchanges mailboxes with other racks: see `rack.boards.lan.adapter`."""
+
+    slot: Slot = Field(description="slot in the crate; slot 1 is the clock's")
+    core: Core = Field(0, description="core of the board; if the machine lacks it, another core is used")
+    rate_hz: Positive = Field(50.0, ge=1e-6, description="rate of the board, Hz; must divide the clock rate")
+    priority: Priority = Field(0, description="SCHED_FIFO priority, above the other boards' of its core; 0: ordinary")
+    budget: BudgetConfig | None = Field(None, description="worst-case processor times, for the timing model")
+    restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board")
+    restarts_within_s: Positive | None = Field(None, description="overrides supervision.within_s for this board, s")
+
+    def board(self) -> BoardConfig:
+        """Return the board."""
+        own = {key: getattr(self, key) for key in LanConfig.model_fields.keys() - LanTable.model_fields.keys()}
+        params = self.model_dump(exclude_none=True, by_alias=True, include=set(LanTable.model_fields))
+        return BoardConfig(executor=LAN_ADAPTER, params=params, **own)
+
+
+class AdapterConfig(Table):
+    """`[adapter]`: ways out of the rack."""
+
+    lan: LanConfig | None = Field(None, description="exchange of mailboxes with other racks over a network")
+
+
 class HostConfig(Table):
     """`[host.<name>]`: one board of the host side, without slot, rate and priority: see `rack.levels.host_program`."""
 
@@ -297,10 +327,18 @@ class RackConfig(Table):
     scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
     task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")
     board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
+    adapter: AdapterConfig = Field(AdapterConfig(), description="ways out of the rack: the network")
     host: dict[str, HostConfig] = Field({}, description="boards of the host side by name, without real time")
     supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of lost boards")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
     command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at its tick")
+
+    @model_validator(mode="after")
+    def _with_adapters(self) -> Self:
+        """Add the adapter's board to the others."""
+        if self.adapter.lan is not None and LAN not in self.board:
+            self.board[LAN] = self.adapter.lan.board()
+        return self
 
     @property
     def clock_ns(self) -> int:
@@ -342,6 +380,8 @@ class RackConfig(Table):
         if self.robot is not None:
             tables["robot"]["model"] = portable(self.robot.model)
         tables["board"] = {
-            name: with_table_files(board, lambda file: portable(Path(file))) for name, board in tables["board"].items()
+            name: with_table_files(board, lambda file: portable(Path(file)))
+            for name, board in tables["board"].items()
+            if name != LAN or self.adapter.lan is None
         }
         return to_toml(tables)

@@ -14,7 +14,7 @@ from rack.backplane.memory import lock_memory, touch_memory
 from rack.backplane.process import cores_kept_awake, die_with_parent, name_process, pin, set_priority, take_processor
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
-from rack.boards.adapters.bus_adapter import BusAdapter
+from rack.boards.adapters.adapter import Adapter
 from rack.boards.classes import find_class
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
@@ -69,7 +69,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
     kind: type[Executor] | type[Planner]
     kind = find_class(wiring.target, Executor) if spec.role == "executor" else find_class(wiring.target, Planner)
     level = kind(wiring.context)
-    if isinstance(level, BusAdapter):
+    if isinstance(level, Adapter):
         level.attach(segment, wiring.entries)
     try:
         level.self_test()
@@ -82,6 +82,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
             touch_memory()
         block[Block.PRIORITY] = take_processor(spec)
         block[Block.CORE] = spec.core
+        if isinstance(level, Adapter):
+            level.open()
         task = _task(segment, wiring, level, attention)
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)

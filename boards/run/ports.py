@@ -17,7 +17,7 @@ from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
 from rack.boards.faults.kind import KINDS
 from rack.boards.faults.messages import FaultyWriter
-from rack.boards.run.queues import QueuePort, Write
+from rack.boards.run.queues import DemandPort, QueuePort, Write
 from rack.boards.wiring import Source
 from rack.levels.level import Ports, Reading, Verdict
 
@@ -157,7 +157,9 @@ class OutputPorts:
     ) -> None:
         """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level sends by itself."""
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
-        self.messages = Ports(**{port: writer.message for port, writer in self.writers.items()})
+        self._demanded = {port: DemandPort(writer) for port, writer in self.writers.items() if writer.spec.max_age}
+        messages = {port: writer.message for port, writer in self.writers.items()}
+        self.messages = Ports(**messages | {port: demanded.message for port, demanded in self._demanded.items()})
         self._rests_on = {port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()}
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
@@ -192,7 +194,10 @@ class OutputPorts:
         ]
 
     def _write_of(self, port: str) -> Write:
-        write: Write = getattr(self._faulty.get(port), "write", self.writers[port].write)
+        faulty = self._faulty.get(port)
+        write: Write = self.writers[port].write if faulty is None else faulty.write
+        if port in self._demanded:
+            return partial(self._demanded[port].write, write, _no_flush if faulty is None else faulty.flush)
         return partial(self._queues[port].write, write) if port in self._queues else write
 
     @property
@@ -253,6 +258,10 @@ class OutputPorts:
     def _traffic(self) -> tuple[int, int]:
         writers = self.writers.values()
         return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)
+
+
+def _no_flush(tick: int, now: int | None) -> None:
+    """Flush nothing: no fault delays messages."""
 
 
 def _basis(mailboxes: Sequence[str], readers: Mapping[str, Reader]) -> Reader | OldestOf | None:

@@ -1,14 +1,16 @@
-"""A task's ports to the queues that it writes."""
+"""A task's ports whose messages its level sends itself: queues, and mailboxes written on demand."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from rack.backplane.mailbox.mailbox import Reading
+from rack.backplane.mailbox.mailbox import Reading, Writer
 from rack.backplane.mailbox.queue import QueueWriter
+from rack.backplane.message import sending
 from rack.backplane.watch.alarms import Alarm, Episodes
 
 Write = Callable[[int, int | None, int | None], bool]
+Flush = Callable[[int, int | None], None]
 
 
 class QueuePort:
@@ -42,3 +44,24 @@ class QueuePort:
             refused, self._refused = writer.refused - self._refused, writer.refused
             self._episodes.find(Alarm.QUEUE_FULL, writer.serial + writer.refused, tick, refused)
         return in_time
+
+
+class DemandPort:
+    """Writes one mailbox for a task in the cycles in which its level has sent a message; `message` is that message."""
+
+    def __init__(self, writer: Writer) -> None:
+        self.message = sending(writer.message, writer.message.record.dtype, self._send, lambda: 1)
+        self._is_sent = False
+        self._basis: int | None = None
+
+    def _send(self, basis: int | None = None) -> bool:
+        self._is_sent, self._basis = True, basis
+        return True
+
+    def write(self, onward: Write, flush: Flush, tick: int, now: int | None, basis: int | None) -> bool:
+        """Write the cycle's message by `onward`, if there is one; else `flush` what faults have delayed."""
+        if not self._is_sent:
+            flush(tick, now)
+            return True
+        self._is_sent = False
+        return onward(tick, now, basis if self._basis is None else self._basis)

@@ -9,7 +9,8 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
-from rack.boards.adapters.bus_adapter import STATUS, BusAdapter
+from rack.boards.adapters.adapter import STATUS
+from rack.boards.adapters.bus_adapter import BusAdapter
 from rack.boards.adapters.entries import AdapterParams, EntryConfig
 from rack.boards.classes import find_class
 from rack.boards.config.resolved import resolve

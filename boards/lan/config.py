@@ -1,0 +1,105 @@
+"""`[adapter.lan]`: what a rack exchanges with others over a network, with whom, and by which rules."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints, ValidationError
+
+from rack.backplane.message import MessageType
+from rack.levels.tables import Positive, Table
+
+FASTEST_HZ = 50.0
+"""Fastest exchange over a network."""
+OnPeerLoss = Literal["hold", "stop", "go on"]
+Right = Literal["watch", "command", "stop"]
+PeerName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
+PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
+Endpoint = Annotated[str, StringConstraints(pattern=r"^(tcp|tls|quic)/[^/#?]+:[0-9]{1,5}$")]
+Local = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
+Remote = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
+TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
+ENDPOINT_NOTE = "as in tls/192.168.1.5:7447 or tcp/127.0.0.1:7447"
+
+
+class ExportConfig(Table):
+    """`[adapter.lan.export.<port>]`: one mailbox of this rack that others may import."""
+
+    source: Local = Field(alias="from", description="mailbox, as in task.status; others import it as RACK/task.status")
+    rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's")
+
+
+class ImportConfig(Table):
+    """`[adapter.lan.import.<port>]`: one mailbox of another rack, which levels here read as `lan.<port>`."""
+
+    source: Remote = Field(alias="from", description="rack and mailbox, as in cell/task.orders")
+    type: TypeName = Field(description="message type of that mailbox, package.module:TYPE")
+    rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's")
+    max_age_ms: Positive = Field(
+        description="age from which a message is old and its writer counts as lost, ms; simulated time"
+    )
+
+    @property
+    def rack(self) -> str:
+        """Name of the rack that writes it."""
+        return self.source.partition("/")[0]
+
+    @property
+    def mailbox(self) -> str:
+        """Name of the mailbox there."""
+        return self.source.partition("/")[2]
+
+    def message_type(self) -> MessageType:
+        """Return the message type. Raises `LookupError` with the reason if there is none."""
+        module, _, name = self.type.partition(":")
+        try:
+            found = getattr(importlib.import_module(module), name, None)
+        except (Exception, SystemExit) as error:  # a user's module may raise anything while it is imported
+            raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
+        if not isinstance(found, MessageType):
+            raise LookupError(f"module '{module}' has no message type '{name}'")
+        return found
+
+
+class LanTable(Table):
+    """The keys of `[adapter.lan]` that concern the network; those of its board are declared with the boards'."""
+
+    listen: tuple[Endpoint, ...] = Field((), description=f"endpoints where other racks find this one, {ENDPOINT_NOTE}")
+    connect: tuple[Endpoint, ...] = Field((), description=f"endpoints of other racks, {ENDPOINT_NOTE}")
+    certificates: str | None = Field(
+        None, description="folder with this rack's certificate and key; see rack lan certificates --help"
+    )
+    insecure: bool = Field(False, description="permit endpoints beyond loopback without TLS")
+    lease_ms: float = Field(200.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms")
+    on_peer_loss: OnPeerLoss = Field(
+        "hold",
+        description="while a peer is lost: hold: levels find what it writes lost, and hold; stop: the arm ramps to "
+        "rest, then brakes; go on: levels keep the last message",
+    )
+    peers: tuple[PeerName, ...] = Field(
+        (), description="racks that this one waits for in lockstep, besides those from which it imports"
+    )
+    permit: dict[PeerName, tuple[Right, ...]] = Field(
+        {},
+        description="what others may do besides exchanging mailboxes, by name; watch: read status and signals; "
+        "command: command levels; stop: set the emergency stop",
+    )
+    most_bytes: int = Field(
+        16_384, ge=64, le=1 << 20, description="length of the longest message taken from the network; bytes"
+    )
+    exports: dict[PortName, ExportConfig] = Field({}, alias="export", description="mailboxes that others may import")
+    imports: dict[PortName, ImportConfig] = Field({}, alias="import", description="mailboxes of other racks, by port")
+
+
+class LanParams(LanTable):
+    """The parameters of the adapter's board: what its table says of the network."""
+
+    @classmethod
+    def found_in(cls, params: Mapping[str, Any]) -> LanParams | None:
+        """Return the parameters; None if they have mistakes."""
+        try:
+            return cls.model_validate(params)
+        except ValidationError:
+            return None

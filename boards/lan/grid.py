@@ -1,0 +1,38 @@
+"""The grid of this rack next to those of others: ticks as times on another machine's clock, and the other way round."""
+
+from __future__ import annotations
+
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.segment import Segment
+from rack.boards.lan.envelope import Envelope
+from rack.boards.lan.peers import PeerRack
+
+
+class OwnGrid:
+    """Converts ticks. In lockstep all racks have one simulated time; in real time each has an epoch of its own."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._clock, self._clock_ns = SystemClock(segment), segment.layout.clock_ns
+        self.is_lockstep = self._clock.is_lockstep
+        self.tick_s = self._clock_ns * 1e-9
+        """One tick, s of simulated time."""
+
+    def time_ns(self, tick: int) -> int:
+        """Return the simulated time of a tick, ns."""
+        return tick * self._clock_ns
+
+    def stamp_ns(self, tick: int) -> int:
+        """Return the CLOCK_MONOTONIC of a tick on this machine, ns; in lockstep its simulated time."""
+        return self.time_ns(tick) if self.is_lockstep else self._clock.time_of(tick)
+
+    def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:
+        """Return the tick here at which a message was written there, at most `tick`, now.
+
+        Until the other clock has been compared with ours it counts as written now.
+        """
+        if self.is_lockstep:
+            return min(tick, head.time_ns // self._clock_ns)
+        if peer.offset_ns is None:
+            return tick
+        here_ns = head.stamp_ns - peer.offset_ns
+        return min(tick, (here_ns - self._clock.time_of(0)) // self._clock.period_ns)
