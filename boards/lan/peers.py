@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from rack.boards.lan.messages import Presence
+from rack.levels.peer import Presence
 
 NONE = 0
 

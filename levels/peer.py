@@ -1,0 +1,41 @@
+"""What a rack knows of another one on the network: the mailbox `lan.peer_<rack>` of its adapter, for levels to read.
+
+A level that works together with another rack reads it with `Input(PEER, "lan.peer_<rack>")`: whether that rack is there,
+and how its simulated time lies next to ours.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from rack.backplane.message import Field, MessageType
+
+
+class Presence(IntEnum):
+    """Where another rack is."""
+
+    AWAITED = 0  # not seen yet
+    THERE = 1
+    LOST = 2
+
+
+PEER = MessageType(
+    "peer",
+    1,
+    (
+        Field("presence", "u1", Presence, "awaited, there or lost"),
+        Field("launches", "u4", "1", "its launches seen so far: a number above 1 means restarts"),
+        Field("losses", "u4", "1", "how often it was lost"),
+        Field("since", "i8", "tick", "since when it is there, or lost"),
+        Field("offset", "f8", "s", "its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"),
+        Field("uncertainty", "f8", "s", "largest error of the offset; -1: not measured yet; 0 in lockstep"),
+        Field("round_trip", "f8", "s", "shortest recent round trip; -1: not measured yet; 0 in lockstep"),
+        Field("ahead", "f8", "s", "its simulated time less that of this rack, at the same instant"),
+        Field("speed", "f8", "1", "its simulated seconds in a real one"),
+    ),
+)
+
+
+def peer_port(rack: str) -> str:
+    """Return the adapter's port for a rack: names of mailboxes have no hyphens."""
+    return f"peer_{rack.replace('-', '_')}"
