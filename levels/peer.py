@@ -1,7 +1,7 @@
 """What a rack knows of another one on the network: the mailbox `lan.peer_<rack>` of its adapter, for levels to read.
 
-A level that works together with another rack reads it with `Input(PEER, "lan.peer_<rack>")`: whether that rack is there,
-and how its simulated time lies next to ours.
+A level that works together with another rack reads it with `Input(PEER, "lan.peer_<rack>")`: whether that rack is
+there, and how its simulated time lies next to ours.
 """
 
 from __future__ import annotations

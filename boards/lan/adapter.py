@@ -22,9 +22,10 @@ from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import LanLink
-from rack.boards.lan.messages import peer_port, status_of
+from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
+from rack.levels.peer import PEER, peer_port
 from rack.levels.tables import read_params
 
 
@@ -36,8 +37,7 @@ class LanAdapter(Adapter):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._table = read_params(LanParams, context.params)
-        racks = dict.fromkeys([*(entry.rack for entry in self._table.imports.values()), *self._table.peers])
-        self._peers = Peers(racks)
+        self._peers = Peers(self._table.racks)
         self._exports: dict[str, Export] = {}
         self._imports: dict[str, Import] = {}
         self._link: LanLink | None = None
@@ -56,10 +56,10 @@ class LanAdapter(Adapter):
                 outputs[port] = Output(entry.message_type(), max_age_s=entry.max_age_ms * 1e-3)
             except LookupError:
                 continue
-        peers = dict.fromkeys([*(entry.rack for entry in table.imports.values()), *table.peers])
-        status = Output(status_of(table.exports, table.imports, peers))
         is_whole = len(known) == len(table.exports) and len(outputs) == len(table.imports)
-        return MadePorts(inputs, {**outputs, STATUS: status}, is_whole)
+        outputs |= {peer_port(rack): Output(PEER) for rack in table.racks}
+        outputs[STATUS] = Output(status_of(table.exports, table.imports))
+        return MadePorts(inputs, outputs, is_whole)
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
         """Take the segment: its grid, and the mailboxes to exchange."""
@@ -93,20 +93,20 @@ class LanAdapter(Adapter):
         for port, entry in self._imports.items():
             if self._is_due(self._table.imports[port].rate_hz, cycle):
                 entry.exchange(getattr(write, port), self._grid, tick)
-        self._report(write.status, tick)
+        self._report(write, tick)
 
     def _is_due(self, rate_hz: float, cycle: int) -> bool:
         return cycle % max(1, round(1.0 / (rate_hz * self.context.period_s))) == 0
 
-    def _report(self, status: Message, tick: int) -> None:
+    def _report(self, write: Ports, tick: int) -> None:
+        status: Message = write.status
         for port, export in self._exports.items():
             export.fill(getattr(status, f"export_{port}"))
         for port, entry in self._imports.items():
             entry.fill(getattr(status, f"import_{port}"), self._grid, tick)
         for peer in self._peers:
-            group = getattr(status, peer_port(peer.rack))
-            group["presence"], group["launches"], group["losses"] = peer.presence, peer.launches, peer.losses
-            group["since"] = peer.since
+            out = getattr(write, peer_port(peer.rack))
+            out.presence, out.launches, out.losses, out.since = peer.presence, peer.launches, peer.losses, peer.since
         absent = [peer.rack for peer in self._peers if not peer.is_there]
         status.state = State.HOLDING if absent else State.EXECUTING
         status.reason = f"rack '{absent[0]}' is not there" if absent else ""

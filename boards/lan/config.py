@@ -86,11 +86,14 @@ class LanTable(Table):
         description="what others may do besides exchanging mailboxes, by name; watch: read status and signals; "
         "command: command levels; stop: set the emergency stop",
     )
-    most_bytes: int = Field(
-        16_384, ge=64, le=1 << 20, description="length of the longest message taken from the network; bytes"
-    )
+    most_bytes: int = Field(16_384, ge=64, le=1 << 20, description="length of the longest message taken; bytes")
     exports: dict[PortName, ExportConfig] = Field({}, alias="export", description="mailboxes that others may import")
     imports: dict[PortName, ImportConfig] = Field({}, alias="import", description="mailboxes of other racks, by port")
+
+    @property
+    def racks(self) -> tuple[str, ...]:
+        """The racks with which this one works: those from which it imports, and `peers`."""
+        return tuple(dict.fromkeys([*(entry.rack for entry in self.imports.values()), *self.peers]))
 
 
 class LanParams(LanTable):
