@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from rack.boards.lan.config import LanTable
-from rack.boards.lan.keys import ALL_ALIVE, any_alive, ask_keys, out_key, ping_key, pong_key, step_key
+from rack.boards.lan.config import LanTable, Right
+from rack.boards.lan.keys import ALL_ALIVE, ASKED, any_alive, ask_keys, out_key, ping_key, pong_key, step_key
 
 IN, OUT = ("ingress",), ("egress",)
 SUBSCRIBE, PUT, TOKEN = ("declare_subscriber",), ("put",), ("liveliness_token",)
@@ -21,7 +21,7 @@ ANYONE = "*"
 """Subject of rules for everyone; no rack may have this name."""
 
 
-class Rule(NamedTuple):
+class Permission(NamedTuple):
     """Messages of some kinds under some keys, in one direction, that are allowed."""
 
     flows: Sequence[str]
@@ -31,7 +31,7 @@ class Rule(NamedTuple):
 
 def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
     """Return zenoh's `access_control` for rack `own`; `asks`: it asks racks, and they may answer."""
-    by_subject: dict[str, list[Rule]] = {}
+    by_subject: dict[str, list[Permission]] = {}
     if asks:
         by_subject[ANYONE] = list(_asking(own))
     if not table.has_tls:
@@ -45,53 +45,54 @@ def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
     return _configured(by_subject)
 
 
-def _exchange(own: str, peer: str, table: LanTable) -> Iterator[Rule]:
+def _exchange(own: str, peer: str, table: LanTable) -> Iterator[Permission]:
     """Yield the rules for a rack with which this one exchanges mailboxes."""
     imports = [out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer]
     exports = [out_key(own, entry.source) for entry in table.exports.values()]
     taken = [*imports, step_key(peer), ping_key(peer, own), pong_key(peer, own)]
     given = [*exports, step_key(own), ping_key(own, peer), pong_key(own, peer)]
-    yield Rule(OUT, SUBSCRIBE, taken)
-    yield Rule(IN, PUT, taken)
+    yield Permission(OUT, SUBSCRIBE, [*taken, ping_key("*", own), pong_key("*", own)])
+    yield Permission(IN, PUT, taken)
+    yield Permission(IN, SUBSCRIBE, [ping_key("*", peer), pong_key("*", peer)])
     yield from _shown(own, given)
-    yield Rule(OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)])
-    yield Rule(IN, TOKEN, [any_alive(peer)])
+    yield Permission(OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)])
+    yield Permission(IN, TOKEN, [any_alive(peer)])
 
 
-def _shown(own: str, keys: Sequence[str]) -> Iterator[Rule]:
+def _shown(own: str, keys: Sequence[str]) -> Iterator[Permission]:
     """Yield the rules for keys to which others may subscribe."""
     if keys:
-        yield Rule(IN, SUBSCRIBE, keys)
-        yield Rule(OUT, PUT, keys)
+        yield Permission(IN, SUBSCRIBE, keys)
+        yield Permission(OUT, PUT, keys)
     yield from _visible(own)
 
 
-def _visible(own: str) -> Iterator[Rule]:
+def _visible(own: str) -> Iterator[Permission]:
     """Yield the rules for others that may know that this rack is there."""
-    yield Rule(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(own)])
-    yield Rule(OUT, TOKEN, [any_alive(own)])
+    yield Permission(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(own)])
+    yield Permission(OUT, TOKEN, [any_alive(own)])
 
 
-def _answering(own: str, peer: str, rights: Iterable[str]) -> Iterator[Rule]:
+def _answering(own: str, peer: str, rights: Iterable[Right]) -> Iterator[Permission]:
     """Yield the rules for questions of a peer."""
-    keys = [ask_keys(own, right, peer) for right in rights]
+    keys = [ask_keys(own, ASKED[right], peer) for right in rights]
     if keys:
-        yield Rule(OUT, ("declare_queryable",), [ask_keys(own)])
-        yield Rule(IN, ("query",), keys)
-        yield Rule(OUT, ("reply",), keys)
+        yield Permission(OUT, ("declare_queryable",), [ask_keys(own)])
+        yield Permission(IN, ("query",), keys)
+        yield Permission(OUT, ("reply",), keys)
 
 
-def _asking(own: str) -> Iterator[Rule]:
+def _asking(own: str) -> Iterator[Permission]:
     """Yield the rules for questions to any rack."""
     asked = [ask_keys("*", "*", own)]
-    yield Rule(IN, ("declare_queryable",), [ask_keys("*")])
-    yield Rule(OUT, ("query",), asked)
-    yield Rule(IN, ("reply",), asked)
-    yield Rule(OUT, WATCH_TOKENS, [ALL_ALIVE])
-    yield Rule(IN, TOKEN, [ALL_ALIVE])
+    yield Permission(IN, ("declare_queryable",), [ask_keys("*")])
+    yield Permission(OUT, ("query",), asked)
+    yield Permission(IN, ("reply",), asked)
+    yield Permission(OUT, WATCH_TOKENS, [ALL_ALIVE])
+    yield Permission(IN, TOKEN, [ALL_ALIVE])
 
 
-def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
+def _configured(by_subject: dict[str, list[Permission]]) -> dict[str, Any]:
     rules, policies = [], []
     for subject, allowed in by_subject.items():
         ids = [f"{subject}-{at}" for at in range(len(allowed))]

@@ -4,14 +4,20 @@
     rack/R/out/<board>/<port>      an exported mailbox
     rack/R/step                    lockstep: the end of a cycle of R's adapter
     rack/R/ping/<to>, .../pong/<to>   round trips between clocks
-    rack/R/ask/<right>/<from>/<what>  a question to R, answered in its adapter's cycles, to whom has the right
+    rack/R/ask/<what>/<from>       a question to R, answered in its adapter's cycles to those who have the right
 
 All begin with a rack's name, so that access control can hold each rack to its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from rack.boards.lan.config import Right
+
 ALL_ALIVE = "rack/*/alive/*"
+ASKED: Mapping[Right, str] = {"watch": "read", "command": "command", "stop": "stop"}
+"""What those may ask who have a right, as in its key."""
 
 
 def out_key(rack: str, mailbox: str) -> str:
@@ -44,11 +50,6 @@ def pong_key(rack: str, to: str) -> str:
     return f"rack/{rack}/pong/{to}"
 
 
-def ask_key(rack: str, right: str, asker: str, what: str) -> str:
-    """Return the key expression of a question to a rack; `right` is what the asker needs there, as in `permit`."""
-    return f"rack/{rack}/ask/{right}/{asker}/{what}"
-
-
-def ask_keys(rack: str, right: str = "", asker: str = "") -> str:
-    """Return the key expression of all questions to a rack, or those that one asker may ask with a right."""
-    return f"rack/{rack}/ask/{right}/{asker}/**" if asker else f"rack/{rack}/ask/**"
+def ask_keys(rack: str, what: str = "", asker: str = "") -> str:
+    """Return the key expression of all questions to a rack, or of those of one asker about one thing."""
+    return f"rack/{rack}/ask/{what}/{asker}/**" if asker else f"rack/{rack}/ask/**"

@@ -27,8 +27,8 @@ KEEP_ALIVES = 4
 """Signs of life within a lease."""
 HANDSHAKE_MS = 2000
 """Longest time to open a connection."""
-ANSWER_BYTES = 65_536
-"""Length of the longest answer to a question."""
+MOST_ANSWER = 65_536 + 1024
+"""Length of the longest answer to a question: 64 KiB, and what says what they are."""
 ZENOH_BYTES = 1024
 """What zenoh adds to the content of a message, at most: key expression, lengths, options."""
 
@@ -64,7 +64,8 @@ class LanLink:
         self.rack = rack
         credentials = None if table.certificates is None else Credentials(Path(table.certificates), rack)
         try:
-            self.sealer = Sealer(credentials.secret if credentials else b"", table.most_bytes)
+            most = MOST_ANSWER if asks else table.most_bytes
+            self.sealer = Sealer(credentials.secret if credentials else b"", most)
             """Seals and opens what this rack sends and receives."""
             self.session = zenoh.open(_settings(rack, table, credentials, asks))
         except zenoh.ZError as error:
@@ -188,7 +189,7 @@ def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks:
     # Whoever opens a connection and says no more is forgotten; these many at once are borne.
     put("transport/unicast/accept_timeout", HANDSHAKE_MS)
     put("transport/unicast/open_timeout", HANDSHAKE_MS)
-    put("transport/link/rx/max_message_size", max(table.most_bytes, ANSWER_BYTES) + HEAD_BYTES + ZENOH_BYTES)
+    put("transport/link/rx/max_message_size", max(table.most_bytes, MOST_ANSWER) + HEAD_BYTES + ZENOH_BYTES)
     put("transport/link/tx/lease", round(table.lease_ms))
     put("transport/link/tx/keep_alive", KEEP_ALIVES)
     put("transport/link/tx/queue/size/real_time", 16)
