@@ -30,8 +30,8 @@ RECENT = 32
 PING_NS, EAGER_NS = 500_000_000, 20_000_000
 """Time between two pings to a rack; the second before `EAGER` round trips have come back, to know it soon."""
 EAGER = 8
-UNANSWERED = 8
-"""Newest pings to a rack whose answer still counts."""
+UNANSWERED = 64
+"""Newest pings to a rack whose answers still count: the round trip may take more than a second."""
 ANSWER_NS = 5_000_000
 """Shortest time between two answers to one rack: a flood of pings is not answered by one of pongs."""
 MOST_ASKERS = 1024
@@ -191,7 +191,7 @@ class Clocks:
         self._rack, self._launch, self._grid = segment.rack, launch, grid
         self._clocks = {peer.rack: PeerClock(peer) for peer in peers}
         self._arrived: deque[Pong] = deque(maxlen=UNREAD)
-        self._serial = self.refused = 0
+        self._serial = self.taken = self.refused = 0
         self._now_ns = 0
         self.responder = Responder(segment, launch)
 
@@ -219,7 +219,8 @@ class Clocks:
         for clock in self._clocks.values():
             clock.begin()
         for _ in range(len(self._arrived)):
-            self.refused += not self._is_taken(self._arrived.popleft())
+            is_taken = self._is_taken(self._arrived.popleft())
+            self.taken, self.refused = self.taken + is_taken, self.refused + (not is_taken)
         self._now_ns = now = monotonic_ns()
         for rack, clock in self._clocks.items():
             if clock.peer.is_there and now >= clock.due_ns:
@@ -255,7 +256,7 @@ class Clocks:
     def count(self, record: Any) -> None:
         """Write the counts into the group of a status."""
         answering = self.responder
-        record[...] = (answering.answered, answering.withheld, answering.refused + self.refused)
+        record[...] = (self.taken, answering.answered, answering.withheld, answering.refused + self.refused)
 
     def fill(self, out: Any, rack: str, tick: int) -> None:
         """Write what is known of a rack's clock into its mailbox: see `rack.levels.peer`."""

@@ -34,6 +34,7 @@ CLOCKS = MessageType(
     "lan_clocks",
     1,
     (
+        Field("taken", "u4", "1", "round trips measured"),
         Field("answered", "u4", "1", "pings of other racks answered"),
         Field("withheld", "u4", "1", "pings not answered: they came too fast, or from too many racks"),
         Field("refused", "u4", "1", "pings and answers refused: malformed, unsigned, or to nothing that was asked"),
