@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from struct import Struct
+from threading import Lock
 from time import monotonic_ns
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import LanLink
+from rack.boards.lan.link import Arrived, LanLink
 from rack.boards.lan.peers import NONE, PeerRack, Peers
 
 DRIFT_PPM = 100
@@ -103,15 +104,6 @@ class ClockOffset:
         self.best = None
 
 
-class Pong(NamedTuple):
-    """An answer as it arrived."""
-
-    arrived_ns: int
-    key: str
-    envelope: bytes | None
-    payload: bytes
-
-
 @dataclass
 class PeerClock:
     """The clock of one rack, and its grid: CLOCK_MONOTONIC of its tick 0, 0 before that; its period; simulated time."""
@@ -139,11 +131,6 @@ class PeerClock:
         return max(0, stamp_ns - self.epoch_ns) * self.clock_ns // self.period_ns if self.epoch_ns else 0
 
 
-def envelope_of(sample: Any) -> bytes | None:
-    """Return the envelope of what has come, if it has one."""
-    return None if sample.attachment is None else sample.attachment.to_bytes()
-
-
 class Responder:
     """Answers the pings of other racks from the network's threads, each rack's at a bounded rate."""
 
@@ -152,27 +139,30 @@ class Responder:
         self._clock_ns = segment.layout.clock_ns
         self._put: dict[str, Any] = {}
         self._again: dict[str, int] = {}
+        self._lock = Lock()
         self.answered = self.withheld = self.refused = 0
 
     def open(self, link: LanLink, sealer: Sealer) -> None:
         """Answer from now on."""
         self._link, self._sealer = link, sealer
-        link.session.declare_subscriber(f"rack/*/ping/{self._rack}", self._on_ping)
+        link.on(f"rack/*/ping/{self._rack}", self._on_ping)
 
-    def _on_ping(self, sample: Any) -> None:
+    def _on_ping(self, ping: Arrived) -> None:
         received = monotonic_ns()
-        key = str(sample.key_expr)
-        asker = key.split("/")[1]
-        if received < self._again.get(asker, 0) or (asker not in self._again and len(self._again) == MOST_ASKERS):
-            self.withheld += 1
-            return
-        head = self._sealer.opened(key, envelope_of(sample), sample.payload.to_bytes())
-        if isinstance(head, Flaw) or head.kind != _PING_KIND:
-            self.refused += 1
-            return
-        self._again[asker] = received + ANSWER_NS
-        self.answered += 1
-        self._answer(asker, head, received)
+        asker = ping.key.split("/")[1]
+        # Each link of the network has its own thread.
+        with self._lock:
+            again = self._again.get(asker)
+            if received < (again or 0) or (again is None and len(self._again) == MOST_ASKERS):
+                self.withheld += 1
+                return
+            head = self._sealer.opened(ping.key, ping.envelope, ping.payload)
+            if isinstance(head, Flaw) or head.kind != _PING_KIND:
+                self.refused += 1
+                return
+            self._again[asker] = received + ANSWER_NS
+            self.answered += 1
+            self._answer(asker, head, received)
 
     def _answer(self, asker: str, ping: Envelope, received: int) -> None:
         key, words = f"rack/{self._rack}/pong/{asker}", self._words
@@ -190,8 +180,10 @@ class Clocks:
     def __init__(self, segment: Segment, peers: Peers, launch: int, grid: OwnGrid) -> None:
         self._rack, self._launch, self._grid = segment.rack, launch, grid
         self._clocks = {peer.rack: PeerClock(peer) for peer in peers}
-        self._arrived: deque[Pong] = deque(maxlen=UNREAD)
-        self._serial = self.taken = self.refused = 0
+        self._arrived: deque[tuple[int, Arrived]] = deque(maxlen=UNREAD)
+        self.taken = self.refused = 0
+        # Of no ping that an adapter before this one may have sent.
+        self._serial = monotonic_ns()
         self._now_ns = 0
         self.responder = Responder(segment, launch)
 
@@ -201,16 +193,13 @@ class Clocks:
             return
         self._sealer = sealer
         self.responder.open(link, sealer)
-        link.session.declare_subscriber(f"rack/*/pong/{self._rack}", self._on_pong)
+        # A tuple is whole or not there: no lock is needed.
+        link.on(f"rack/*/pong/{self._rack}", lambda pong: self._arrived.append((monotonic_ns(), pong)))
         for rack, clock in self._clocks.items():
             clock.put = link.publish(self._ping_key(rack))
 
     def _ping_key(self, to: str) -> str:
         return f"rack/{self._rack}/ping/{to}"
-
-    def _on_pong(self, sample: Any) -> None:
-        arrived = monotonic_ns()
-        self._arrived.append(Pong(arrived, str(sample.key_expr), envelope_of(sample), sample.payload.to_bytes()))
 
     def exchange(self) -> None:
         """Take the answers that have come, and ask again where it is time."""
@@ -219,7 +208,7 @@ class Clocks:
         for clock in self._clocks.values():
             clock.begin()
         for _ in range(len(self._arrived)):
-            is_taken = self._is_taken(self._arrived.popleft())
+            is_taken = self._is_taken(*self._arrived.popleft())
             self.taken, self.refused = self.taken + is_taken, self.refused + (not is_taken)
         self._now_ns = now = monotonic_ns()
         for rack, clock in self._clocks.items():
@@ -238,7 +227,7 @@ class Clocks:
         head = Envelope(_PING_KIND, self._launch, self._serial, self._serial, 0, 0, sent)
         clock.put(b"", self._sealer.seal(self._ping_key(rack), head, b""))
 
-    def _is_taken(self, pong: Pong) -> bool:
+    def _is_taken(self, arrived_ns: int, pong: Arrived) -> bool:
         """Take an answer; return False for one that is damaged, or to nothing that was asked."""
         head = self._sealer.opened(pong.key, pong.envelope, pong.payload)
         if isinstance(head, Flaw) or head.kind != _PONG_KIND or len(pong.payload) != _PONG.size:
@@ -248,7 +237,7 @@ class Clocks:
         if clock is None or launch != self._launch or head.launch != clock.peer.launch or min(period, clock_ns) < 1:
             return False
         sent = clock.sent.pop(head.serial, None)
-        if sent is None or not clock.offset.add(RoundTrip(sent, received, head.stamp_ns, pong.arrived_ns)):
+        if sent is None or not clock.offset.add(RoundTrip(sent, received, head.stamp_ns, arrived_ns)):
             return False
         clock.epoch_ns, clock.period_ns, clock.clock_ns = epoch, period, clock_ns
         return True

@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -36,6 +35,7 @@ from rack.boards.lan.clocks import (
 )
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
+from rack.boards.lan.link import Arrived
 from rack.boards.lan.peers import PeerRack
 from rack.tools.runs.window import free_port
 from tests.boards.lan.clock_machine import CLOCK_NS, PERIOD_NS
@@ -154,17 +154,17 @@ class Answers:
 
     def __init__(self) -> None:
         self.sent: list[str] = []
-        self.session = SimpleNamespace(declare_subscriber=lambda key, callback: None)
+
+    def on(self, key: str, callback: Any) -> None:
+        """Bring nothing: the tests do."""
 
     def publish(self, key: str) -> Any:
         return lambda payload, envelope: self.sent.append(key)
 
 
-def ping(asker: str, sealer: Sealer, to: str) -> Any:
+def ping(asker: str, sealer: Sealer, to: str) -> Arrived:
     key = f"rack/{asker}/ping/{to}"
-    envelope = sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b"")
-    content = SimpleNamespace(to_bytes=lambda: b"")
-    return SimpleNamespace(key_expr=key, payload=content, attachment=SimpleNamespace(to_bytes=lambda: envelope))
+    return Arrived(key, sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b""), b"")
 
 
 def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
