@@ -363,7 +363,7 @@ def lan(
         list[float] | None,
         typer.Option("--rate", metavar="HZ", min=0.2, max=50.0, help="rate; may be given several times"),
     ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 4.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 3.0,
     rounds: Rounds = 1,
     loss: Annotated[
         float, typer.Option(metavar="SHARE", min=0.0, max=0.2, help="share of packets lost, as in 0.01")
@@ -374,8 +374,8 @@ def lan(
     """Measure racks that exchange messages over a network.
 
     A coordinator exchanges with 1 to 32 racks at 1, 10 and 50 Hz, each on a machine of its own: network namespaces,
-    made for this and removed afterwards (root only). By turns with the network link of a rack: bare UDP, and the DDS
-    `cyclonedds`. A rack seals its messages and sees who is there; UDP does neither.
+    made for this and removed afterwards (root only). By turns with the network link of a rack, with TLS and without:
+    bare UDP, and the DDS `cyclonedds`. A rack seals its messages and sees who is there; UDP does neither.
 
     The output shows round trips, ages of messages when a cycle takes them, bytes a second on the coordinator's cable,
     and the time to see that a cable is pulled, plugged in again, or a process killed; also messages that never came,

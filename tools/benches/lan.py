@@ -17,7 +17,7 @@ from rack.tools.benches.cyclictest import CYCLICTEST, WakeGrid, absent_cyclictes
 from rack.tools.benches.lan_ends import COORDINATOR
 from rack.tools.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.benches.lan_group import HEAD_START_NS, Group
-from rack.tools.benches.lan_machine import ENDS
+from rack.tools.benches.lan_machine import ENDS, TCP, TLS
 from rack.tools.benches.network import Lab
 from rack.tools.console.progress import Progress
 
@@ -33,7 +33,7 @@ LAUNCH_S = 0.7
 DISTURBED_HZ, ENDLESS = 10.0, 1_000_000
 """Rate of the exchange meanwhile, and a number of cycles that nobody waits for."""
 WITHOUT_LIVELINESS = ("UDP",)
-PACKAGES = {"rack": "zenoh", "cyclonedds": "cyclonedds"}
+PACKAGES = ((TLS, "cryptography"), (TLS, "zenoh"), (TCP, "zenoh"), ("cyclonedds", "cyclonedds"))
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class LanRuns:
 
     counts: Sequence[int] = COUNTS
     rates_hz: Sequence[float] = RATES_HZ
-    seconds: float = 4.0
+    seconds: float = 3.0
     rounds: int = 1
     loss: float = 0.0
 
 
 def measure(runs: LanRuns, progress: Progress) -> LanFigures:
     """Measure every contestant at each number of racks, by turns. Raises `Failure`."""
-    absent = [one for who, package in PACKAGES.items() if (one := absent_package(who, package))]
+    absent = [one for who, package in PACKAGES if (one := absent_package(who, package))]
     contestants = [who for who in ENDS if who not in [one.who for one in absent]]
     if lacks := absent_cyclictest():
         absent.append(lacks)

@@ -13,11 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-import zenoh
-
-from rack.boards.lan.config import LanTable
-from rack.boards.lan.envelope import Envelope, Flaw, Sealer
-from rack.boards.lan.link import Arrived, LanLink, out_key
 
 COORDINATOR = 0
 ORDER_BYTES, STATUS_BYTES = 1024, 256
@@ -34,16 +29,21 @@ Notice = Callable[[int, bool], None]
 
 @dataclass(frozen=True)
 class Place:
-    """Where an end is: on which machine, and the addresses of all."""
+    """Where an end is: on which machine, and the addresses of all. `certificates`: a folder; empty: without TLS."""
 
     machine: int
     addresses: tuple[str, ...]
-    certificates: str = ""
+    certificates: str
 
     @property
     def others(self) -> tuple[int, ...]:
         """The machines that this one exchanges messages with."""
         return tuple(range(1, len(self.addresses))) if self.machine == COORDINATOR else (COORDINATOR,)
+
+
+def rack_name(machine: int) -> str:
+    """Return the name of the rack on a machine."""
+    return f"r{machine}"
 
 
 class End(Protocol):
@@ -59,64 +59,6 @@ class End(Protocol):
 
     def taken(self) -> Iterator[tuple[int, bytes]]:
         """Yield what has come since the last call: from which machine, and the content."""
-
-
-class RackEnd:
-    """The link of a rack's network adapter, with its envelopes and seals."""
-
-    def __init__(self, place: Place, notice: Notice, take: Take | None) -> None:
-        protocol = "tls" if place.certificates else "tcp"
-        table = {
-            "listen" if place.machine == COORDINATOR else "connect": [
-                f"{protocol}/{place.addresses[COORDINATOR]}:{PORT}"
-            ],
-            "lease_ms": LEASE_MS,
-            "certificates": place.certificates or None,
-            "insecure": not place.certificates,
-        }
-        self._link = link = LanLink(_rack(place.machine), LanTable.model_validate(table))
-        self._sealer, self._number = Sealer(), 0
-        keys = {other: _key(place.machine, other) for other in place.others}
-        self._puts = {other: (key, link.publish(key)) for other, key in keys.items()}
-        self._from = {_key(other, place.machine): other for other in place.others}
-        self._arrived = [link.subscribe(key, UNREAD) for key in self._from if take is None]
-        if take is not None:
-            for key in self._from:
-                link.on(key, lambda arrived: take(*self._opened(arrived)))
-        racks = {_rack(other): other for other in place.others}
-
-        def see(sample: zenoh.Sample) -> None:
-            rack = str(sample.key_expr).split("/")[1]
-            if rack in racks:
-                notice(racks[rack], sample.kind == zenoh.SampleKind.PUT)
-
-        self._alive = link.session.liveliness().declare_subscriber("rack/*/alive/*", see, history=True)
-        link.declare_alive(place.machine)
-
-    def _opened(self, arrived: Arrived) -> tuple[int, bytes]:
-        head = self._sealer.opened(arrived.key, arrived.envelope, arrived.payload)
-        if isinstance(head, Flaw):
-            raise RuntimeError(f"{arrived.key}: {head.name.lower()}")
-        return self._from[arrived.key], arrived.payload
-
-    def send(self, to: int, content: bytes) -> None:
-        """Seal and send a message to a machine."""
-        self._number += 1
-        key, put = self._puts[to]
-        put(content, self._sealer.seal(key, Envelope(0, 0, self._number, self._number, 0, 0, 0), content))
-
-    def taken(self) -> Iterator[tuple[int, bytes]]:
-        """Yield what has come since the last call."""
-        for arrived in self._arrived:
-            yield from map(self._opened, arrived())
-
-
-def _rack(machine: int) -> str:
-    return f"r{machine}"
-
-
-def _key(writer: int, reader: int) -> str:
-    return out_key(_rack(writer), f"task.for_{_rack(reader)}")
 
 
 class UdpEnd:

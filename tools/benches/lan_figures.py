@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 BASELINES = {"round trip": "UDP", "age": "UDP", "on the wire": "UDP"}
 """Whom the others are compared with; in all else, with cyclonedds."""
-COLOURS = {"rack": "#4477aa", "UDP": "#222222", "cyclonedds": "#ccbb44"}
+COLOURS = {"rack, TLS": "#4477aa", "rack, TCP": "#66ccee", "UDP": "#222222", "cyclonedds": "#ccbb44"}
 TITLE = (
     f"a coordinator sends an order of {ORDER_BYTES} B to every rack, and each of these a status of {STATUS_BYTES} B; "
     f"lease {LEASE_MS} ms"

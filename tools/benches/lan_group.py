@@ -6,16 +6,17 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from subprocess import PIPE
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory, TemporaryFile
 from types import TracebackType
 from typing import Any, Self
 
 from rack.backplane.process import readable
-from rack.tools.benches.lan_ends import COORDINATOR, Place
-from rack.tools.benches.lan_machine import ANSWER_S, FIND_S, Found, Task, Window
+from rack.tools.benches.lan_ends import COORDINATOR, Place, rack_name
+from rack.tools.benches.lan_machine import ANSWER_S, FIND_S, TLS, Found, Task, Window
 from rack.tools.benches.network import Lab
 from rack.tools.console.answer import Failure
 
@@ -34,9 +35,19 @@ class Group:
     def __init__(self, lab: Lab, who: str, echoes: bool, priority: int) -> None:
         self.lab, self.who, self.racks = lab, who, len(lab) - 1
         addresses = tuple(lab.address(machine) for machine in range(len(lab)))
-        self._tasks = [Task(who, Place(machine, addresses), echoes, priority) for machine in range(len(lab))]
+        self._folder = TemporaryDirectory(prefix="rack-bench-")
+        certificates = self._certificates(addresses) if who == TLS else ""
+        places = [Place(machine, addresses, certificates) for machine in range(len(lab))]
+        self._tasks = [Task(who, place, echoes, priority) for place in places]
         self._members: list[_Member] = []
         self.false_deaths = 0
+
+    def _certificates(self, addresses: Sequence[str]) -> str:
+        from rack.tools.lan.certificates import make_credentials
+
+        names = {rack_name(machine): [address] for machine, address in enumerate(addresses)}
+        make_credentials(Path(self._folder.name), names, days=1)
+        return self._folder.name
 
     def __enter__(self) -> Self:
         try:
@@ -58,6 +69,7 @@ class Group:
     def _end(self) -> None:
         for member in self._members:
             member.end()
+        self._folder.cleanup()
 
     @property
     def _coordinator(self) -> _Member:

@@ -20,8 +20,10 @@ from typing import Any
 from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.tools.benches.lan_ends import COORDINATOR, ORDER_BYTES, STATUS_BYTES, End, Place
 
+TLS, TCP = "rack, TLS", "rack, TCP"
 ENDS = {
-    "rack": "rack.tools.benches.lan_ends:RackEnd",
+    TLS: "rack.tools.benches.lan_link:RackEnd",
+    TCP: "rack.tools.benches.lan_link:RackEnd",
     "UDP": "rack.tools.benches.lan_ends:UdpEnd",
     "cyclonedds": "rack.tools.benches.lan_dds:DdsEnd",
 }
