@@ -16,7 +16,8 @@ from rack.boards.lan.config import ExportConfig, ImportConfig
 from rack.boards.lan.counts import ImportCount, MessageOrder
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import UNREAD, Arrived, LanLink, out_key
+from rack.boards.lan.keys import out_key
+from rack.boards.lan.link import UNREAD, Arrived, LanLink
 from rack.boards.lan.peers import NONE, PeerRack
 
 NEVER = -1
