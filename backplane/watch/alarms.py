@@ -29,6 +29,10 @@ RECORD = np.dtype(
 )
 
 
+PEER = -2
+"""Subject of a demand on the arm that the loss of another rack makes."""
+
+
 class Alarm(IntEnum):
     """Kinds of alarms. In brackets: subject; value."""
 
@@ -37,7 +41,7 @@ class Alarm(IntEnum):
     FAULT_ENDS = 2  # [entry; times it acted]
     HANG = 3  # [task; releases missed]
     REJOINED = 4  # [task, -1: the clock itself; ticks it was away]
-    DEMAND = 5  # [task whose loss demands it, -1: the emergency stop or nobody; Demand]
+    DEMAND = 5  # [task whose loss demands it, PEER: another rack's, -1: the emergency stop or nobody; Demand]
     COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was issued
     # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release
@@ -73,6 +77,10 @@ class Alarm(IntEnum):
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
     MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
+    # Raised by the network adapter: other racks.
+    PEER_LOST = 60  # [number among the level's `names`; -]
+    PEER_BACK = 61  # [number; ticks it was away]  the same launch as before
+    PEER_RESTARTED = 62  # [number; ticks it was away]  another launch
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)

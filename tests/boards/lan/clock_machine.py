@@ -32,7 +32,7 @@ def main(name: str, other: str, table: str, trips: int) -> None:
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.EPOCH_NS] = epoch_ns = time.monotonic_ns()
     peers = Peers([other])
-    clocks = Clocks(segment, peers, epoch_ns, OwnGrid(segment))
+    clocks = Clocks(segment, peers, epoch_ns, OwnGrid(segment, 1))
     link = LanLink(name, LanTable.model_validate(json.loads(table)))
     try:
         clocks.open(link, Sealer())
