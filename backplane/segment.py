@@ -14,7 +14,7 @@ import stat
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import posix_ipc
 
@@ -29,6 +29,18 @@ VERSION = 11
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
+
+
+class Launch(NamedTuple):
+    """When a segment was made, ns: on the wall clock, and on CLOCK_MONOTONIC of its machine."""
+
+    created_ns: int
+    monotonic_ns: int
+
+    @property
+    def wall_offset_ns(self) -> int:
+        """Wall clock less CLOCK_MONOTONIC: one for the whole run, as the wall clock may be set meanwhile."""
+        return self.created_ns - self.monotonic_ns
 
 
 class Segment:
@@ -93,7 +105,7 @@ class Segment:
         self.words[Head.SIZE] = len(self.bytes)
         self.words[Head.LAUNCHER_PID] = os.getpid()
         self.words[Head.LAUNCHER_START] = start_time(os.getpid())
-        self.words[Head.CREATED_NS] = time.time_ns()
+        self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS] = time.time_ns(), time.monotonic_ns()
         # Last, so that no process attaches to half a segment.
         self.words[Head.MAGIC] = MAGIC
 
@@ -157,6 +169,11 @@ class Segment:
         """Return a task's control block, as words (`words.Block`). Raises `KeyError`."""
         start = self.map.blocks[task] // 8
         return self.words[start : start + max(Block) + 1]
+
+    @property
+    def launch(self) -> Launch:
+        """When it was made."""
+        return Launch(self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS])
 
     @property
     def launcher(self) -> int:

@@ -25,7 +25,6 @@ from rack.backplane.words import System
 from rack.boards.lan.clocks import (
     _PING_KIND,
     ANSWER_NS,
-    DRIFT_PPM,
     MOST_ASKERS,
     RECENT,
     ClockOffset,
@@ -37,6 +36,7 @@ from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import Arrived
 from rack.boards.lan.peers import PeerRack
+from rack.levels.peer import DRIFT_PPM
 from rack.tools.runs.window import free_port
 from tests.boards.lan.clock_machine import CLOCK_NS, PERIOD_NS
 
