@@ -169,6 +169,7 @@ class LevelContext:
     below: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level below, by name
     params: Mapping[str, Any] = field(default_factory=dict)  # `[board.<name>.params]`, as given
     phase: int = 0  # first tick of the level, less than `every`
+    rack: str = ""  # name of the rack
 
     @property
     def period_s(self) -> float:
