@@ -38,6 +38,19 @@ class Arrived(NamedTuple):
     payload: bytes
 
 
+class Question(NamedTuple):
+    """A question that has come. `reply` sends one answer, a payload and its envelope.
+
+    Several answers reach only those who ask with `ConsolidationMode.NONE`. The asker is done when the next question is
+    taken, or none is left.
+    """
+
+    key: str
+    envelope: bytes | None
+    payload: bytes
+    reply: Callable[[bytes, bytes], None]
+
+
 def out_key(rack: str, mailbox: str) -> str:
     """Return the key expression of an exported mailbox."""
     return f"rack/{rack}/out/{mailbox.replace('.', '/')}"
@@ -84,12 +97,37 @@ class LanLink:
             for _ in range(unread):
                 if (sample := take()) is None:
                     return
-                envelope = sample.attachment
-                yield Arrived(
-                    str(sample.key_expr), None if envelope is None else envelope.to_bytes(), sample.payload.to_bytes()
-                )
+                yield Arrived(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
 
         return arrived
+
+    def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
+        """Call a function in a thread of the network with everything that comes under a key expression, at once."""
+
+        def take(sample: zenoh.Sample) -> None:
+            callback(Arrived(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes()))
+
+        # Direct: a thread between would add its wake-up, and a queue without a bound.
+        self._kept.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False)))
+
+    def answer(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Question]]:
+        """Return a function that yields the questions asked under a key expression since the last call, oldest first.
+
+        A question under several keys at once is dropped unanswered.
+        """
+        queryable = self.session.declare_queryable(key, zenoh.handlers.RingChannel(unread))
+        self._kept.append(queryable)
+
+        def questions() -> Iterator[Question]:
+            for _ in range(unread):
+                if (query := queryable.try_recv()) is None:
+                    return
+                with query:
+                    asked, content = str(query.key_expr), _bytes_of(query.payload) or b""
+                    if "*" not in asked:
+                        yield Question(asked, _bytes_of(query.attachment), content, _reply(query))
+
+        return questions
 
     def declare_alive(self, launch: int) -> None:
         """Show others that this launch is there; after everything that they may send it."""
@@ -114,6 +152,14 @@ class LanLink:
     def close(self) -> None:
         """Leave the network: others see it at once."""
         self.session.close()  # type: ignore[no-untyped-call]
+
+
+def _bytes_of(content: zenoh.ZBytes | None) -> bytes | None:
+    return None if content is None else content.to_bytes()
+
+
+def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
+    return lambda payload, envelope: query.reply(query.key_expr, payload, attachment=envelope)
 
 
 def _settings(table: LanTable) -> zenoh.Config:
