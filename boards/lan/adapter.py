@@ -19,7 +19,6 @@ from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
 from rack.boards.lan.config import LanParams
 from rack.boards.lan.entries import Export, Import
-from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import LanLink
 from rack.boards.lan.messages import status_of
@@ -74,11 +73,10 @@ class LanAdapter(Adapter):
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
-        sealer = Sealer(most_bytes=self._table.most_bytes)
         for entry in self._imports.values():
-            entry.open(link, sealer)
+            entry.open(link, link.sealer)
         for export in self._exports.values():
-            export.open(link, sealer, self._grid.is_lockstep)
+            export.open(link, link.sealer, self._grid.is_lockstep)
         self._peers.watch(link.watch_alive())
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch)
