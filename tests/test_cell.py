@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from rack.backplane.message import State
+from rack.boards.config import CONFIGS, load, resolve
+from rack.boards.errors import ConfigError
 from rack.levels.messages import Error
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
@@ -54,3 +57,66 @@ def test_the_k1607_with_its_hand_transfers_the_part() -> None:
     np.testing.assert_allclose(rack.read("world.model").position[0], HAND_OVER, atol=2e-3)
     servo = rack.read("servo.status")
     assert servo.touches == servo.violations == servo.clipped == 0
+
+
+TWO_SHARED = """
+extends = ["{puma}"]
+
+[board.servo.reads]
+others = ["lan.shared", "lan.third"]
+
+[adapter.lan.import.third]
+from = "cell-other/servo.shared"
+type = "rack.levels.shared_bodies:SHARED_BODIES"
+rate_hz = 50
+max_age_ms = 200
+"""
+
+
+def test_a_rack_may_share_with_several_others(tmp_path: Path) -> None:
+    (tmp_path / "three.toml").write_text(TWO_SHARED.format(puma=CONFIGS / "cell" / "puma.toml"))
+    servo = next(task for task in resolve(load(tmp_path / "three.toml")).tasks if task.task == "servo")
+    assert servo.inputs["others"] == {"lan.shared": "lan.shared", "lan.third": "lan.third"}
+
+
+MISTAKES = {
+    "unknown": (
+        'board.servo.params.shared=["prt"]',
+        'board.servo.params.shared = "prt": not in the scene; objects: part',
+    ),
+    "twice": (
+        'board.servo.params.shared=["part", "part"]',
+        'board.servo.params.shared = "part": named twice',
+    ),
+    "none": ("board.servo.params.shared=[]", "should have at least 1 item"),
+    "too many": (
+        'board.servo.params.shared=["a", "b", "c", "d", "e"]',
+        "should have at most 4 items",
+    ),
+    "no copies": (
+        "board.servo.params.arm=rack.levels.arm:SimulatedArm",
+        "the arm shares no objects; permitted: rack.levels.arm.sharing:SharingArm",
+    ),
+    "from nowhere": ("board.servo.reads.others=lan.shred", '"lan.shred": no task writes it'),
+    "of another type": ("board.servo.reads.others=servo.scene", "carries scene 1; the port needs shared_bodies 1"),
+    "without sharing": (
+        "board.servo.executor=rack.levels.servo:ServoExecutor",
+        "board.servo.params.shared",
+    ),
+}
+
+
+@pytest.mark.parametrize(("setting", "line"), MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_about_shared_bodies_are_named(setting: str, line: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        resolve(load(CONFIGS / "cell" / "puma.toml", [setting]))
+    assert line in str(error.value)
+
+
+def test_an_obstacle_cannot_be_shared(tmp_path: Path) -> None:
+    robot = CONFIGS / "robots" / "puma560_crossing.toml"
+    text = f'extends = ["{CONFIGS / "cell" / "puma.toml"}", "{robot}"]\ntask = {{}}\n'
+    (tmp_path / "post.toml").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        resolve(load(tmp_path / "post.toml", ['board.servo.params.shared=["post"]', "task.action=[]"]))
+    assert "an obstacle, which moves by itself; objects: block1, block2, peg" in str(error.value)
