@@ -17,6 +17,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Head
 from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
+from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
@@ -65,6 +66,7 @@ class LanAdapter(Adapter):
         words = segment.words
         launch = xxh3(bytes(words[Head.LAUNCHER_PID : Head.CREATED_NS + 1]))
         self._rack, self._launch, self._grid = segment.rack, launch, OwnGrid(segment)
+        self._clocks = Clocks(segment, self._peers, launch, self._grid)
         self._exports = {port: Export(segment, table, launch) for port, table in self._table.exports.items()}
         for port, entry in self._table.imports.items():
             peer = self._peers[entry.rack]
@@ -77,6 +79,7 @@ class LanAdapter(Adapter):
             entry.open(link, link.sealer)
         for export in self._exports.values():
             export.open(link, link.sealer, self._grid.is_lockstep)
+        self._clocks.open(link, link.sealer)
         self._peers.watch(link.watch_alive())
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch)
@@ -91,6 +94,7 @@ class LanAdapter(Adapter):
         for port, entry in self._imports.items():
             if self._is_due(self._table.imports[port].rate_hz, cycle):
                 entry.exchange(getattr(write, port), self._grid, tick)
+        self._clocks.exchange()
         self._report(write, tick)
 
     def _is_due(self, rate_hz: float, cycle: int) -> bool:
@@ -98,12 +102,14 @@ class LanAdapter(Adapter):
 
     def _report(self, write: Ports, tick: int) -> None:
         status: Message = write.status
+        self._clocks.count(status.clocks)
         for port, export in self._exports.items():
             export.fill(getattr(status, f"export_{port}"))
         for port, entry in self._imports.items():
             entry.fill(getattr(status, f"import_{port}"), self._grid, tick)
         for peer in self._peers:
             out = getattr(write, peer_port(peer.rack))
+            self._clocks.fill(out, peer.rack, tick)
             out.presence, out.launches, out.losses, out.since = peer.presence, peer.launches, peer.losses, peer.since
         absent = [peer.rack for peer in self._peers if not peer.is_there]
         status.state = State.HOLDING if absent else State.EXECUTING

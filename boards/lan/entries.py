@@ -82,6 +82,7 @@ class Import:
         self._peer, self._max_age, self._key = peer, spec.max_age, out_key(table.rack, table.mailbox)
         self._launch = self._number = self.serial = 0
         self._basis = NEVER
+        self._waiting: Envelope | None = None
         self.count = ImportCount()
         self._arrived: Callable[[], Iterator[Arrived]]
 
@@ -91,15 +92,17 @@ class Import:
 
     def exchange(self, out: Message, grid: OwnGrid, tick: int) -> None:
         """Take what has come, and pass the newest good message on."""
-        newest: Envelope | None = None
         for arrived in self._arrived():
             head = self._judged(arrived)
             if head is not None:
-                self.count.overtaken += newest is not None
-                newest = head
-        if newest is None:
+                self.count.overtaken += self._waiting is not None
+                self._waiting = head
+        if (waiting := self._waiting) is None or waiting.launch != self._peer.launch:
             return
-        basis = grid.tick_of(newest, self._peer, tick)
+        # Its age decides: until the clocks have been compared it is kept, as it may be long too old.
+        if (basis := grid.tick_of(waiting, self._peer, tick)) is None:
+            return
+        self._waiting = None
         if tick - basis > self._max_age:
             self.count.late += 1
             return

@@ -22,6 +22,8 @@ class PeerRack:
     since: int = 0
     offset_ns: int | None = None
     """Its CLOCK_MONOTONIC less that of this machine; None: not measured yet."""
+    uncertainty_ns: int = 0
+    """Largest error of that."""
 
     @property
     def is_there(self) -> bool:
@@ -30,14 +32,15 @@ class PeerRack:
 
     def comes(self, launch: int, tick: int) -> None:
         """Note that a launch is there."""
-        self.launches += launch != self.launch
+        if launch != self.launch:
+            self.launches, self.offset_ns = self.launches + 1, None
         self.presence, self.launch, self.since = Presence.THERE, launch, tick
 
     def goes(self, launch: int, tick: int) -> None:
         """Note that a launch is gone; nothing, if another one has come meanwhile."""
         if launch == self.launch and self.is_there:
             self.presence, self.since = Presence.LOST, tick
-            self.losses += 1
+            self.losses, self.offset_ns = self.losses + 1, None
 
 
 class Peers:
