@@ -37,6 +37,7 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.RE_REFERENCED: "recovery",
     Alarm.LATCHED: "reaction",
     Alarm.QUEUE_FULL: "held",
+    Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
 }
 """The kind of event for each alarm; any other alarm is a detection."""
@@ -70,6 +71,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
     Alarm.MODIFICATION: ("name", "control modification '{subject}' failed and was taken out"),
+    Alarm.REMOTE_STOP: ("name", "'{subject}' has set the emergency stop from another machine"),
     Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
 }
 

@@ -7,7 +7,7 @@ which have its core and priority. Nothing here waits, but in lockstep, where tim
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
@@ -18,6 +18,7 @@ from rack.backplane.words import Head
 from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
 from rack.boards.lan.config import LanParams
+from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import LanLink
@@ -40,6 +41,12 @@ class LanAdapter(Adapter):
         self._exports: dict[str, Export] = {}
         self._imports: dict[str, Import] = {}
         self._link: LanLink | None = None
+
+    @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return the other racks, and those who may ask questions: alarms name them by number."""
+        table = LanParams.found_in(params)
+        return () if table is None else tuple(dict.fromkeys([*table.racks, *table.permit]))
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
@@ -69,6 +76,7 @@ class LanAdapter(Adapter):
         for port, entry in self._table.imports.items():
             peer = self._peers[entry.rack]
             self._imports[port] = Import(segment, f"{self.context.board}.{port}", entry, peer)
+        self._desk = Desk(segment, self._table.permit, self.names(self.context.params), self.findings)
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
@@ -77,6 +85,7 @@ class LanAdapter(Adapter):
             entry.open(link, link.sealer)
         for export in self._exports.values():
             export.open(link, link.sealer, self._grid.is_lockstep)
+        self._desk.open(link, self._launch)
         self._peers.watch(link.watch_alive())
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch)
@@ -91,6 +100,7 @@ class LanAdapter(Adapter):
         for port, entry in self._imports.items():
             if self._is_due(self._table.imports[port].rate_hz, cycle):
                 entry.exchange(getattr(write, port), self._grid, tick)
+        self._desk.answer(tick)
         self._report(write, tick)
 
     def _is_due(self, rate_hz: float, cycle: int) -> bool:
