@@ -100,7 +100,7 @@ class Desk:
         self, segment: Segment, permit: Mapping[str, Sequence[Right]], names: Sequence[str], findings: list[Finding]
     ) -> None:
         self._segment, self._permit, self._names, self._findings = segment, permit, names, findings
-        self._lines, self._table, self._grid = UtilityLines(segment), OperatorTable(segment), OwnGrid(segment)
+        self._lines, self._table, self._grid = UtilityLines(segment), OperatorTable(segment), OwnGrid(segment, 1)
         boxes = enumerate(segment.layout.mailboxes)
         self._boxes = {at: box for at, box in boxes if box.writer == CLOCK and box.name.endswith(".operator")}
         self._hosts = [segment.map.blocks[host.name] + 8 * Block.PID for host in segment.layout.hosts]
