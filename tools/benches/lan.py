@@ -19,6 +19,7 @@ from rack.tools.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.benches.lan_group import HEAD_START_NS, Group
 from rack.tools.benches.lan_machine import ENDS, TCP, TLS
 from rack.tools.benches.network import Lab
+from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 
 COUNTS = (1, 2, 4, 8, 16, 32)
@@ -61,8 +62,14 @@ def measure(runs: LanRuns, progress: Progress) -> LanFigures:
                 lab.lose(machine, runs.loss)
             for _, who in turns(contestants, runs.rounds):
                 progress.begin(f"{count} racks: {who}")
-                bench.measure(lab, who)
-                progress.end(bench.cost_s(count), "done", ())
+                try:
+                    bench.measure(lab, who)
+                    ended = "done"
+                except Failure as failure:
+                    # The others count all the same.
+                    ended = str(failure)
+                    absent.append(Absent(f"{who} with {count} racks", ended))
+                progress.end(bench.cost_s(count), ended, ())
             if lacks is None:
                 bench.wake(count)
     return bench.figures(absent)

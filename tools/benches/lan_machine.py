@@ -27,7 +27,7 @@ ENDS = {
     "UDP": "rack.tools.benches.lan_ends:UdpEnd",
     "cyclonedds": "rack.tools.benches.lan_dds:DdsEnd",
 }
-FIND_S = 20.0
+FIND_S = 30.0
 """Longest time that machines may take to find each other."""
 ANSWER_S = 1.0
 """Longest wait for the last answers of a window."""
