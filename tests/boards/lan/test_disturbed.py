@@ -19,7 +19,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.levels.peer import Presence
-from rack.tools.benches.network import Lab
+from rack.tools.benches.network import LINK, NET, Lab
 from rack.tools.lan.certificates import make_credentials
 from tests.boards.lan.racks import RackProcess, rack_text
 from tests.machine import needs_fifo, needs_lab
@@ -32,8 +32,9 @@ LEASE_TICKS = 80
 """200 ms, the default, in ticks of 2.5 ms."""
 KEEP_ALIVE_TICKS = LEASE_TICKS // 4
 CYCLE_TICKS = 8
+AWAY_TICKS = 600
 LOSS = 0.05
-RETRANSMIT_US = 5000
+RETRANSMIT = "rto_min 5ms"
 """Shortest time after which TCP sends a packet again. Linux waits as long as the lease; see configs/cell/scale.md."""
 
 
@@ -120,8 +121,8 @@ class LabRack:
 def lab() -> Iterator[Lab]:
     with Lab(2) as lab:
         for machine in range(len(lab)):
-            quick = lab.popen(machine, ["sysctl", "-qw", f"net.ipv4.tcp_rto_min_us={RETRANSMIT_US}"])
-            assert quick.wait(BOUND_S) == 0
+            route = f"ip route change {NET}.0/24 dev {LINK} src {lab.address(machine)} {RETRANSMIT}"
+            assert lab.popen(machine, route.split()).wait(BOUND_S) == 0
         yield lab
 
 
@@ -158,21 +159,23 @@ def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(lab: Lab, ra
 def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_as_new(
     lab: Lab, racks: tuple[LabRack, LabRack]
 ) -> None:
-    before, pulled = [rack.counts() for rack in racks], [rack.tick for rack in racks]
+    before = [rack.counts() for rack in racks]
     lab.unplug(1)
+    pulled = [rack.tick for rack in racks]
     for rack, tick in zip(racks, pulled, strict=True):
         lost = rack.await_presence(Presence.LOST)
         # The lease begins with the last sign of life, and is looked at as often as signs are due.
         assert lost.since - tick <= LEASE_TICKS + KEEP_ALIVE_TICKS + CYCLE_TICKS
     for rack, tick in zip(racks, pulled, strict=True):
-        wait_until(lambda rack=rack, tick=tick: rack.tick > tick + 1200)
+        wait_until(lambda rack=rack, tick=tick: rack.tick > tick + AWAY_TICKS)
     lab.plug(1)
     for rack, first in zip(racks, before, strict=True):
         rack.await_presence(Presence.THERE)
         rack.await_messages(5)
         now = rack.counts()
         assert (now.launches, now.losses) == (first.launches, first.losses + 1)
-        assert now.number - first.number == now.accounted - first.accounted
+        # One each may have waited for the comparison of clocks, at either end of the time away.
+        assert abs((now.number - first.number) - (now.accounted - first.accounted)) <= 2
         # Sent meanwhile, and gone with the connection.
         assert now.missing > first.missing
         assert (now.refused, now.repeated) == (0, 0)
@@ -181,8 +184,9 @@ def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_
 
 def test_a_killed_rack_is_lost_and_its_next_launch_is_told_from_it(racks: tuple[LabRack, LabRack]) -> None:
     killed, other = racks[1], racks[0]
-    before, tick, count = other.counts(), other.tick, other.heard()[0]
+    before, count = other.counts(), other.heard()[0]
     killed.process.end()
+    tick = other.tick
     lost = other.await_presence(Presence.LOST)
     assert lost.since - tick <= LEASE_TICKS + KEEP_ALIVE_TICKS + CYCLE_TICKS
     killed.start()
