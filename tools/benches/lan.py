@@ -118,6 +118,8 @@ class LanBench:
             kilobytes = (idle + sent * rate_hz / cycles) * 1e-3
             self._note(Point("age", group.racks, rate_hz, group.who, "ms"), [us * 1e-3 for m in found for us in m.us])
             self._note(Point("on the wire", group.racks, rate_hz, group.who, "kB/s"), [kilobytes])
+            each_us = found[COORDINATOR].processor_us / (cycles * group.racks)
+            self._note(Point("processor", group.racks, rate_hz, group.who, "us"), [each_us])
             steady.missing += sum(one.missing for one in found)
             steady.taken += sum(len(one.us) for one in found)
         steady.false_deaths += group.false_deaths
