@@ -25,7 +25,7 @@ RETRY_MS = (50, 200)
 """Shortest and longest time between two attempts to connect."""
 KEEP_ALIVES = 4
 """Signs of life within a lease."""
-HANDSHAKE_MS = 2000
+HANDSHAKE_MS = 3000
 """Longest time to open a connection."""
 MOST_ANSWER = 65_536 + 1024
 """Length of the longest answer to a question: 64 KiB, and what says what they are."""
