@@ -28,7 +28,9 @@ class Home:
     """The link, and the counts of what has come: by key, all and what was good; questions; tokens."""
 
     def __init__(self, rack: str, table: LanTable) -> None:
+        began = time.monotonic()
         self._link = link = LanLink(rack, table)
+        self._opened_s = time.monotonic() - began
         self._arrived = [link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()]
         self._questions = link.answer(ask_keys(rack))
         self._exports = [(key, link.publish(key)) for key in (out_key(rack, e.source) for e in table.exports.values())]
@@ -58,7 +60,8 @@ class Home:
         flaws = {flaw.name: count for flaw, count in self._link.sealer.flaws.items()}
         sizes = {key: sorted(found) for key, found in self._sizes.items()}
         counts = {"came": self._came, "good": self._good, "asked": self._asked, "sizes": sizes}
-        return {**counts, "flaws": flaws, "tokens": self._tokens}
+        own = {"connected": bool(self._link.session.info.peers_zid()), "opened_s": self._opened_s}
+        return {**counts, "flaws": flaws, "tokens": self._tokens, **own}
 
 
 def serve(cycle: Callable[[], None], state: Callable[[], dict[str, Any]], period_s: float) -> None:

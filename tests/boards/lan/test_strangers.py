@@ -69,17 +69,19 @@ def running(module: str, *arguments: str) -> Iterator[Program]:
 
 @dataclass(frozen=True)
 class Site:
-    """A rack at home and its credentials."""
+    """A rack at home, its credentials, and the port on which it looks for friend."""
 
     folder: Path
     port: int
+    friends_port: int
     home: Program
 
     def mutual(self, name: str, folder: str = "set") -> dict[str, Any]:
         """Return settings of a session that shows the certificate of a name."""
         own = Credentials(self.folder / folder, name)
-        shown = {"connect_certificate": str(own.certificate), "connect_private_key": str(own.key), "enable_mtls": True}
-        return self._over("tls", shown)
+        files = {"certificate": str(own.certificate), "private_key": str(own.key)}
+        shown = {f"{side}_{key}": file for side in ("connect", "listen") for key, file in files.items()}
+        return self._over("tls", {"enable_mtls": True, **shown})
 
     def bare(self, protocol: str) -> dict[str, Any]:
         """Return settings of a session without a certificate."""
@@ -98,11 +100,12 @@ class Site:
 def at_home(folder: Path) -> Iterator[Site]:
     """Run a rack over TLS that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
     for each in ("set", "forged"):
-        make_credentials(folder / each, {"home": ["127.0.0.1"], **{name: [] for name in NAMES}}, 1)
-    port = free_port()
+        make_credentials(folder / each, {name: ["127.0.0.1"] for name in ("home", *NAMES)}, 1)
+    port, friends_port = free_port(), free_port()
     entry = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
     table = {
         "listen": [f"tls/127.0.0.1:{port}"],
+        "connect": [f"tls/127.0.0.1:{friends_port}"],
         "certificates": str(folder / "set"),
         "most_bytes": MOST,
         "permit": {"viewer": ["watch"], "friend": ["stop"]},
@@ -110,7 +113,7 @@ def at_home(folder: Path) -> Iterator[Site]:
         "import": {f"port{at}": {"from": source, **entry} for at, source in enumerate(IMPORTED)},
     }
     with running("home", "home", json.dumps(table)) as home:
-        yield Site(folder, port, home)
+        yield Site(folder, port, friends_port, home)
 
 
 @pytest.fixture(scope="module")
