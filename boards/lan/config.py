@@ -79,8 +79,9 @@ class LanTable(Table):
     lease_ms: float = Field(200.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms")
     on_peer_loss: OnPeerLoss = Field(
         "hold",
-        description="while a peer is lost: hold: levels find what it writes lost, and hold; stop: the arm ramps to "
-        "rest, then brakes; go on: levels keep the last message",
+        description="while a rack that was there is lost: hold: levels find what it writes lost at once, and hold, "
+        "until its first message after that; stop: the same, and the arm ramps to rest, then brakes, until it is back; "
+        "go on: levels keep its last message, however old",
     )
     peers: tuple[PeerName, ...] = Field(
         (),
