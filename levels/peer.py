@@ -31,6 +31,7 @@ PEER = MessageType(
         Field("offset", "f8", "s", "its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"),
         Field("uncertainty", "f8", "s", "largest error of the offset; -1: not measured yet; 0 in lockstep"),
         Field("round_trip", "f8", "s", "shortest recent round trip; -1: not measured yet; 0 in lockstep"),
+        Field("steps", "u4", "1", "how often its clock or ours was found to have stepped, as when a machine sleeps"),
         Field("ahead", "f8", "s", "its simulated time less that of this rack, at the same instant"),
         Field("speed", "f8", "1", "its simulated seconds in a real one"),
     ),

@@ -21,6 +21,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
+from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
@@ -80,6 +81,7 @@ class LanAdapter(Adapter):
         launch = xxh3(bytes(words[Head.LAUNCHER_PID : Head.CREATED_NS + 1])) & _LAUNCH_MASK
         self._words, self._rack, self._launch = words, segment.rack, launch
         self._grid = OwnGrid(segment, self.context.every)
+        self._clocks = Clocks(segment, self._peers, launch, self._grid)
         # In the time of a lease and a connection the token of every rack that is still there has come.
         seen_by = words[System.TICK] + self._grid.ticks_in((table.lease_ms + RETRY_MS[1]) * 1e6)
         for peer in self._peers:
@@ -104,6 +106,7 @@ class LanAdapter(Adapter):
             entry.open(link, link.sealer, self._grid)
         for export in self._exports.values():
             export.open(link, link.sealer, self._grid)
+        self._clocks.open(link, link.sealer)
         self._peers.watch(link.watch_alive(TOKENS), self._grid.is_lockstep)
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch)
@@ -121,6 +124,7 @@ class LanAdapter(Adapter):
             entry.look(tick)
             if cycle % entry.every == 0:
                 entry.exchange(getattr(write, port), tick)
+        self._clocks.exchange()
         self._report(write, tick)
 
     def _demand_stop(self, tick: int) -> None:
@@ -133,12 +137,15 @@ class LanAdapter(Adapter):
 
     def _report(self, write: Ports, tick: int) -> None:
         status: Message = write.status
+        self._clocks.count(status.clocks)
         for port, export in self._exports.items():
             export.fill(getattr(status, f"export_{port}"))
         for port, entry in self._imports.items():
             entry.fill(getattr(status, f"import_{port}"), tick)
         for peer in self._peers:
-            peer.fill(getattr(write, peer_port(peer.rack)), self._grid.is_lockstep)
+            out = getattr(write, peer_port(peer.rack))
+            self._clocks.fill(out, peer.rack, tick)
+            peer.fill(out, self._grid.is_lockstep)
         status.reason = reason = self._trouble(tick)
         status.state = State.HOLDING if reason else State.EXECUTING
 

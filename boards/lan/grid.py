@@ -16,7 +16,7 @@ class OwnGrid:
     `every`: ticks of the adapter's cycle.
     """
 
-    def __init__(self, segment: Segment, every: int) -> None:
+    def __init__(self, segment: Segment, every: int = 1) -> None:
         self._clock, self._clock_ns = SystemClock(segment), segment.layout.clock_ns
         self._cycle_ns = every * self._clock_ns
         self.is_lockstep = self._clock.is_lockstep
@@ -39,14 +39,15 @@ class OwnGrid:
         """Return the CLOCK_MONOTONIC of a tick on this machine, ns; in lockstep its simulated time."""
         return self.time_ns(tick) if self.is_lockstep else self._clock.time_of(tick)
 
-    def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:
+    def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int | None:
         """Return the tick here at which a message was written there, at most `tick`, now.
 
-        Until the other clock has been compared with ours it counts as written now.
+        None as long as the other clock has not been compared with ours: how old it is cannot be said. It counts as
+        written as early as the uncertainty of that comparison permits: never as younger than it is.
         """
         if self.is_lockstep:
             return min(tick, head.time_ns // self._clock_ns)
         if peer.offset_ns is None:
-            return tick
-        here_ns = head.stamp_ns - peer.offset_ns
+            return None
+        here_ns = head.stamp_ns - peer.offset_ns - peer.uncertainty_ns
         return min(tick, (here_ns - self._clock.time_of(0)) // self._clock.period_ns)

@@ -33,6 +33,16 @@ IMPORT = MessageType(
         Field("age_s", "f8", "s", "the same in simulated time; -1: none yet"),
     ),
 )
+CLOCKS = MessageType(
+    "lan_clocks",
+    1,
+    (
+        Field("taken", "u4", "1", "round trips measured"),
+        Field("answered", "u4", "1", "pings of other racks answered"),
+        Field("withheld", "u4", "1", "pings not answered: they came too fast, or from too many racks"),
+        Field("refused", "u4", "1", "pings and answers refused: malformed, unsigned, or to nothing that was asked"),
+    ),
+)
 
 
 def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
@@ -40,6 +50,7 @@ def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
     return status(
         "lan_status",
         1,
+        Field("clocks", CLOCKS, "1", "round trips to compare clocks; none in lockstep"),
         *(Field(f"export_{port}", EXPORT, "1", f"export {port}") for port in exports),
         *(Field(f"import_{port}", IMPORT, "1", f"import {port}") for port in imports),
     )

@@ -48,6 +48,8 @@ class PeerRack:
     since: int = 0
     offset_ns: int | None = None
     """Its CLOCK_MONOTONIC less that of this machine; None: not measured yet."""
+    uncertainty_ns: int = 0
+    """Largest error of that."""
     tokens: list[int] = field(default_factory=list)
     confirm_by: int = -1
     findings: list[Finding] = field(default_factory=list)
@@ -92,6 +94,7 @@ class PeerRack:
         if self.is_there:
             self.presence, self.since, self.confirm_by = Presence.LOST, tick, -1
             self.losses += 1
+            self.offset_ns = None
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
     def _enters(self, launch: int, tick: int) -> None:
@@ -101,6 +104,7 @@ class PeerRack:
         if is_new:
             self.launches += 1
             self._seen.append(launch)
+            self.offset_ns = None
         if not is_first:
             alarm = Alarm.PEER_RESTARTED if is_new else Alarm.PEER_BACK
             self.findings.append(Finding(alarm, self.number, tick - self.since))
@@ -137,7 +141,7 @@ class Peers:
         self._is_lockstep = False
         self.arrivals = 0
 
-    def watch(self, changes: Changes, is_lockstep: bool) -> None:
+    def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
         """Take what comes and goes from now on from this function: rack, launch, whether it has come."""
         self._changes, self._is_lockstep = changes, is_lockstep
         for peer in self if is_lockstep else ():
