@@ -35,6 +35,7 @@ class Head(IntEnum):
     LAYOUT_SIZE = 7
     CONFIG_AT = 8
     CONFIG_SIZE = 9
+    CREATED_MONOTONIC_NS = 10  # the same moment as CREATED_NS, CLOCK_MONOTONIC
 
 
 class System(IntEnum):

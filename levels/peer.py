@@ -10,6 +10,9 @@ from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType
 
+DRIFT_PPM = 100
+"""Largest difference between the rates of two clocks: each crystal within 50 ppm."""
+
 
 class Presence(IntEnum):
     """Where another rack is."""

@@ -6,6 +6,7 @@ An alarm is raised once per episode: when a condition is found, not in every cyc
 from __future__ import annotations
 
 from enum import IntEnum
+from functools import partial
 from os import eventfd_write
 from time import monotonic_ns
 
@@ -77,10 +78,11 @@ class Alarm(IntEnum):
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
     MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
-    # Raised by the network adapter: other racks.
+    # Raised by the network adapter: other racks, and those who ask from other machines.
     PEER_LOST = 60  # [number among the level's `names`; -]
     PEER_BACK = 61  # [number; ticks it was away]  the same launch as before
     PEER_RESTARTED = 62  # [number; ticks it was away]  another launch
+    REMOTE_STOP = 63  # [number; -]  another machine has set the emergency stop
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
@@ -115,7 +117,8 @@ def alarm_ring(segment: Segment, task: str) -> Ring:
     """Return the reading end of an alarm ring; its rows are of dtype `RECORD`."""
     address = segment.map.alarms[task]
     head = segment.words[address // 8 : address // 8 + 1]
-    return Ring(segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE), RECORD, head)
+    memory = segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE)
+    return Ring(memory, RECORD, head, partial(segment.oldest, address))
 
 
 CLEAN_READS = 20

@@ -285,6 +285,7 @@ class _Examined:
             task=config.task,
             sizes=self._sizes,
             params=params,
+            rack=config.name,
         )
 
 

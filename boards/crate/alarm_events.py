@@ -40,6 +40,7 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.PEER_RESTARTED: "recovery",
     Alarm.LATCHED: "reaction",
     Alarm.QUEUE_FULL: "held",
+    Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
 }
 """The kind of event for each alarm; any other alarm is a detection."""
@@ -76,6 +77,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.PEER_LOST: ("name", "rack '{subject}' is lost: its network adapter ended, or is out of reach"),
     Alarm.PEER_BACK: ("name", "rack '{subject}' is back after {span}"),
     Alarm.PEER_RESTARTED: ("name", "rack '{subject}' is back after {span}: it was restarted"),
+    Alarm.REMOTE_STOP: ("name", "'{subject}' has set the emergency stop from another machine"),
     Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
 }
 

@@ -23,6 +23,7 @@ from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
+from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, LanLink
@@ -53,9 +54,9 @@ class LanAdapter(Adapter):
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the racks that alarms name."""
+        """Return the other racks, and those who may ask questions: alarms name them by number."""
         table = LanParams.found_in(params)
-        return () if table is None else table.racks
+        return () if table is None else tuple(dict.fromkeys([*table.racks, *table.permit]))
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
@@ -98,6 +99,7 @@ class LanAdapter(Adapter):
                 export.resume(getattr(before.value, f"export_{port}"))
             for port, entry in self._imports.items():
                 entry.resume(getattr(before.value, f"import_{port}"), status.newest)
+        self._desk = Desk(segment, table.permit, self.names(self.context.params), self.findings)
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
@@ -107,6 +109,7 @@ class LanAdapter(Adapter):
         for export in self._exports.values():
             export.open(link, link.sealer, self._grid)
         self._clocks.open(link, link.sealer)
+        self._desk.open(link, self._launch)
         self._peers.watch(link.watch_alive(TOKENS), self._grid.is_lockstep)
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch)
@@ -125,6 +128,7 @@ class LanAdapter(Adapter):
             if cycle % entry.every == 0:
                 entry.exchange(getattr(write, port), tick)
         self._clocks.exchange()
+        self._desk.answer(tick)
         self._report(write, tick)
 
     def _demand_stop(self, tick: int) -> None:

@@ -23,9 +23,8 @@ from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import Arrived, LanLink
 from rack.boards.lan.peers import NONE, PeerRack, Peers
+from rack.levels.peer import DRIFT_PPM
 
-DRIFT_PPM = 100
-"""Largest difference between the rates of two clocks: each crystal within 50 ppm."""
 RECENT = 32
 """Round trips of which the best one counts."""
 PING_NS, EAGER_NS = 500_000_000, 20_000_000

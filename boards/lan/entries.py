@@ -158,23 +158,27 @@ class Import:
         return None
 
     def _is_due(self, head: Envelope, arrived: Arrived, came: int, tick: int) -> bool:
-        """Say whether a message is of the launch that is there. If that may yet turn out, keep it for later.
+        """Say whether a message is of the launch that is there, and of known age. If it may yet be, keep it for later.
 
         In lockstep, what was sent in a later cycle than this one is kept.
         """
         if self._grid.is_lockstep:
             is_strange, most = self._order.launch not in (NONE, head.launch), UNREAD
+            is_known = False
             is_due = head.stamp_ns <= self._grid.time_ns(tick)
         else:
             is_strange, most = self._peer.is_over(head.launch) or tick - came > self._max_age, 1
-            is_due = self._peer.is_there and head.launch == self._peer.launch
+            is_known = self._peer.is_there and head.launch == self._peer.launch
+            # Its age decides: until the clocks have been compared it may be too old.
+            is_due = is_known and self._peer.offset_ns is not None
         if is_strange:
             self.count.strange += 1
         elif not is_due:
             self._early.append((came, arrived))
             if len(self._early) > most:
                 del self._early[0]
-                self.count.strange += 1
+                self.count.overtaken += is_known
+                self.count.strange += not is_known
         return is_due and not is_strange
 
     def _is_next(self, head: Envelope, payload: bytes) -> bool:

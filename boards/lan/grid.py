@@ -39,15 +39,13 @@ class OwnGrid:
         """Return the CLOCK_MONOTONIC of a tick on this machine, ns; in lockstep its simulated time."""
         return self.time_ns(tick) if self.is_lockstep else self._clock.time_of(tick)
 
-    def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int | None:
+    def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:
         """Return the tick here at which a message was written there, at most `tick`, now.
 
-        None as long as the other clock has not been compared with ours: how old it is cannot be said. It counts as
-        written as early as the uncertainty of that comparison permits: never as younger than it is.
+        The clocks have been compared. It counts as written as early as the uncertainty of that permits: never as
+        younger than it is.
         """
         if self.is_lockstep:
             return min(tick, head.time_ns // self._clock_ns)
-        if peer.offset_ns is None:
-            return None
-        here_ns = head.stamp_ns - peer.offset_ns - peer.uncertainty_ns
+        here_ns = head.stamp_ns - (peer.offset_ns or 0) - peer.uncertainty_ns
         return min(tick, (here_ns - self._clock.time_of(0)) // self._clock.period_ns)

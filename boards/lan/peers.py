@@ -93,13 +93,14 @@ class PeerRack:
         """Note that it is lost."""
         if self.is_there:
             self.presence, self.since, self.confirm_by = Presence.LOST, tick, -1
-            self.losses += 1
-            self.offset_ns = None
+            self.losses, self.offset_ns = self.losses + 1, None
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
     def _enters(self, launch: int, tick: int) -> None:
         """Note that a launch is there that was not, or not any more."""
         self.leaves(tick)
+        if launch != self.launch:
+            self.offset_ns = None
         is_first, is_new = self.presence is Presence.AWAITED, launch not in self._seen
         if is_new:
             self.launches += 1
