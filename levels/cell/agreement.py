@@ -94,13 +94,16 @@ class Agreement:
             self._cancel(answers, now_s)
 
     def _await(self, answers: Mapping[str, ArmAnswer], now_s: float) -> None:
-        """Begin once every arm reports, with the step that the reports show."""
-        if any(not answers[arm].is_there or answers[arm].response is Response.ENDED for arm in self._arms):
-            return
-        newest = max([a.order for a in answers.values() if a.program == self.program], default=0)
-        if newest >= ATTEMPTS and newest // ATTEMPTS <= len(self._steps):
+        """Go on once every arm reports, with the step that the reports show, or with the end."""
+        ours = [answer for answer in answers.values() if answer.program == self.program]
+        ended = [answer for answer in ours if answer.response is Response.ENDED]
+        newest = max([answer.order for answer in ended or ours], default=0)
+        if newest // ATTEMPTS in range(1, len(self._steps) + 2):
             self.step, self.attempt = newest // ATTEMPTS - 1, newest % ATTEMPTS
-        self._go_on(now_s)
+        if ended:
+            self.end(Error(ended[0].error), ended[0].reason, now_s)
+        elif all(answers[arm].is_there for arm in self._arms):
+            self._go_on(now_s)
 
     def _go_on(self, now_s: float) -> None:
         if self.step < len(self._steps):
