@@ -1,0 +1,53 @@
+"""Levels for tests of the network: one that counts its cycles, and some that read what other racks export."""
+
+from __future__ import annotations
+
+from rack.backplane.message import Field, status
+from rack.levels.level import Executor, Input, Ports
+from rack.levels.peer import PEER
+
+PULSE = status("pulse", 1, Field("count", "i8", "1", "cycles so far"))
+HEARD = status(
+    "heard",
+    1,
+    Field("count", "i8", "1", "count last heard"),
+    Field("total", "i8", "1", "sum of all counts heard"),
+    Field("lost", "i8", "1", "cycles in which the other rack's writer was lost"),
+)
+MET = status("met", 1, Field("presence", "u1", "1", "where the other rack is"), Field("since", "i8", "tick", "since"))
+
+
+class Pulse(Executor):
+    """Counts its cycles."""
+
+    outputs = {"status": PULSE}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Count."""
+        write.status.count = tick // self.context.every
+
+
+class Echo(Executor):
+    """Adds up what it hears of another rack, `lan.other`."""
+
+    inputs = {"other": Input(PULSE, "lan.other")}
+    outputs = {"status": HEARD}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Add what is new, and count the cycles in which the writer is lost."""
+        other = read.other
+        if other.is_new:
+            write.status.count = other.value.count
+            write.status.total += other.value.count
+        write.status.lost += other.is_lost
+
+
+class Meeting(Executor):
+    """Notes where rack `other` is, as the adapter says."""
+
+    inputs = {"peer": Input(PEER, "lan.peer_other")}
+    outputs = {"status": MET}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Note it."""
+        write.status.presence, write.status.since = read.peer.value.presence, read.peer.value.since

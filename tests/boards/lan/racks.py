@@ -1,0 +1,191 @@
+"""Several racks at once, for tests of the network: their configs, the racks as processes, and how they ended.
+
+As a program, `python -m tests.boards.lan.racks CONFIG SECONDS [KEY=VALUE]...` runs one rack and prints its events and
+its outcome, one JSON document a line.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.line import CrateLine
+from rack.boards.errors import ConfigError, LaunchError
+from rack.boards.events import Event, Outcome
+from rack.tools.runs.window import free_port
+from tests.processes import BOUND_S
+
+ROOT = Path(__file__).resolve().parents[3]
+BASE = f"""
+python_path = ["{Path(__file__).parent}"]
+
+[clock]
+period_ms = 2.5
+
+[board.pulse]
+slot = 2
+rate_hz = 100
+executor = "lan_levels:Pulse"
+"""
+ECHO = """
+[board.echo]
+slot = 3
+rate_hz = 100
+executor = "lan_levels:Echo"
+"""
+EXPORT = """
+[adapter.lan.export.pulse]
+from = "pulse.status"
+rate_hz = 50
+"""
+
+
+def rack_text(
+    name: str, listen: str, connect: Iterable[str], other: str = "", *, peers: Iterable[str] = (), lan: str = ""
+) -> str:
+    """Return the config of a rack that exports its pulse, and adds up that of rack `other`, if one is named.
+
+    `lan`: further lines of its `[adapter.lan]`.
+    """
+    imported = f"""
+[adapter.lan.import.other]
+from = "{other}/pulse.status"
+type = "lan_levels:PULSE"
+rate_hz = 50
+max_age_ms = 100
+"""
+    table = f"""
+[adapter.lan]
+slot = 5
+listen = {json.dumps([listen] if listen else [])}
+connect = {json.dumps(list(connect))}
+peers = {json.dumps(list(peers))}
+{lan}
+"""
+    return f'name = "{name}"\n{BASE}{ECHO if other else ""}{table}{EXPORT}{imported if other else ""}'
+
+
+def endpoints(count: int) -> list[str]:
+    """Return endpoints on free ports of this machine's loopback."""
+    return [f"tcp/127.0.0.1:{free_port()}" for _ in range(count)]
+
+
+def ring_texts(names: Sequence[str], peers: Mapping[str, Iterable[str]] | None = None, lan: str = "") -> list[str]:
+    """Return the configs of racks that all know each other, each of which adds up the pulse of the one before it."""
+    at = endpoints(len(names))
+    texts = []
+    for k, name in enumerate(names):
+        others = [other for other in names if other != name] if peers is None else peers.get(name, ())
+        texts.append(rack_text(name, at[k], at[:k], names[k - 1], peers=others, lan=lan))
+    return texts
+
+
+def configs(texts: Iterable[str], folder: Path, *settings: str) -> list[RackConfig]:
+    """Return the configs of these texts, with settings."""
+    found = []
+    for k, text in enumerate(texts):
+        path = folder / f"rack-{k}.toml"
+        path.write_text(text)
+        found.append(load(str(path), settings))
+    return found
+
+
+def run_together(racks: Sequence[RackConfig], seconds: Sequence[float | None]) -> list[tuple[Outcome, list[Event]]]:
+    """Run racks from this process, launched in this order, until all have ended; return outcomes and events."""
+    with ExitStack() as stack:
+        # All crates import at once.
+        crates = [stack.enter_context(CrateLine()) for _ in racks]
+        running: list[Rack] = []
+        for config, crate, most in zip(racks, crates, seconds, strict=True):
+            rack = stack.enter_context(Rack(config, crate=crate))
+            rack.start(most)
+            running.append(rack)
+        while any([rack.watch(0.01) for rack in running]):  # noqa: C419  each of them is watched
+            continue
+    return [(_outcome(rack), rack.events) for rack in running]
+
+
+def _outcome(rack: Rack) -> Outcome:
+    assert rack.outcome is not None
+    return rack.outcome
+
+
+class RackProcess:
+    """A rack in a process of its own. `pid` is its launcher's."""
+
+    def __init__(self, config: Path, seconds: float | None, *settings: str) -> None:
+        command = [sys.executable, "-m", "tests.boards.lan.racks", str(config), str(seconds or 0), *settings]
+        self._process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.pid = self._process.pid
+        self.events: list[dict[str, Any]] = []
+
+    def await_event(self, kind: str, text: str = "") -> dict[str, Any]:
+        """Return the next event of a kind whose text contains this. Raises `AssertionError` if the rack ends first."""
+        for event in self._lines():
+            if event.get("kind") == kind and text in event["text"]:
+                return event
+        raise AssertionError(f"no event {kind} '{text}': {self.events} {self._process.communicate()[1]}")
+
+    def outcome(self) -> dict[str, Any]:
+        """Wait for its end and return its outcome, as in `Outcome`, or the text of the error of its launch."""
+        for line in self._lines():
+            if "kind" not in line:
+                self._process.communicate(timeout=BOUND_S)
+                return line
+        raise AssertionError(f"no outcome: {self.events} {self._process.communicate()[1]}")
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to its launcher."""
+        self._process.send_signal(number)
+
+    def end(self) -> None:
+        """Kill its launcher, if it still runs."""
+        self._process.kill()
+        self._process.communicate(timeout=BOUND_S)
+
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            found = json.loads(line)
+            self.events += [found] if "kind" in found else []
+            yield found
+
+
+@contextmanager
+def started(config: Path, seconds: float | None = None, *settings: str) -> Iterator[RackProcess]:
+    """Start a rack in a process of its own, which is killed at the end, should it still run."""
+    process = RackProcess(config, seconds, *settings)
+    try:
+        yield process
+    finally:
+        process.end()
+
+
+def main(config: str, seconds: str, *settings: str) -> None:
+    """Run one rack; a signal stops it as Ctrl-C would."""
+
+    def show(document: dict[str, Any]) -> None:
+        sys.stdout.write(json.dumps(document) + "\n")
+        sys.stdout.flush()
+
+    try:
+        rack = Rack(load(config, list(settings)), lambda event: show(asdict(event)))
+        signal.signal(signal.SIGTERM, lambda number, frame: rack.stop("SIGTERM received"))
+        with rack:
+            show(asdict(rack.run(float(seconds) or None)))
+    except (ConfigError, LaunchError) as error:
+        show({"error": str(error)})
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
