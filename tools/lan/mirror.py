@@ -86,6 +86,8 @@ class MirroredRing:
 class Mirror(Segment):
     """A mirror; `is_there` says whether the rack answered last time. Its `rack` is the name by which users know it."""
 
+    is_mirror = True
+
     def __init__(self, rack: str, fetch: Fetch) -> None:
         """Fetch layout and config. Raises `SegmentError` when the other program has another version."""
         self._fetch = fetch

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import NamedTuple
 
 from rack.tools.console.answer import Failure
@@ -11,6 +15,8 @@ PORT = 7447
 OPERATOR = "operator"
 CERTIFICATES = "RACK_CERTIFICATES"
 """Environment variable with the default of --certificates."""
+AT_THE_RACK = "resets an emergency stop on its own machine alone: rack estop {} --reset"
+"""Why a rack refuses a reset from afar."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
 _HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
 
@@ -20,6 +26,20 @@ class Asker(NamedTuple):
 
     name: str = OPERATOR
     certificates: str = ""
+
+    @classmethod
+    def default(cls) -> Asker:
+        """Return who asks when nothing else is given."""
+        return cls(certificates=os.environ.get(CERTIFICATES, ""))
+
+    @classmethod
+    def of(cls, name: str, certificates: str) -> Asker:
+        """Return who asks by the options of a command. Raises `Failure`."""
+        if _NAME.fullmatch(name) is None:
+            raise Failure(f'--as = "{name}": not a name; permitted: small letters, digits, "-" and "_", at most 40', 2)
+        if certificates and not Path(certificates).is_dir():
+            raise Failure(f"--certificates = {certificates}: not a folder", 2)
+        return cls(name, certificates)
 
 
 class HostAddress(NamedTuple):
@@ -56,3 +76,14 @@ class RackAddress(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.at}/{self.rack}"
+
+
+@contextmanager
+def needing_zenoh() -> Iterator[None]:
+    """Raise `Failure` when what is imported in this context lacks the network's library."""
+    try:
+        yield
+    except ImportError as error:
+        if error.name != "zenoh":
+            raise
+        raise Failure("racks on other machines need eclipse-zenoh: pip install nasrem-rack[lan]") from None
