@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rack.tools.console.address import Asker
 from rack.tools.console.answer import Failure, print_answer, print_json
+
+if TYPE_CHECKING:
+    from rack.tools.console.address import Asker
 
 
 def list_racks(as_json: bool) -> None:
@@ -49,7 +51,7 @@ def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> 
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly one."""
     from rack.tools.runs.watched import watched
 
-    with watched(rack or _only_rack(), asker or Asker.default()) as one:
+    with watched(rack or _only_rack(), asker) as one:
         from rack.tools.runs.snapshot import RackMonitor
 
         found = RackMonitor(one.segment).look()

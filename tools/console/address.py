@@ -13,12 +13,13 @@ from rack.tools.console.answer import Failure
 
 PORT = 7447
 OPERATOR = "operator"
+EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 CERTIFICATES = "RACK_CERTIFICATES"
 """Environment variable with the default of --certificates."""
 AT_THE_RACK = "resets an emergency stop on its own machine alone: rack estop {} --reset"
 """Why a rack refuses a reset from afar."""
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
-_HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
+_NAME = r"[a-z0-9][a-z0-9_-]{0,39}"
+_HOST = r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?"
 
 
 class Asker(NamedTuple):
@@ -35,7 +36,7 @@ class Asker(NamedTuple):
     @classmethod
     def of(cls, name: str, certificates: str) -> Asker:
         """Return who asks by the options of a command. Raises `Failure`."""
-        if _NAME.fullmatch(name) is None:
+        if re.fullmatch(_NAME, name) is None:
             raise Failure(f'--as = "{name}": not a name; permitted: small letters, digits, "-" and "_", at most 40', 2)
         if certificates and not Path(certificates).is_dir():
             raise Failure(f"--certificates = {certificates}: not a folder", 2)
@@ -43,7 +44,7 @@ class Asker(NamedTuple):
 
 
 class HostAddress(NamedTuple):
-    """A machine, or a port of it, at which a rack listens. An IPv6 address has its brackets."""
+    """A port of a machine at which a rack listens. An IPv6 address has its brackets."""
 
     host: str
     port: int = PORT
@@ -51,10 +52,16 @@ class HostAddress(NamedTuple):
     @classmethod
     def of(cls, text: str) -> HostAddress:
         """Return the address in a text. Raises `Failure`."""
-        found = _HOST.fullmatch(text)
+        found = re.fullmatch(_HOST, text)
         if found is None or not 0 < int(found[2] or PORT) < 1 << 16:
             raise Failure(f'HOST = "{text}": not a host; permitted: a name or address, as in 10.0.0.5 or cell:7447', 2)
         return cls(found[1], int(found[2] or PORT))
+
+    @classmethod
+    def of_endpoint(cls, endpoint: str) -> HostAddress:
+        """Return the address of an endpoint of a config; of one that stands for all addresses, this machine's."""
+        host, _, port = endpoint.partition("/")[2].rpartition(":")
+        return cls(EVERYWHERE.get(host, host), int(port))
 
     def __str__(self) -> str:
         return self.host if self.port == PORT else f"{self.host}:{self.port}"
@@ -70,7 +77,7 @@ class RackAddress(NamedTuple):
     def of(cls, text: str) -> RackAddress:
         """Return the address in HOST[:PORT]/RACK. Raises `Failure`."""
         host, _, rack = text.partition("/")
-        if _NAME.fullmatch(rack) is None:
+        if re.fullmatch(_NAME, rack) is None:
             raise Failure(f'RACK = "{text}": not a rack; permitted: RACK, or HOST/RACK, as in 10.0.0.5/cell', 2)
         return cls(HostAddress.of(host), rack)
 

@@ -157,6 +157,8 @@ class Mirror(Segment):
         self._hosts = answer.hosts
         self.realtime_offset_ns = answer.realtime_ns - answer.monotonic_ns
         """CLOCK_REALTIME of its machine less CLOCK_MONOTONIC there."""
+        self.realtime_ns = answer.realtime_ns
+        """CLOCK_REALTIME of its machine when it answered."""
         self.monotonic_offset_ns = answer.monotonic_ns - time.monotonic_ns()
         """CLOCK_MONOTONIC of its machine less that of this one, to within the way of an answer."""
 

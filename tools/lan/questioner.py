@@ -10,9 +10,12 @@ import ipaddress
 import os
 import secrets
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
@@ -20,6 +23,7 @@ import zenoh
 
 from rack.backplane.segment import VERSION
 from rack.boards.lan.config import LanTable
+from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE
 from rack.boards.lan.link import LanLink
@@ -36,6 +40,8 @@ PATIENCE_S = 4.0
 """Time without an answer after which a rack counts as gone."""
 PAUSE_S = 0.02
 """Time until a question is asked again that was dropped."""
+REFUSAL_S = 0.2
+"""Longest wait for the refusal of a certificate."""
 DENIED = 10
 """Times that a question comes back at once without an answer until it counts as not permitted."""
 MOST_BYTES = 1 << 17
@@ -97,15 +103,18 @@ class Questioner:
             if rack in self._launches:
                 return FarLaunch(rack, self._launches[rack])
             there = ", ".join(sorted(self._launches))
-        there = there or f"none, or none that knows '{self._asker.name}'"
-        raise Failure(f"no rack '{rack}' at {self._at}; racks there: {there}")
+        raise Failure(f"no rack '{rack}' at {self._at}; racks there: {there or self._nobody()}")
 
     def launches(self) -> list[FarLaunch]:
         """Return the racks there, once one has shown itself. Raises `Failure` when none does."""
         with self._changed:
             if not self._changed.wait_for(lambda: bool(self._launches), CONNECT_S):
-                raise Failure(f"{self._at}: no rack there shows itself to '{self._asker.name}'")
+                raise Failure(f"{self._at}: racks there: {self._nobody()}")
             return [FarLaunch(*found) for found in sorted(self._launches.items())]
+
+    def _nobody(self) -> str:
+        hint = "" if self._asker.certificates else "; one with TLS needs --certificates"
+        return f"none that knows '{self._asker.name}'{hint}"
 
     def is_there(self, rack: str, launch: int) -> bool:
         """Say whether a launch has not ended yet, as far as is known."""
@@ -185,11 +194,18 @@ class Questioner:
 
 
 def _check_reach(at: HostAddress, asker: Asker) -> None:
-    """Raise `Failure` when nobody listens there, or it is too far to go without certificates."""
+    """Raise `Failure` when nobody listens there, it refuses this user's certificate, or there is none to show."""
     host = at.host.strip("[]")
     try:
-        with socket.create_connection((host, at.port), CONNECT_S) as found:
-            address = ipaddress.ip_address(found.getpeername()[0].partition("%")[0])
+        with socket.create_connection((host, at.port), CONNECT_S) as connection:
+            address = ipaddress.ip_address(connection.getpeername()[0].partition("%")[0])
+            if asker.certificates:
+                _shake_hands(connection, host, asker)
+    except ssl.SSLCertVerificationError as error:
+        raise Failure(f"{at}: its certificate is refused here: {error.verify_message}") from None
+    except (ssl.SSLError, ConnectionResetError) as error:
+        why = (getattr(error, "reason", None) or "connection closed").replace("_", " ").lower()
+        raise Failure(f"{at}: TLS refused: {why}") from None
     except TimeoutError:
         raise Failure(f"{at}: no answer at port {at.port} within {CONNECT_S:g} s") from None
     except OSError as error:
@@ -197,3 +213,17 @@ def _check_reach(at: HostAddress, asker: Asker) -> None:
         raise Failure(f"{at}: cannot connect to port {at.port}: {why or error}") from None
     if not asker.certificates and not address.is_loopback:
         raise Failure(f"{at}: not this machine, so it needs certificates; see --certificates", 2)
+
+
+def _shake_hands(connection: socket.socket, host: str, asker: Asker) -> None:
+    """Show the certificate and look at the other one, as the session will: it would only try again and again."""
+    credentials = Credentials(Path(asker.certificates), asker.name)
+    if (flaw := next(credentials.flaws(), None)) is not None:
+        raise Failure(str(flaw))
+    context = ssl.create_default_context(cafile=credentials.authority)
+    context.load_cert_chain(credentials.certificate, credentials.key)
+    with context.wrap_socket(connection, server_hostname=host) as secure:
+        # The other side judges our certificate after its own part is done: a refusal comes as the first thing to read.
+        secure.settimeout(REFUSAL_S)
+        with suppress(TimeoutError):
+            secure.recv(1)

@@ -35,7 +35,7 @@ class RemoteRack:
     """
 
     def __init__(self, address: RackAddress, asker: Asker | None = None) -> None:
-        self.address, self._asker = address, asker or Asker()
+        self.address, self._asker = address, asker or Asker.default()
         self._racks = Questioner(address.at, self._asker)
         try:
             self._launch = self._racks.launch(address.rack)

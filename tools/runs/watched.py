@@ -68,11 +68,14 @@ class LocalRack:
         return OperatorTable(self.segment).claim(request)
 
 
-def watched(rack: str, asker: Asker) -> WatchedRack:
-    """Return a rack by its name, or by HOST/RACK. Raises `SegmentError`, or `Failure` for one on another machine."""
+def watched(rack: str, asker: Asker | None = None) -> WatchedRack:
+    """Return a rack by its name, or by HOST/RACK, which `asker` asks.
+
+    Raises `SegmentError` when there is none, or `Failure` for one on another machine.
+    """
     if "/" not in rack:
         return LocalRack(rack)
     address = RackAddress.of(rack)
     with needing_zenoh():
         from rack.tools.lan.remote import RemoteRack
-    return RemoteRack(address, asker)
+    return RemoteRack(address, asker or Asker.default())
