@@ -27,6 +27,7 @@ PEER = MessageType(
     1,
     (
         Field("presence", "u1", Presence, "awaited, there or lost"),
+        Field("launch", "i8", "1", "number of the launch that is there, or was last; 0: none, or in lockstep"),
         Field("launches", "u4", "1", "its launches seen so far: a number above 1 means restarts"),
         Field("losses", "u4", "1", "how often it was lost"),
         Field("since", "i8", "tick", "since when it is there, or lost"),

@@ -32,11 +32,11 @@ def main(name: str, other: str, table: str, trips: int) -> None:
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.EPOCH_NS] = epoch_ns = time.monotonic_ns()
     peers = Peers([other])
-    clocks = Clocks(segment, peers, epoch_ns, OwnGrid(segment))
+    clocks = Clocks(segment, peers, epoch_ns, OwnGrid(segment, 1))
     link = LanLink(name, LanTable.model_validate(json.loads(table)))
     try:
         clocks.open(link, Sealer())
-        peers.watch(link.watch_alive())
+        peers.watch(link.watch_alive(), is_lockstep=False)
         link.declare_alive(epoch_ns)
         has_said = False
         while not select.select([sys.stdin], [], [], CYCLE_S)[0]:

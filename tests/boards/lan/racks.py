@@ -110,7 +110,7 @@ def run_together(racks: Sequence[RackConfig], seconds: Sequence[float | None]) -
             rack = stack.enter_context(Rack(config, crate=crate))
             rack.start(most)
             running.append(rack)
-        while any([rack.watch(0.01) for rack in running]):
+        while any([rack.watch(0.01) for rack in running]):  # noqa: C419  each of them is watched
             continue
     return [(_outcome(rack), rack.events) for rack in running]
 
