@@ -6,7 +6,7 @@ connect a port to another mailbox.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from rack.backplane.layout import Role
@@ -56,9 +56,17 @@ def all_ports(config: RackConfig, mistakes: list[Mistake]) -> list[TaskPorts]:
     """Return the ports of every task and host board whose class is found; add all mistakes to `mistakes`."""
     wired = [_wired(config, place, mistakes) for place in (*config.tasks(), *config.hosts())]
     found = [ports for ports in wired if ports is not None]
-    types = {box: ports.outputs[port].type for ports in found for port, box in ports.writes.items()}
-    whole = [_with_made_ports(config, ports, types) for ports in found]
-    return [_with_exchange(config, ports, mistakes) for ports in whole]
+    types = _types(found)
+    made = [_with_made_ports(config, ports, types) for ports in found]
+    # What the config of one board makes, an adapter may exchange.
+    types = _types(made)
+    made = [ports if ports.is_whole else _with_made_ports(config, ports, types) for ports in made]
+    return [_with_exchange(config, ports, mistakes) for ports in made]
+
+
+def _types(found: Iterable[TaskPorts]) -> dict[str, MessageType]:
+    """Return the message type of each mailbox written."""
+    return {box: ports.outputs[port].type for ports in found for port, box in ports.writes.items()}
 
 
 def _with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]) -> TaskPorts:
