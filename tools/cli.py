@@ -43,7 +43,7 @@ COMMANDS = (
     ("inject", "rack.tools.inject:app", "Inject a fault into a running rack."),
     ("estop", "rack.tools.estop:estop", "Engage the brakes of the arm at once, until --reset."),
     ("record", "rack.tools.record:record", "Record a running rack."),
-    ("replay", "rack.tools.replay:replay", "Open the recording of a run in the viewer."),
+    ("replay", "rack.tools.replay:replay", "Open recordings in the viewer, of several racks on one time line."),
     ("report", "rack.tools.report:report", "Report on a recorded run, or compare two runs."),
     ("analyze", "rack.tools.analyze:analyze", "Compare a run with the timing model, equation by equation."),
     ("gantt", "rack.tools.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),

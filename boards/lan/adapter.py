@@ -42,6 +42,7 @@ class LanAdapter(Adapter):
     """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each rack."""
 
     params = LanParams
+    wired_by = "params.export"
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -25,7 +25,7 @@ RETRY_MS = (50, 200)
 """Shortest and longest time between two attempts to connect."""
 KEEP_ALIVES = 4
 """Signs of life within a lease."""
-HANDSHAKE_MS = 2000
+HANDSHAKE_MS = 3000
 """Longest time to open a connection."""
 MOST_ANSWER = 65_536 + 1024
 """Length of the longest answer to a question: 64 KiB, and what says what they are."""
@@ -175,7 +175,8 @@ def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks:
     # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it leaves there.
     for key in ("scouting/multicast", "scouting/gossip", "transport/shared_memory", "adminspace"):
         put(f"{key}/enabled", False)
-    put("listen/endpoints", list(table.listen))
+    timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
+    put("listen/endpoints", [f"{endpoint}{timed}" for endpoint in table.listen])
     put("connect/endpoints", list(table.connect))
     put("connect/timeout_ms", -1)
     put("connect/exit_on_failure", False)
