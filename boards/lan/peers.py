@@ -105,6 +105,7 @@ class PeerRack:
         if is_new:
             self.launches += 1
             self._seen.append(launch)
+            self.offset_ns = None
         if not is_first:
             alarm = Alarm.PEER_RESTARTED if is_new else Alarm.PEER_BACK
             self.findings.append(Finding(alarm, self.number, tick - self.since))
@@ -141,7 +142,7 @@ class Peers:
         self._is_lockstep = False
         self.arrivals = 0
 
-    def watch(self, changes: Changes, is_lockstep: bool) -> None:
+    def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
         """Take what comes and goes from now on from this function: rack, launch, whether it has come."""
         self._changes, self._is_lockstep = changes, is_lockstep
         for peer in self if is_lockstep else ():
