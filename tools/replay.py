@@ -1,24 +1,96 @@
-"""`rack replay`: open the recording of a run in the viewer."""
+"""`rack replay`: open recordings in the viewer; those of several racks on one time line."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
+
 from rack.tools.console.answer import Failure
-from rack.tools.console.parameters import RunFolder
-from rack.tools.runs.window import ViewerWindow
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.progress import reading_progress
+from rack.tools.runs.recording import Recording
+from rack.tools.runs.time_line import on_one_time_line
+from rack.tools.runs.window import ViewerWindow, has_screen
+
+Runs = Annotated[
+    list[Path],
+    typer.Argument(metavar="RUN...", help="folder of a run, as in runs/nasrem-20250101-120000; one for each rack"),
+]
+Out = Annotated[
+    Path | None, typer.Option(metavar="FILE.rrd", help="make the viewer's file from what is recorded, and open nothing")
+]
 
 
-def replay(run: RunFolder) -> None:
+def replay(runs: Runs, out: Out = None) -> None:
     """Open the recording of a run in the viewer; return when it is closed.
 
     It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd.
 
+    Of several racks that ran together, give the folder of each: they are shown at once, each under its name, on the
+    time line of the first. Their clocks are compared by what the racks recorded of each other; how uncertain that is
+    stands in the log. Recordings that did not run together are refused.
+
     \b
     Examples:
       rack replay runs/nasrem-20250101-120000
+      rack replay runs/cell-puma-20250101-120000 runs/cell-k1607-20250101-120001
+      rack replay runs/cell-puma-* runs/cell-k1607-* --out both.rrd
     """
+    if out is not None:
+        _make(runs, out)
+    elif len(runs) == 1:
+        _open_own(runs[0])
+    elif has_screen():
+        with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-replay-") as folder:
+            _make(runs, Path(folder, "run.rrd"))
+            _show(Path(folder, "run.rrd"))
+    else:
+        raise Failure("no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd saves it for one")
+
+
+def _open_own(run: Path) -> None:
     # A restarted recorder leaves several files.
     recordings = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
     if not recordings or not all(recording.is_file() for recording in recordings):
         raise Failure(f"{run}: nothing to replay: it has no run.rrd", 2)
+    _show(*recordings)
+
+
+def _show(*recordings: Path) -> None:
     if problem := ViewerWindow(*(str(recording.resolve()) for recording in recordings)).wait():
         raise Failure(problem)
+
+
+def _make(runs: Sequence[Path], out: Path) -> None:
+    if out.suffix != ".rrd":
+        raise Failure(f"--out {out}: not the name of a viewer's file; permitted: a name that ends in .rrd", 2)
+    if out.exists():
+        raise Failure(f"--out {out}: exists already", 2)
+    merge(runs, out)
+
+
+def merge(runs: Sequence[Path], out: Path, silent: bool = False) -> list[str]:
+    """Write the viewer's file of runs that were recorded together; return what a user should know of their times.
+
+    Raises `Failure` if they cannot be read, or did not run together.
+    """
+    for run in runs:
+        if not run.is_dir():
+            raise Failure(f"{run}: no such folder" if not run.exists() else f"{run}: not the folder of a run", 2)
+    placed = on_one_time_line([Recording(run) for run in runs])
+    notes = [place.note for place in placed[1:]]
+    for note in () if silent else notes:
+        print(note, file=sys.stderr)
+    # It takes half a second to import.
+    from rack.tools.viewer.merged import write_merged
+
+    try:
+        write_merged(placed, out, reading_progress(silent, "merging the recordings"))
+    except RuntimeError as error:
+        raise Failure(f"{out}: {' '.join(str(error).split())}") from None
+    return notes

@@ -104,6 +104,9 @@ class Agreement:
             self.end(Error(ended[0].error), ended[0].reason, now_s)
         elif all(answers[arm].is_there for arm in self._arms):
             self._go_on(now_s)
+        if self.phase is Phase.ASKING:
+            # At once: an arm that has forgotten its promise must not be asked for it again.
+            self._ask(answers, now_s)
 
     def _go_on(self, now_s: float) -> None:
         if self.step < len(self._steps):

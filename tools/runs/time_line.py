@@ -188,7 +188,7 @@ def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
     by_ns = np.rint(read(mailbox, "offset")[known] * 1e9).astype(np.int64)
     at_ns = of.stamp_ns(ticks) + by_ns
     seen_ns = np.rint(ticks * of.clock_ns + read(mailbox, "ahead")[known] * 1e9)
-    apart_ns = np.maximum(peer.time_ns(at_ns), 0) - seen_ns
+    apart_ns = peer.time_ns(at_ns) - seen_ns
     # Of a peer that had not begun yet, nothing says which launch it was.
     is_this = (np.abs(apart_ns) <= TOLERANCE_NS) & (seen_ns > 0)
     if not is_this.any():

@@ -6,16 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import rerun as rr
 
 from rack.tools.runs.recording import Recording
 from rack.tools.runs.time_line import Placed
 from rack.tools.viewer.blueprint import RackViews, blueprint, together
-from rack.tools.viewer.levels import LOG
 from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Stream, Timelines, new_recording
-
-NOTES = (LOG, "time line")
 
 
 def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
@@ -49,7 +45,7 @@ def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], N
 
 def _note(stream: Stream, placed: Sequence[Placed]) -> None:
     for place in placed[1:]:
-        stream.at(0, place.line.epoch_ns, NOTES, rr.TextLog(place.note, level="INFO"))
+        stream.say(0, place.line.epoch_ns, "time line", place.note, "INFO")
 
 
 def _blocks(recording: Recording, last: int, block: int) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:

@@ -24,6 +24,7 @@ SIM_TIME, TICK, WALL = "sim_time", "tick", "wall"
 KEPT = 4096
 """Pairs of tick and time kept, to place what has a tick but no time stamp."""
 APPLICATION = "rack"
+LOG = "log"
 FLUSH_S = 0.5
 """Longest single wait for the disk: the rings, not drained meanwhile, hold two seconds."""
 SERVER_MEMORY = "200MB"
@@ -186,6 +187,11 @@ class Stream:
         self._recording.set_time(TICK, sequence=int(found.ticks[0]))
         self._recording.set_time(WALL, timestamp=np.datetime64(int(found.wall_ns[0]), "ns"))
         self._recording.log(self._path(entity), archetype)
+
+    def say(self, tick: int, stamp_ns: int, source: str, text: str, level: str) -> None:
+        """Write a line to the log, under its source; of a rack among several it begins with the rack's name."""
+        line = rr.TextLog(": ".join((*self._root, text)), level=level)
+        self.at(tick, stamp_ns, (LOG, source), line)
 
     def property(self, name: str, values: rr.AsComponents) -> None:
         """Log a property of the run."""

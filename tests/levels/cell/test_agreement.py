@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rack.backplane.message import Message
-from rack.levels.cell.agreement import ATTEMPTS, BEGUN, Agreement, ArmAnswer
+from rack.levels.cell.agreement import ATTEMPTS, BEGUN, MAX_ATTEMPTS, Agreement, ArmAnswer
 from rack.levels.cell.messages import CELL_PROGRESS, CELL_REPORT, OrderVerb, Phase, Response
 from rack.levels.cell.taken import TakenOrder
 from rack.levels.messages import Error
@@ -144,8 +145,18 @@ class Play:
 
 MESSAGES = [*ARMS, *(f">{arm}" for arm in ARMS)]
 LOST = st.frozensets(st.sampled_from(MESSAGES))
-EVENTS = st.lists(st.one_of(LOST, st.sampled_from([*ARMS, "cell", "launch"])), max_size=40)
-STEADY = st.lists(st.one_of(LOST, st.sampled_from([*ARMS, "cell"])), max_size=40)
+QUIET = st.integers(0, 30).map(lambda cycles: [frozenset[str]()] * cycles)
+"""Cycles without losses: the program takes about 20."""
+
+
+def after_a_while(*restarted: str) -> st.SearchStrategy[list[frozenset[str] | str]]:
+    """Return what happens: losses, and restarts of these."""
+    disturbed = st.lists(st.one_of(LOST, st.sampled_from(restarted)), max_size=30)
+    return st.tuples(QUIET, disturbed).map(lambda parts: [*parts[0], *parts[1]])
+
+
+EVENTS = after_a_while(*ARMS, "cell", "launch")
+STEADY = after_a_while(*ARMS, "cell")
 SOME_STEPS = st.frozensets(st.integers(0, len(STEPS) - 1), max_size=1)
 
 
@@ -208,7 +219,7 @@ def test_promise_that_expires_is_asked_for_again_before_anything_begins(
     assert play.agreement.error in (Error.NONE, Error.TOO_LATE)
 
 
-@given(EVENTS, st.sampled_from(ARMS), st.integers(0, 40))
+@given(STEADY, st.sampled_from(ARMS), st.integers(0, 40))
 @settings(max_examples=100, deadline=None)
 def test_arm_launched_anew_ends_the_program_or_has_lost_nothing(
     events: list[frozenset[str] | str], arm: str, when: int
@@ -216,10 +227,22 @@ def test_arm_launched_anew_ends_the_program_or_has_lost_nothing(
     play = Play()
     disturb(play, events[:when])
     play.arms[arm].launch()
-    disturb(play, [event for event in events[when:] if event != "launch"])
+    disturb(play, events[when:])
     play.finish()
     is_done = all(play.done_by(arms, step) == {1} for step, arms in enumerate(STEPS))
     assert is_done or "its rack was launched anew" in play.agreement.reason
+
+
+@pytest.mark.parametrize(("keeps_s", "error", "attempts"), [(3.0, Error.NONE, 1), (0.5, Error.TOO_LATE, MAX_ATTEMPTS)])
+def test_promise_that_expires_is_asked_for_so_many_times(keeps_s: float, error: Error, attempts: int) -> None:
+    play = Play(puma=PlayedArm(keeps_s=keeps_s))
+    disturb(play, [frozenset(), frozenset(), *[frozenset({"k1607"})] * 8])
+    asked = set[int]()
+    while play.agreement.phase is not Phase.OVER:
+        play.cycle()
+        asked.add(play.agreement.attempt)
+    assert (play.agreement.error, max(asked)) == (error, attempts)
+    assert not any(arm.stopped for arm in play.arms.values())
 
 
 def test_order_that_was_never_promised_fails() -> None:
