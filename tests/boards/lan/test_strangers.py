@@ -97,15 +97,15 @@ class Site:
 
 
 @contextmanager
-def at_home(folder: Path) -> Iterator[Site]:
-    """Run a rack over TLS that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
+def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
+    """Run a rack that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
     for each in ("set", "forged"):
         make_credentials(folder / each, {name: ["127.0.0.1"] for name in ("home", *NAMES)}, 1)
     port, friends_port = free_port(), free_port()
     entry = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
     table = {
-        "listen": [f"tls/127.0.0.1:{port}"],
-        "connect": [f"tls/127.0.0.1:{friends_port}"],
+        "listen": [f"{protocol}/127.0.0.1:{port}"],
+        "connect": [f"{protocol}/127.0.0.1:{friends_port}"],
         "certificates": str(folder / "set"),
         "most_bytes": MOST,
         "permit": {"viewer": ["watch"], "friend": ["stop"]},
@@ -231,3 +231,20 @@ def test_a_seal_with_another_secret_does_not_fit(found: Found) -> None:
 def test_a_huge_message_is_not_put_together(found: Found) -> None:
     assert found.home["good"][pulse("heavy")] == found.home["came"][pulse("heavy")] > 0
     assert found.home["sizes"][pulse("heavy")] == [100]
+
+
+def test_without_tls_keys_and_seals_remain(tmp_path: Path) -> None:
+    mole, lies = pulse("mole"), [(out_key(name, "pulse.status"), 9, None) for name in ("nobody", "home")]
+    with at_home(tmp_path, "tcp") as site:
+        both = {
+            "friend": {**friend(site), "settings": site.bare("tcp")},
+            "mole": {"settings": site.bare("tcp"), "puts": [(mole, 9, mole), *lies], "listens": ["**"]},
+        }
+        with running("strangers", json.dumps(both)) as others:
+            wait_until(lambda: site.home.state()["came"].get(mole, 0) > ROUNDS and others.state()["friend"]["answers"])
+            wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
+            home, of = site.home.state(), others.state()
+    assert set(home["came"]) == {mole, pulse("friend")}
+    assert home["good"][mole] == 0
+    assert home["flaws"]["UNSIGNED"] == home["came"][mole]
+    assert of["mole"]["heard"] == {}
