@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from rack.tools.runs.recording import Recording
-from rack.tools.runs.time_line import Placed
+from rack.tools.runs.time_line import RackPlace
 from rack.tools.viewer.blueprint import RackViews, blueprint, together
 from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Stream, Timelines, new_recording
 
 
-def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
+def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
     """Write one recording of all these racks; `show` gets the part that is done, 0 to 1.
 
     The notes on the times of racks are in its log. Of a single rack it is that rack's run.rrd.
@@ -43,7 +43,7 @@ def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], N
     recording.disconnect()
 
 
-def _note(stream: Stream, placed: Sequence[Placed]) -> None:
+def _note(stream: Stream, placed: Sequence[RackPlace]) -> None:
     for place in placed[1:]:
         stream.say(0, place.line.epoch_ns, "time line", place.note, "INFO")
 
