@@ -100,7 +100,8 @@ class Site:
 def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
     """Run a rack that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
     for each in ("set", "forged"):
-        make_credentials(folder / each, {name: ["127.0.0.1"] for name in ("home", *NAMES)}, 1)
+        addresses = {name: ["127.0.0.1"] for name in ("home", *NAMES)}
+        make_credentials(folder / each, {**addresses, "impostor": ["127.9.9.9"]}, 1)
     port, friends_port = free_port(), free_port()
     entry = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
     table = {
@@ -143,6 +144,8 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
     liar, second = pulse("liar"), out_key("liar", "second.status")
     lies = [(liar, 100, None), (liar, MOST + 1, liar), (second, 100, liar), *eager["puts"], *own]
     heavy = [(pulse("heavy"), size, pulse("heavy")) for size in (100, 1 << 20)]
+    impostor = site.mutual("impostor") | {"connect/endpoints": []}
+    impostor["listen/endpoints"] = [f"tls/127.0.0.1:{site.friends_port}"]
     asks = [READ, COMMAND, STOP, "rack/home/ask/stop/friend", "rack/home/ask/**"]
     return {
         "friend": friend(site),
@@ -154,6 +157,7 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
         "liar": {"settings": site.mutual("liar"), **secret, "puts": [*lies, (liar, 100, liar)]},
         "mole": {"settings": site.mutual("mole"), "puts": [(pulse("mole"), 9, pulse("mole"))], "secret": "00" * 32},
         "heavy": {"settings": site.mutual("heavy"), **secret, "puts": heavy},
+        "impostor": {"settings": impostor, **eager},
     }
 
 
@@ -194,6 +198,10 @@ def test_a_friend_is_heard_answered_and_shown_who_is_there(found: Found) -> None
 @pytest.mark.parametrize("name", ["bare", "plain", "forged"])
 def test_who_shows_no_certificate_of_ours_is_not_connected(found: Found, name: str) -> None:
     assert found.of[name] == {"heard": {}, "tokens": {}, "answers": {}, "connected": False}
+
+
+def test_a_rack_goes_out_only_to_whom_the_address_belongs(found: Found) -> None:
+    assert found.of["impostor"] == {"heard": {}, "tokens": {}, "answers": {}, "connected": False}
 
 
 def test_a_certificate_of_ours_without_a_right_gets_nothing(found: Found) -> None:
@@ -238,13 +246,12 @@ def test_without_tls_keys_and_seals_remain(tmp_path: Path) -> None:
     with at_home(tmp_path, "tcp") as site:
         both = {
             "friend": {**friend(site), "settings": site.bare("tcp")},
-            "mole": {"settings": site.bare("tcp"), "puts": [(mole, 9, mole), *lies], "listens": ["**"]},
+            "mole": {"settings": site.bare("tcp"), "puts": [(mole, 9, mole), *lies]},
         }
         with running("strangers", json.dumps(both)) as others:
             wait_until(lambda: site.home.state()["came"].get(mole, 0) > ROUNDS and others.state()["friend"]["answers"])
             wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
-            home, of = site.home.state(), others.state()
+            home = site.home.state()
     assert set(home["came"]) == {mole, pulse("friend")}
     assert home["good"][mole] == 0
     assert home["flaws"]["UNSIGNED"] == home["came"][mole]
-    assert of["mole"]["heard"] == {}
