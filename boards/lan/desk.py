@@ -33,6 +33,7 @@ from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import ASKED
 from rack.boards.lan.link import LanLink, Question
 from rack.boards.lan.questions import (
+    MOST_CONTENT,
     MOST_QUESTION,
     NEEDED,
     Code,
@@ -48,7 +49,7 @@ QUESTIONS_A_CYCLE = 16
 """Questions of each right that a cycle looks at."""
 ANSWERS_A_CYCLE = 4
 """Answers of each right that a cycle sends."""
-BYTES_A_CYCLE = 1 << 17
+BYTES_A_CYCLE = MOST_CONTENT
 """Bytes of content after which a cycle answers no further question to read."""
 CLIENT_S = 2.0
 """Real time without a question of a client after which it counts as gone."""

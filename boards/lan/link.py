@@ -31,7 +31,7 @@ MOST_ANSWER = 65_536 + 1024
 """Length of the longest answer to a question: 64 KiB, and what says what they are."""
 ZENOH_BYTES = 1024
 """What zenoh adds to the content of a message, at most: key expression, lengths, options."""
-ANSWERS_NEVER_WAIT = {"messages": ["reply"], "flows": ["egress"], "overwrite": {"congestion_control": "drop"}}
+NO_WAIT = {"messages": ["query"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
 
 
 class Arrived(NamedTuple):
@@ -196,7 +196,7 @@ def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks:
     put("transport/link/tx/keep_alive", KEEP_ALIVES)
     put("transport/link/tx/queue/size/real_time", 16)
     # An answer takes over the congestion control of its question: whoever asks must not make the adapter wait.
-    put("qos/network", [ANSWERS_NEVER_WAIT])
+    put("qos/network", [NO_WAIT])
     # What does wait for room, in lockstep, waits no longer than until the peer counts as lost.
     put("transport/link/tx/queue/congestion_control/block/wait_before_close", round(table.lease_ms * 1e3))
     return config

@@ -34,6 +34,8 @@ from rack.tools.console.answer import Failure
 
 CONNECT_S = 3.0
 """Longest wait for a connection, and for the racks at its other end to show themselves."""
+OTHERS_S = 0.3
+"""Longest wait for further racks at the other end of a connection, once one has shown itself."""
 ANSWER_S = 1.0
 """Longest wait for one answer; after it the question is asked again."""
 PATIENCE_S = 4.0
@@ -99,7 +101,8 @@ class Questioner:
     def launch(self, rack: str) -> FarLaunch:
         """Return the launch of a rack that is there. Raises `Failure` when it is not: it names those that are."""
         with self._changed:
-            self._changed.wait_for(lambda: rack in self._launches, CONNECT_S)
+            self._changed.wait_for(lambda: self._launches, CONNECT_S)
+            self._changed.wait_for(lambda: rack in self._launches, OTHERS_S)
             if rack in self._launches:
                 return FarLaunch(rack, self._launches[rack])
             there = ", ".join(sorted(self._launches))
