@@ -6,7 +6,7 @@ connect a port to another mailbox.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from rack.backplane.layout import Role
@@ -56,16 +56,15 @@ def all_ports(config: RackConfig, mistakes: list[Mistake]) -> list[TaskPorts]:
     """Return the ports of every task and host board whose class is found; add all mistakes to `mistakes`."""
     wired = [_wired(config, place, mistakes) for place in (*config.tasks(), *config.hosts())]
     found = [ports for ports in wired if ports is not None]
-    types = _types(found)
-    made = [_with_made_ports(config, ports, types) for ports in found]
-    # What the config of one board makes, an adapter may exchange.
-    types = _types(made)
-    made = [ports if ports.is_whole else _with_made_ports(config, ports, types) for ports in made]
-    return [_with_exchange(config, ports, mistakes) for ports in made]
+    whole, types, before = found, _types(found), -1
+    # What one board makes another may pass on.
+    while len(types) != before:
+        before, whole = len(types), [_with_made_ports(config, ports, types) for ports in found]
+        types = _types(whole)
+    return [_with_exchange(config, ports, mistakes) for ports in whole]
 
 
-def _types(found: Iterable[TaskPorts]) -> dict[str, MessageType]:
-    """Return the message type of each mailbox written."""
+def _types(found: list[TaskPorts]) -> dict[str, MessageType]:
     return {box: ports.outputs[port].type for ports in found for port, box in ports.writes.items()}
 
 
