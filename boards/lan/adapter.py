@@ -22,8 +22,10 @@ from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import LanLink
+from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
+from rack.boards.lan.step import STEP_BYTES
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.peer import PEER, peer_port
 from rack.levels.tables import read_params
@@ -41,6 +43,7 @@ class LanAdapter(Adapter):
         self._exports: dict[str, Export] = {}
         self._imports: dict[str, Import] = {}
         self._link: LanLink | None = None
+        self._barrier: Barrier | None = None
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
@@ -70,26 +73,33 @@ class LanAdapter(Adapter):
         for port, entry in self._table.imports.items():
             peer = self._peers[entry.rack]
             self._imports[port] = Import(segment, f"{self.context.board}.{port}", entry, peer)
+        if self._grid.is_lockstep and self._table.racks:
+            self._barrier = Barrier(segment, self.context.board, self._table.racks)
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
         sealer = Sealer(most_bytes=self._table.most_bytes)
+        way, barrier = self._barrier or link, self._barrier
         for entry in self._imports.values():
-            entry.open(link, sealer)
+            entry.open(way, sealer)
         for export in self._exports.values():
-            export.open(link, sealer, self._grid.is_lockstep)
-        self._peers.watch(link.watch_alive())
+            export.open(way, sealer)
+        if barrier is not None:
+            barrier.open(link, Sealer(most_bytes=STEP_BYTES), self._launch)
+        self._peers.watch(link.watch_alive() if barrier is None else barrier.changes)
         # Last: whoever sees it knows all subscriptions, and loses nothing.
-        link.declare_alive(self._launch)
+        link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Exchange what is due."""
         cycle = tick // self.context.every
-        self._peers.look(tick)
         for port, export in self._exports.items():
             if self._is_due(self._table.exports[port].rate_hz, cycle):
                 export.exchange(getattr(read, port), self._grid, tick)
+        if self._barrier is not None and not self._barrier.meet(tick):
+            return
+        self._peers.look(tick)
         for port, entry in self._imports.items():
             if self._is_due(self._table.imports[port].rate_hz, cycle):
                 entry.exchange(getattr(write, port), self._grid, tick)
@@ -113,5 +123,7 @@ class LanAdapter(Adapter):
 
     def close(self) -> None:
         """Leave the network."""
+        if self._barrier is not None:
+            self._barrier.close()
         if self._link is not None:
             self._link.close()

@@ -14,6 +14,7 @@ from rack.boards.lan.config import ExportConfig, ImportConfig
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import Arrived, LanLink, out_key
+from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import PeerRack
 from rack.levels.level import Reading
 
@@ -31,9 +32,9 @@ class Export:
         self.sent = self.serial = 0
         self._put: Callable[[bytes, bytes], None]
 
-    def open(self, link: LanLink, sealer: Sealer, is_lockstep: bool) -> None:
-        """Publish it; in lockstep it waits rather than lose a message."""
-        self._put, self._sealer = link.publish(self._key, reliable=is_lockstep), sealer
+    def open(self, way: LanLink | Barrier, sealer: Sealer) -> None:
+        """Publish it."""
+        self._put, self._sealer = way.publish(self._key), sealer
 
     def exchange(self, reading: Reading, grid: OwnGrid, tick: int) -> None:
         """Send the message, if it is new."""
@@ -84,9 +85,9 @@ class Import:
         self.count = ImportCount()
         self._arrived: Callable[[], Iterator[Arrived]]
 
-    def open(self, link: LanLink, sealer: Sealer) -> None:
+    def open(self, way: LanLink | Barrier, sealer: Sealer) -> None:
         """Subscribe to it."""
-        self._arrived, self._sealer = link.subscribe(self._key), sealer
+        self._arrived, self._sealer = way.subscribe(self._key), sealer
 
     def exchange(self, out: Message, grid: OwnGrid, tick: int) -> None:
         """Take what has come, and pass the newest good message on."""

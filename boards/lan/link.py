@@ -2,9 +2,10 @@
 
 Key expressions, R being the name of the rack that sends:
 
-    rack/R/alive/<launch>       liveliness token: gone when the adapter's process ends or falls silent for the lease
+    rack/R/alive/<launch>       liveliness token: gone when the adapter's process ends or falls silent for the lease;
+                                in lockstep its cycle follows, ns, after a hyphen
     rack/R/out/<board>/<port>   an exported mailbox
-    rack/R/step                 lockstep: the end of a cycle of R's adapter
+    rack/R/step                 lockstep: the cycles of R's adapter, each with all that it exports
     rack/R/ping/<to>, .../pong/<to>   round trips between clocks
     rack/R/ask/<what>           questions to R: answered in its adapter's cycles
 
@@ -28,6 +29,8 @@ RETRY_MS = (50, 200)
 """Shortest and longest time between two attempts to connect."""
 KEEP_ALIVES = 4
 """Signs of life within a lease."""
+ALIVE = "rack/*/alive/*"
+"""Key expressions of all tokens."""
 
 
 class Arrived(NamedTuple):
@@ -43,9 +46,20 @@ def out_key(rack: str, mailbox: str) -> str:
     return f"rack/{rack}/out/{mailbox.replace('.', '/')}"
 
 
-def alive_key(rack: str, launch: int) -> str:
-    """Return the key expression of a launch's token."""
-    return f"rack/{rack}/alive/{launch:016x}"
+def step_key(rack: str) -> str:
+    """Return the key expression of a rack's steps."""
+    return f"rack/{rack}/step"
+
+
+def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
+    """Return the key expression of a launch's token; in lockstep with the length of its adapter's cycle, ns."""
+    return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
+
+
+def launch_and_cycle(alive: str) -> tuple[int, int]:
+    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real time."""
+    launch, _, cycle_ns = alive.rpartition("/")[2].partition("-")
+    return int(launch, 16), int(cycle_ns or 0)
 
 
 class LanLink:
@@ -91,14 +105,14 @@ class LanLink:
 
         return arrived
 
-    def declare_alive(self, launch: int) -> None:
-        """Show others that this launch is there; after everything that they may send it."""
-        self._kept.append(self.session.liveliness().declare_token(alive_key(self.rack, launch)))
+    def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
+        """Show others that this launch is there; after everything that they may send it. See `alive_key`."""
+        self._kept.append(self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns)))
 
     def watch_alive(self, unread: int = UNREAD) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields rack, launch, and whether it has come or gone, of others, oldest first."""
         subscriber = self.session.liveliness().declare_subscriber(
-            "rack/*/alive/*", zenoh.handlers.RingChannel(unread), history=True
+            ALIVE, zenoh.handlers.RingChannel(unread), history=True
         )
         self._kept.append(subscriber)
 
@@ -106,8 +120,8 @@ class LanLink:
             for _ in range(unread):
                 if (sample := subscriber.try_recv()) is None:
                     return
-                _, rack, _, launch = str(sample.key_expr).split("/")
-                yield rack, int(launch, 16), sample.kind == zenoh.SampleKind.PUT
+                key = str(sample.key_expr)
+                yield key.split("/")[1], launch_and_cycle(key)[0], sample.kind == zenoh.SampleKind.PUT
 
         return changes
 
