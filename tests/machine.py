@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from rack.tools.benches.network import Lab
+
 WAIT_S = 600.0
 """Bound of a wait for one's turn: twice the longest time-out of a test. It does not count in the test's own time."""
 _FOLDER = Path(tempfile.gettempdir())
@@ -33,6 +35,7 @@ def obtains_fifo() -> bool:
 
 needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")
 needs_two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+needs_lab = pytest.mark.skipif(bool(Lab.is_possible()), reason=Lab.is_possible())
 
 
 @contextmanager

@@ -47,6 +47,7 @@ COMMANDS = (
     ("analyze", "rack.tools.analyze:analyze", "Compare a run with the timing model, equation by equation."),
     ("gantt", "rack.tools.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
     ("campaign", "rack.tools.campaign:campaign", "Inject random faults into many runs, and judge each."),
+    ("lan", "rack.tools.lan.group:app", "Prepare racks that work together over a network."),
     ("bench", "rack.tools.bench:bench", "Measure costs on this machine."),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""

@@ -91,6 +91,9 @@ def anchor(tables: Tables, folder: Path) -> Tables:
         anchored["robot"] = {**robot, "model": str(_find(robot["model"], folder) or folder / robot["model"])}
     if isinstance(own, list) and all(isinstance(item, str) for item in own):
         anchored["python_path"] = [str((folder / item).resolve()) for item in own]
+    adapters = tables.get("adapter")
+    if isinstance(adapters, dict):
+        anchored["adapter"] = {name: _with_certificates(adapter, folder) for name, adapter in adapters.items()}
     boards = tables.get("board")
     if isinstance(boards, dict):
         anchored["board"] = {
@@ -98,6 +101,12 @@ def anchor(tables: Tables, folder: Path) -> Tables:
             for name, board in boards.items()
         }
     return anchored
+
+
+def _with_certificates(adapter: Any, folder: Path) -> Any:
+    """Return an adapter's table with the absolute path of its certificates, if it names any."""
+    own = adapter.get("certificates") if isinstance(adapter, dict) else None
+    return {**adapter, "certificates": str(folder / own)} if isinstance(own, str) else adapter
 
 
 def with_table_files(board: Any, path: Callable[[str], str]) -> Any:

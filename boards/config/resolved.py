@@ -26,6 +26,7 @@ from rack.boards.config.faults import fault_mistakes, injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
+from rack.boards.config.network import credential_mistakes
 from rack.boards.config.ports import TaskPorts, reference
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
@@ -67,17 +68,13 @@ def loads(text: str) -> RackConfig:
 
 
 def resolve(config: RackConfig) -> Resolved:
-    """Check and wire a config. Raises `ConfigError` with every mistake."""
-    commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
-    examined = _Examined(config, places(config), commands)
-    if examined.mistakes:
-        raise ConfigError(examined.mistakes)
-    return examined.resolved()
+    """Check and wire a config to run on this machine, now. Raises `ConfigError` with every mistake."""
+    return _examined(config, credential_mistakes(config)).resolved()
 
 
 def wire(config: RackConfig) -> Layout:
-    """Return the layout of a config. Raises `ConfigError` with every mistake."""
-    return resolve(config).layout
+    """Return the layout of a config, which may have run elsewhere. Raises `ConfigError` with every mistake."""
+    return _examined(config).resolved().layout
 
 
 def classes(config: RackConfig) -> tuple[str, ...]:
@@ -167,6 +164,14 @@ class Resolved:
     def _refused(self, segment: Segment) -> str:
         refused = [t.name for t in self.layout.tasks if t.priority and not segment.block(t.name)[Block.PRIORITY]]
         return f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
+
+
+def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> _Examined:
+    commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
+    examined = _Examined(config, places(config), commands)
+    if mistakes := [*examined.mistakes, *further]:
+        raise ConfigError(mistakes)
+    return examined
 
 
 class _Examined:

@@ -19,13 +19,11 @@ from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
 from rack.boards.lan.config import LanParams
 from rack.boards.lan.entries import Export, Import
-from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
-from rack.boards.lan.step import STEP_BYTES
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.peer import PEER, peer_port
 from rack.levels.tables import read_params
@@ -79,14 +77,13 @@ class LanAdapter(Adapter):
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
-        sealer = Sealer(most_bytes=self._table.most_bytes)
         way, barrier = self._barrier or link, self._barrier
         for entry in self._imports.values():
-            entry.open(way, sealer)
+            entry.open(way, link.sealer)
         for export in self._exports.values():
-            export.open(way, sealer)
+            export.open(way, link.sealer)
         if barrier is not None:
-            barrier.open(link, Sealer(most_bytes=STEP_BYTES), self._launch)
+            barrier.open(link, self._launch)
         self._peers.watch(link.watch_alive() if barrier is None else barrier.changes)
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)

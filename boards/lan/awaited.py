@@ -23,7 +23,7 @@ class Why(IntEnum):
 
 
 _TEXTS = {
-    Why.UNSEEN: "it has not come yet",
+    Why.UNSEEN: "it has not come yet, or does not name this rack",
     Why.SLOWER: "it is slower, or held",
     Why.GONE: f"its adapter is gone; it counts as lost after {GIVE_UP_S:g} s",
 }

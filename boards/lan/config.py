@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StringConstraints, ValidationError
+from pydantic import AfterValidator, Field, StringConstraints, ValidationError
 
 from rack.backplane.message import MessageType
+from rack.boards.lan.endpoint import Endpoint, proper
 from rack.levels.tables import Positive, Table
 
 FASTEST_HZ = 50.0
@@ -17,7 +18,7 @@ OnPeerLoss = Literal["hold", "stop", "go on"]
 Right = Literal["watch", "command", "stop"]
 PeerName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
-Endpoint = Annotated[str, StringConstraints(pattern=r"^(tcp|tls|quic)/[^/#?]+:[0-9]{1,5}$")]
+EndpointText = Annotated[str, AfterValidator(proper)]
 Local = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Remote = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
@@ -66,10 +67,12 @@ class ImportConfig(Table):
 class LanTable(Table):
     """The keys of `[adapter.lan]` that concern the network; those of its board are declared with the boards'."""
 
-    listen: tuple[Endpoint, ...] = Field((), description=f"endpoints where other racks find this one, {ENDPOINT_NOTE}")
-    connect: tuple[Endpoint, ...] = Field((), description=f"endpoints of other racks, {ENDPOINT_NOTE}")
+    listen: tuple[EndpointText, ...] = Field(
+        (), description=f"endpoints where other racks find this one, {ENDPOINT_NOTE}"
+    )
+    connect: tuple[EndpointText, ...] = Field((), description=f"endpoints of other racks, {ENDPOINT_NOTE}")
     certificates: str | None = Field(
-        None, description="folder with this rack's certificate and key; see rack lan certificates --help"
+        None, description="folder with this rack's certificate, key and secret; see rack lan certificates --help"
     )
     insecure: bool = Field(False, description="permit endpoints beyond loopback without TLS")
     lease_ms: float = Field(200.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms")
@@ -79,7 +82,9 @@ class LanTable(Table):
         "rest, then brakes; go on: levels keep the last message",
     )
     peers: tuple[PeerName, ...] = Field(
-        (), description="racks that this one waits for in lockstep, besides those from which it imports"
+        (),
+        description="racks with which this one works, besides those from which it imports: they may import, and "
+        "lockstep waits for them",
     )
     permit: dict[PeerName, tuple[Right, ...]] = Field(
         {},
@@ -89,6 +94,17 @@ class LanTable(Table):
     most_bytes: int = Field(16_384, ge=64, le=1 << 20, description="length of the longest message taken; bytes")
     exports: dict[PortName, ExportConfig] = Field({}, alias="export", description="mailboxes that others may import")
     imports: dict[PortName, ImportConfig] = Field({}, alias="import", description="mailboxes of other racks, by port")
+
+    @property
+    def endpoints(self) -> Iterator[tuple[str, Endpoint]]:
+        """Yield each endpoint with its place in the table, as in listen[0]."""
+        for key in ("listen", "connect"):
+            yield from ((f"{key}[{at}]", Endpoint.of(text)) for at, text in enumerate(getattr(self, key)))
+
+    @property
+    def has_tls(self) -> bool:
+        """Whether the others are known by their certificates."""
+        return any(endpoint.has_tls for _, endpoint in self.endpoints)
 
     @property
     def racks(self) -> tuple[str, ...]:

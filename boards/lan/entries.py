@@ -13,7 +13,8 @@ from rack.backplane.segment import Segment
 from rack.boards.lan.config import ExportConfig, ImportConfig
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import Arrived, LanLink, out_key
+from rack.boards.lan.keys import out_key
+from rack.boards.lan.link import Arrived, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import PeerRack
 from rack.levels.level import Reading

@@ -54,6 +54,10 @@ class Sealer:
     def __init__(self, secret: bytes = b"", most_bytes: int = 1 << 20) -> None:
         self._secret, self._most = secret, most_bytes
 
+    def taking(self, most_bytes: int) -> Sealer:
+        """Return one with the same secret and another limit."""
+        return Sealer(self._secret, most_bytes)
+
     def seal(self, key: str, head: Envelope, payload: bytes | memoryview) -> bytes:
         """Return the envelope of a payload to be sent under a key expression."""
         packed = _HEAD.pack(_MAGIC, head.flags, *head[:7])

@@ -1,14 +1,5 @@
 """The link: a rack's session on the network, with everything that looks for others by itself switched off.
 
-Key expressions, R being the name of the rack that sends:
-
-    rack/R/alive/<launch>       liveliness token: gone when the adapter's process ends or falls silent for the lease;
-                                in lockstep its cycle follows, ns, after a hyphen
-    rack/R/out/<board>/<port>   an exported mailbox
-    rack/R/step                 lockstep: the cycles of R's adapter, each with all that it exports
-    rack/R/ping/<to>, .../pong/<to>   round trips between clocks
-    rack/R/ask/<what>           questions to R: answered in its adapter's cycles
-
 What comes is kept in channels of fixed length, which overwrite the oldest; the adapter takes it in its own cycles.
 """
 
@@ -16,11 +7,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import zenoh
 
+from rack.boards.lan.access import access_control
 from rack.boards.lan.config import LanTable
+from rack.boards.lan.credentials import Credential, Credentials
+from rack.boards.lan.envelope import HEAD_BYTES, Sealer
+from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
 
 UNREAD = 32
@@ -29,8 +25,12 @@ RETRY_MS = (50, 200)
 """Shortest and longest time between two attempts to connect."""
 KEEP_ALIVES = 4
 """Signs of life within a lease."""
-ALIVE = "rack/*/alive/*"
-"""Key expressions of all tokens."""
+HANDSHAKE_MS = 2000
+"""Longest time to open a connection."""
+MOST_ANSWER = 65_536 + 1024
+"""Length of the longest answer to a question: 64 KiB, and what says what they are."""
+ZENOH_BYTES = 1024
+"""What zenoh adds to the content of a message, at most: key expression, lengths, options."""
 
 
 class Arrived(NamedTuple):
@@ -41,37 +41,38 @@ class Arrived(NamedTuple):
     payload: bytes
 
 
-def out_key(rack: str, mailbox: str) -> str:
-    """Return the key expression of an exported mailbox."""
-    return f"rack/{rack}/out/{mailbox.replace('.', '/')}"
+class Question(NamedTuple):
+    """A question that has come. `reply` sends one answer, a payload and its envelope.
 
+    Several answers reach only those who ask with `ConsolidationMode.NONE`. The asker is done when the next question is
+    taken, or none is left.
+    """
 
-def step_key(rack: str) -> str:
-    """Return the key expression of a rack's steps."""
-    return f"rack/{rack}/step"
-
-
-def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
-    """Return the key expression of a launch's token; in lockstep with the length of its adapter's cycle, ns."""
-    return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
-
-
-def launch_and_cycle(alive: str) -> tuple[int, int]:
-    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real time."""
-    launch, _, cycle_ns = alive.rpartition("/")[2].partition("-")
-    return int(launch, 16), int(cycle_ns or 0)
+    key: str
+    envelope: bytes | None
+    payload: bytes
+    reply: Callable[[bytes, bytes], None]
 
 
 class LanLink:
-    """One open session. Raises `LevelError` if an endpoint cannot be opened."""
+    """One open session of `rack`, or of a tool that `asks` racks and is known by that name.
 
-    def __init__(self, rack: str, table: LanTable) -> None:
+    Raises `LevelError` if an endpoint cannot be opened, or the secret cannot be read.
+    """
+
+    def __init__(self, rack: str, table: LanTable, asks: bool = False) -> None:
         self.rack = rack
+        credentials = None if table.certificates is None else Credentials(Path(table.certificates), rack)
         try:
-            self.session = zenoh.open(_settings(table))
+            most = MOST_ANSWER if asks else table.most_bytes
+            self.sealer = Sealer(credentials.secret if credentials else b"", most)
+            """Seals and opens what this rack sends and receives."""
+            self.session = zenoh.open(_settings(rack, table, credentials, asks))
         except zenoh.ZError as error:
             why = " ".join(str(error).split())
             raise LevelError(f"adapter.lan: listen {', '.join(table.listen) or 'nowhere'}: {why}") from None
+        except Credential as flaw:
+            raise LevelError(f"adapter.lan: {flaw}") from None
         self._kept: list[Any] = []
 
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
@@ -98,12 +99,37 @@ class LanLink:
             for _ in range(unread):
                 if (sample := take()) is None:
                     return
-                envelope = sample.attachment
-                yield Arrived(
-                    str(sample.key_expr), None if envelope is None else envelope.to_bytes(), sample.payload.to_bytes()
-                )
+                yield Arrived(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
 
         return arrived
+
+    def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
+        """Call a function in a thread of the network with everything that comes under a key expression, at once."""
+
+        def take(sample: zenoh.Sample) -> None:
+            callback(Arrived(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes()))
+
+        # Direct: a thread between would add its wake-up, and a queue without a bound.
+        self._kept.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False)))
+
+    def answer(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Question]]:
+        """Return a function that yields the questions asked under a key expression since the last call, oldest first.
+
+        A question under several keys at once is dropped unanswered.
+        """
+        queryable = self.session.declare_queryable(key, zenoh.handlers.RingChannel(unread))
+        self._kept.append(queryable)
+
+        def questions() -> Iterator[Question]:
+            for _ in range(unread):
+                if (query := queryable.try_recv()) is None:
+                    return
+                with query:
+                    asked, content = str(query.key_expr), _bytes_of(query.payload) or b""
+                    if "*" not in asked:
+                        yield Question(asked, _bytes_of(query.attachment), content, _reply(query))
+
+        return questions
 
     def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
         """Show others that this launch is there; after everything that they may send it. See `alive_key`."""
@@ -112,7 +138,7 @@ class LanLink:
     def watch_alive(self, unread: int = UNREAD) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields rack, launch, and whether it has come or gone, of others, oldest first."""
         subscriber = self.session.liveliness().declare_subscriber(
-            ALIVE, zenoh.handlers.RingChannel(unread), history=True
+            ALL_ALIVE, zenoh.handlers.RingChannel(unread), history=True
         )
         self._kept.append(subscriber)
 
@@ -130,7 +156,15 @@ class LanLink:
         self.session.close()  # type: ignore[no-untyped-call]
 
 
-def _settings(table: LanTable) -> zenoh.Config:
+def _bytes_of(content: zenoh.ZBytes | None) -> bytes | None:
+    return None if content is None else content.to_bytes()
+
+
+def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
+    return lambda payload, envelope: query.reply(query.key_expr, payload, attachment=envelope)
+
+
+def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks: bool) -> zenoh.Config:
     config = zenoh.Config()
 
     def put(key: str, value: Any) -> None:
@@ -144,9 +178,35 @@ def _settings(table: LanTable) -> zenoh.Config:
     put("connect/endpoints", list(table.connect))
     put("connect/timeout_ms", -1)
     put("connect/exit_on_failure", False)
+    # A peer that is not there yet keeps nobody: opening would wait for it for half a second.
+    put("open/return_conditions/connect_scouted", False)
     shortest, longest = RETRY_MS
     put("connect/retry", {"period_init_ms": shortest, "period_max_ms": longest, "period_increase_factor": 1})
+    put("access_control", access_control(rack, table, asks))
+    if credentials is not None and table.has_tls:
+        put("transport/link/tls", _tls(credentials))
+    put("transport/link/protocols", sorted({endpoint.protocol for _, endpoint in table.endpoints}) or ["tcp"])
+    # Whoever opens a connection and says no more is forgotten; these many at once are borne.
+    put("transport/unicast/accept_timeout", HANDSHAKE_MS)
+    put("transport/unicast/open_timeout", HANDSHAKE_MS)
+    put("transport/link/rx/max_message_size", max(table.most_bytes, MOST_ANSWER) + HEAD_BYTES + ZENOH_BYTES)
     put("transport/link/tx/lease", round(table.lease_ms))
     put("transport/link/tx/keep_alive", KEEP_ALIVES)
     put("transport/link/tx/queue/size/real_time", 16)
+    # An answer to somebody who does not take it holds its cycle no longer than until the peer counts as lost.
+    put("transport/link/tx/queue/congestion_control/block/wait_before_close", round(table.lease_ms * 1e3))
     return config
+
+
+def _tls(credentials: Credentials) -> dict[str, Any]:
+    certificate, key = str(credentials.certificate), str(credentials.key)
+    return {
+        "root_ca_certificate": str(credentials.authority),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+    }

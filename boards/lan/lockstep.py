@@ -29,10 +29,11 @@ import zenoh
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.lan.awaited import GIVE_UP_S, Why, word_of
-from rack.boards.lan.envelope import Envelope, Flaw, Sealer
-from rack.boards.lan.link import ALIVE, Arrived, LanLink, launch_and_cycle, step_key
+from rack.boards.lan.envelope import Envelope, Flaw
+from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle, step_key
+from rack.boards.lan.link import Arrived, LanLink
 from rack.boards.lan.peers import NONE
-from rack.boards.lan.step import STEP_KIND, Step, StepFlag, pack_step, unpack_step
+from rack.boards.lan.step import MOST_STEP, STEP_KIND, Step, StepFlag, pack_step, unpack_step
 from rack.levels.errors import CannotGoOn
 
 LOOK_S = 0.1
@@ -108,9 +109,10 @@ class Barrier:
         self._events: SimpleQueue[zenoh.Sample] = SimpleQueue()
         self._kept: list[object] = []
 
-    def open(self, link: LanLink, sealer: Sealer, launch: int) -> None:
+    def open(self, link: LanLink, launch: int) -> None:
         """Listen to the others. Call it before this launch shows that it is there."""
-        self._rack, self._launch, self._sealer, self._key = link.rack, launch, sealer, step_key(link.rack)
+        self._rack, self._launch, self._sealer = link.rack, launch, link.sealer.taking(MOST_STEP)
+        self._key = step_key(link.rack)
         self._put = link.publish(self._key, reliable=True)
         # Called by a thread of the network: it wakes the cycle that waits, and does no more.
         handler = zenoh.handlers.Callback(self._events.put, indirect=False)
@@ -119,7 +121,7 @@ class Barrier:
             if self._is_restarted:
                 # It may have ended meanwhile.
                 partner.gone_s = time.monotonic()
-        self._kept.append(link.session.liveliness().declare_subscriber(ALIVE, handler, history=True))
+        self._kept.append(link.session.liveliness().declare_subscriber(ALL_ALIVE, handler, history=True))
 
     def publish(self, key: str) -> Callable[[bytes, bytes], None]:
         """Return a function that sends payload and envelope under a key expression, in the step of this cycle."""
@@ -142,6 +144,8 @@ class Barrier:
         self._now_ns = now_ns = tick * self._tick_ns
         awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
         self._content, self._exports = pack_step(self.cycle_ns, awaited, self._exports), []
+        if len(self._content) > MOST_STEP:
+            self._refuse(f"a cycle exports {len(self._content)} bytes; lockstep permits {MOST_STEP}")
         self._send(self._first)
         while late := [partner for partner in self._partners.values() if not partner.has_reached(now_ns)]:
             try:

@@ -8,7 +8,7 @@ from itertools import chain
 from typing import Any
 
 from rack.backplane.layout import Layout, Protocol
-from rack.boards.config import RackConfig, loads, rack_timing, wire
+from rack.boards.config import RackConfig, loads, rack_timing, resolve
 from rack.boards.config.layout import obtained_core
 from rack.boards.errors import ConfigError
 from rack.levels.timing.rack import RackTiming
@@ -37,7 +37,7 @@ class JudgedConfig:
     @classmethod
     def of(cls, config: RackConfig, budgets: Mapping[str, Budget] | None = None) -> JudgedConfig:
         """Wire a config and judge it by `budgets`, or by its own. Raises `ConfigError`."""
-        layout = wire(config)
+        layout = resolve(config).layout
         timing = rack_timing(config, layout, budgets)
         return cls(config, layout, timing, tuple(verdicts(timing)))
 

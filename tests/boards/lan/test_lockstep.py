@@ -133,7 +133,10 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
     with running(racks[:1]) as (rack,):
         rack.start(1.0)
         watch([rack], until=lambda: rack.segment.block("lan")[Block.AWAITS])
-        assert awaited(rack.segment, "lan") == f"waits for rack '{names[1]}': it has not come yet"
+        assert (
+            awaited(rack.segment, "lan")
+            == f"waits for rack '{names[1]}': it has not come yet, or does not name this rack"
+        )
         watch([rack], until=lambda: rack.events[-1].kind == "waiting")
         assert rack.segment.words[System.TICK] < CYCLE
         rack.stop("test")

@@ -1,0 +1,104 @@
+"""Who may do what on a rack's session, as rules for zenoh's access control. What no rule allows is denied.
+
+A rule concerns what comes in (ingress) or goes out (egress), a kind of message, and keys. With TLS its subject is the
+common name of the other side's certificate; without, there is no identity, and rules hold for everyone: what a rack
+exports anybody may read then, and what it imports is known by its key and its seal alone. Both sides of a subscription
+need a rule: to declare it is a message too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+from rack.boards.lan.config import LanTable, Right
+from rack.boards.lan.keys import ALL_ALIVE, ASKED, any_alive, ask_keys, out_key, ping_key, pong_key, step_key
+
+IN, OUT = ("ingress",), ("egress",)
+SUBSCRIBE, PUT, TOKEN = ("declare_subscriber",), ("put",), ("liveliness_token",)
+WATCH_TOKENS = ("declare_liveliness_subscriber", "liveliness_query")
+ANYONE = "*"
+"""Subject of rules for everyone; no rack may have this name."""
+
+
+class Permission(NamedTuple):
+    """Messages of some kinds under some keys, in one direction, that are allowed."""
+
+    flows: Sequence[str]
+    messages: Sequence[str]
+    keys: Sequence[str]
+
+
+def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
+    """Return zenoh's `access_control` for rack `own`; `asks`: it asks racks, and they may answer."""
+    by_subject: dict[str, list[Permission]] = {}
+    if asks:
+        by_subject[ANYONE] = list(_asking(own))
+    if not table.has_tls:
+        by_subject.setdefault(ANYONE, []).extend(_shown(own, [out_key(own, e.source) for e in table.exports.values()]))
+    for peer in dict.fromkeys([*table.racks, *table.permit]):
+        subject = peer if table.has_tls else ANYONE
+        rules = by_subject.setdefault(subject, [])
+        rules += [*_visible(own), *_answering(own, peer, table.permit.get(peer, ()))]
+        if peer in table.racks:
+            rules += _exchange(own, peer, table)
+    return _configured(by_subject)
+
+
+def _exchange(own: str, peer: str, table: LanTable) -> Iterator[Permission]:
+    """Yield the rules for a rack with which this one exchanges mailboxes."""
+    imports = [out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer]
+    exports = [out_key(own, entry.source) for entry in table.exports.values()]
+    taken = [*imports, step_key(peer), ping_key(peer, own), pong_key(peer, own)]
+    given = [*exports, step_key(own), ping_key(own, peer), pong_key(own, peer)]
+    yield Permission(OUT, SUBSCRIBE, [*taken, ping_key("*", own), pong_key("*", own)])
+    yield Permission(IN, PUT, taken)
+    yield Permission(IN, SUBSCRIBE, [ping_key("*", peer), pong_key("*", peer)])
+    yield from _shown(own, given)
+    yield Permission(OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)])
+    yield Permission(IN, TOKEN, [any_alive(peer)])
+
+
+def _shown(own: str, keys: Sequence[str]) -> Iterator[Permission]:
+    """Yield the rules for keys to which others may subscribe."""
+    if keys:
+        yield Permission(IN, SUBSCRIBE, keys)
+        yield Permission(OUT, PUT, keys)
+    yield from _visible(own)
+
+
+def _visible(own: str) -> Iterator[Permission]:
+    """Yield the rules for others that may know that this rack is there."""
+    yield Permission(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(own)])
+    yield Permission(OUT, TOKEN, [any_alive(own)])
+
+
+def _answering(own: str, peer: str, rights: Iterable[Right]) -> Iterator[Permission]:
+    """Yield the rules for questions of a peer."""
+    keys = [ask_keys(own, ASKED[right], peer) for right in rights]
+    if keys:
+        yield Permission(OUT, ("declare_queryable",), [ask_keys(own)])
+        yield Permission(IN, ("query",), keys)
+        yield Permission(OUT, ("reply",), keys)
+
+
+def _asking(own: str) -> Iterator[Permission]:
+    """Yield the rules for questions to any rack."""
+    asked = [ask_keys("*", "*", own)]
+    yield Permission(IN, ("declare_queryable",), [ask_keys("*")])
+    yield Permission(OUT, ("query",), asked)
+    yield Permission(IN, ("reply",), asked)
+    yield Permission(OUT, WATCH_TOKENS, [ALL_ALIVE])
+    yield Permission(IN, TOKEN, [ALL_ALIVE])
+
+
+def _configured(by_subject: dict[str, list[Permission]]) -> dict[str, Any]:
+    rules, policies = [], []
+    for subject, allowed in by_subject.items():
+        ids = [f"{subject}-{at}" for at in range(len(allowed))]
+        for name, rule in zip(ids, allowed, strict=True):
+            flows, messages, keys = map(list, rule)
+            rules.append({"id": name, "permission": "allow", "flows": flows, "messages": messages, "key_exprs": keys})
+        policies.append({"rules": ids, "subjects": [subject]})
+    names = [{"id": name} | ({} if name == ANYONE else {"cert_common_names": [name]}) for name in by_subject]
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": names, "policies": policies}

@@ -1,0 +1,61 @@
+"""Endpoints: where a session listens, or connects to."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from ipaddress import ip_address
+from typing import NamedTuple
+
+TLS = ("tls", "quic")
+_SHAPE = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})", re.ASCII)
+_NUMBERS = re.compile(r"[0-9.]*")
+PERMITTED = "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535"
+
+
+class Endpoint(NamedTuple):
+    """An endpoint; `host` is a name, or an address without brackets."""
+
+    protocol: str
+    host: str
+    port: int
+
+    @classmethod
+    def of(cls, text: str) -> Endpoint:
+        """Return the endpoint in a text. Raises `ValueError`: it is malformed."""
+        found = _SHAPE.fullmatch(text)
+        if found is None or not 0 < int(found[3]) <= 65535:
+            raise ValueError(PERMITTED)
+        host = found[2].strip("[]")
+        # What looks like an address must be one: resolvers take 127.1 and 300 for addresses too.
+        if ":" in host or _NUMBERS.fullmatch(host):
+            try:
+                ip_address(host)
+            except ValueError:
+                raise ValueError(f"'{host}' is no address; {PERMITTED}") from None
+        return cls(found[1], host, int(found[3]))
+
+    @property
+    def has_tls(self) -> bool:
+        """Whether both sides show certificates."""
+        return self.protocol in TLS
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach it."""
+        with suppress(ValueError):
+            return ip_address(self.host).is_loopback
+        return self.host == "localhost"
+
+    @property
+    def is_everywhere(self) -> bool:
+        """Whether it stands for all addresses of the machine."""
+        with suppress(ValueError):
+            return ip_address(self.host).is_unspecified
+        return False
+
+
+def proper(text: str) -> str:
+    """Return an endpoint as it is. Raises `ValueError`: it is malformed."""
+    Endpoint.of(text)
+    return text

@@ -1,0 +1,62 @@
+"""Key expressions on the network; R is the name of the rack that sends, or that is asked.
+
+    rack/R/alive/<launch>          liveliness token: gone when the adapter's process ends or is silent for the lease;
+                                   in lockstep its cycle follows, ns, after a hyphen
+    rack/R/out/<board>/<port>      an exported mailbox
+    rack/R/step                    lockstep: a cycle of R's adapter, with all that it exports
+    rack/R/ping/<to>, .../pong/<to>   round trips between clocks
+    rack/R/ask/<what>/<from>       a question to R, answered in its adapter's cycles to those who have the right
+
+All begin with a rack's name, so that access control can hold each rack to its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rack.boards.lan.config import Right
+
+ALL_ALIVE = "rack/*/alive/*"
+ASKED: Mapping[Right, str] = {"watch": "read", "command": "command", "stop": "stop"}
+"""What those may ask who have a right, as in its key."""
+
+
+def out_key(rack: str, mailbox: str) -> str:
+    """Return the key expression of an exported mailbox."""
+    return f"rack/{rack}/out/{mailbox.replace('.', '/')}"
+
+
+def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
+    """Return the key expression of a launch's token; in lockstep with the length of its adapter's cycle, ns."""
+    return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
+
+
+def launch_and_cycle(alive: str) -> tuple[int, int]:
+    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real time."""
+    launch, _, cycle_ns = alive.rpartition("/")[2].partition("-")
+    return int(launch, 16), int(cycle_ns or 0)
+
+
+def any_alive(rack: str) -> str:
+    """Return the key expression of the tokens of all launches of a rack."""
+    return f"rack/{rack}/alive/*"
+
+
+def step_key(rack: str) -> str:
+    """Return the key expression of the cycles of a rack's adapter, in lockstep."""
+    return f"rack/{rack}/step"
+
+
+def ping_key(rack: str, to: str) -> str:
+    """Return the key expression of a round trip that a rack begins."""
+    return f"rack/{rack}/ping/{to}"
+
+
+def pong_key(rack: str, to: str) -> str:
+    """Return the key expression of a round trip that a rack sends back."""
+    return f"rack/{rack}/pong/{to}"
+
+
+def ask_keys(rack: str, what: str = "", asker: str = "") -> str:
+    """Return the key expression of all questions to a rack, or of those of one asker about one thing."""
+    return f"rack/{rack}/ask/{what}/{asker}/**" if asker else f"rack/{rack}/ask/**"

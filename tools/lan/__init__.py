@@ -1,0 +1,1 @@
+"""Racks of other machines, and the credentials of racks that work together."""
