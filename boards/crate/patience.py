@@ -6,8 +6,6 @@ import math
 import time
 
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block
-from rack.boards.config.schema import LAN
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.requests import Opened, PreloadFailed, Preloading
 from rack.boards.errors import LaunchError
@@ -52,16 +50,17 @@ class RackAwaited:
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment, self._journal = segment, journal
-        self._adapter = LAN if LAN in (task.name for task in segment.layout.tasks) else None
         self._patience: Patience | None = None
 
     def look(self) -> None:
         """Report it, if that is due."""
-        if self._adapter is None or not self._segment.block(self._adapter)[Block.AWAITS]:
+        waits = list(awaited(self._segment))
+        if not waits:
             self._patience = None
             return
         self._patience = self._patience or Patience(self._journal, math.inf)
-        self._patience.report(f"'{self._adapter}' {awaited(self._segment, self._adapter)}")
+        for board, why in waits:
+            self._patience.report(f"'{board}' {why}")
 
 
 def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:

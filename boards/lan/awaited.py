@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from enum import IntEnum
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.boards.lan.config import LanTable
 
 GIVE_UP_S = 10.0
 """Real time after which a rack whose adapter is gone counts as lost; a restarted board is back sooner."""
@@ -34,13 +34,15 @@ def word_of(place: int, why: Why) -> int:
     return 1 + place + (why << _PLACES)
 
 
-def awaited(segment: Segment, board: str) -> str:
-    """Return for which rack an adapter waits, and why, as text; empty: it does not."""
-    word = segment.block(board)[Block.AWAITS]
-    if not word:
-        return ""
-    why, place = divmod(word - 1, 1 << _PLACES)
-    table = tomllib.loads(segment.config)["adapter"][board]
-    keys = {field.alias or name for name, field in LanTable.model_fields.items()}
-    racks = LanTable.model_validate({key: table[key] for key in keys & table.keys()}).racks
-    return f"waits for rack '{racks[place]}': {_TEXTS[Why(why)]}"
+def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
+    """Yield the adapter that waits for another rack, if one does, with a text that says for which and why."""
+    for task in segment.layout.tasks:
+        if word := segment.block(task.name)[Block.AWAITS]:
+            # Only here: it takes a while to import.
+            from rack.boards.lan.config import LanTable
+
+            why, place = divmod(word - 1, 1 << _PLACES)
+            table = tomllib.loads(segment.config)["adapter"][task.board]
+            keys = {field.alias or name for name, field in LanTable.model_fields.items()}
+            racks = LanTable.model_validate({key: table[key] for key in keys & table.keys()}).racks
+            yield task.board, f"waits for rack '{racks[place]}': {_TEXTS[Why(why)]}"

@@ -105,7 +105,9 @@ class Barrier:
         self._exports: list[Arrived] = []
         self._imports: dict[str, deque[Arrived]] = {}
         self._changes: list[tuple[str, int, bool]] = []
-        self._now_ns, self._content, self._sent = NEVER, b"", 0
+        # A rack is one step ahead of what another has received, at most.
+        self._steps: deque[tuple[int, bytes]] = deque(maxlen=2)
+        self._now_ns, self._sent = NEVER, 0
         self._events: SimpleQueue[zenoh.Sample] = SimpleQueue()
         self._kept: list[object] = []
 
@@ -143,10 +145,11 @@ class Barrier:
         """
         self._now_ns = now_ns = tick * self._tick_ns
         awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
-        self._content, self._exports = pack_step(self.cycle_ns, awaited, self._exports), []
-        if len(self._content) > MOST_STEP:
-            self._refuse(f"a cycle exports {len(self._content)} bytes; lockstep permits {MOST_STEP}")
-        self._send(self._first)
+        content, self._exports = pack_step(self.cycle_ns, awaited, self._exports), []
+        if len(content) > MOST_STEP:
+            self._refuse(f"a cycle exports {len(content)} bytes; lockstep permits {MOST_STEP}")
+        self._steps.append((now_ns, content))
+        self._send(now_ns, content, self._first)
         while late := [partner for partner in self._partners.values() if not partner.has_reached(now_ns)]:
             try:
                 self._note(self._events.get(timeout=LOOK_S))
@@ -162,15 +165,19 @@ class Barrier:
 
     def close(self) -> None:
         """Let the others go on without this rack, if its run has ended: a board alone may come back."""
-        if self._content and (self._is_over or self._has_refused):
-            self._send(StepFlag.OVER | self._first)
+        if self._steps and (self._is_over or self._has_refused):
+            self._send(*self._steps[-1], StepFlag.OVER | self._first)
 
-    def _send(self, flags: StepFlag) -> None:
+    def _send(self, time_ns: int, content: bytes, flags: StepFlag) -> None:
         self._sent += 1
-        now = self._now_ns
-        tick = now // self._tick_ns
-        head = Envelope(STEP_KIND, self._launch, self._sent, self._sent, tick, now, now, flags)
-        self._put(self._content, self._sealer.seal(self._key, head, self._content))
+        tick = time_ns // self._tick_ns
+        head = Envelope(STEP_KIND, self._launch, self._sent, self._sent, tick, time_ns, time_ns, flags)
+        self._put(content, self._sealer.seal(self._key, head, content))
+
+    def _send_again(self, flags: StepFlag) -> None:
+        """Send the newest steps to somebody who may not have received them; others ignore them."""
+        for time_ns, content in self._steps:
+            self._send(time_ns, content, flags)
 
     @property
     def _first(self) -> StepFlag:
@@ -208,8 +215,8 @@ class Barrier:
         if is_there and partner.launch in (NONE, launch):
             self._check_cycle(partner, cycle_ns)
             partner.gone_s = None
-            # It has not received what was sent before.
-            self._send(self._first)
+            # It has come, or come back: what was sent meanwhile is lost.
+            self._send_again(self._first)
         elif is_there:
             self._is_of(partner, launch)
         elif partner.launch == launch:
@@ -235,7 +242,7 @@ class Barrier:
             partner.forget()
         elif step.flags & StepFlag.FIRST:
             # Before this rack goes on: it may come too late for the other one to have received its step.
-            self._send(StepFlag(0))
+            self._send_again(StepFlag(0))
 
     def _is_of(self, partner: Partner, launch: int) -> bool:
         """Say whether a launch is the one that steps with this rack; one that comes later takes no part."""

@@ -11,8 +11,8 @@ import pytest
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.crate import patience
-from rack.boards.lan.awaited import awaited
 from rack.levels.peer import Presence, peer_port
+from rack.tools.runs.holds import Holds
 from tests.boards.lan.racks import Ended, configs, ended, ring_texts, run_together, running, started, watch
 from tests.processes import forked, runs, wait_until
 
@@ -133,10 +133,8 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
     with running(racks[:1]) as (rack,):
         rack.start(1.0)
         watch([rack], until=lambda: rack.segment.block("lan")[Block.AWAITS])
-        assert (
-            awaited(rack.segment, "lan")
-            == f"waits for rack '{names[1]}': it has not come yet, or does not name this rack"
-        )
+        said = f"waits for rack '{names[1]}': it has not come yet, or does not name this rack"
+        assert [hold.why for hold in Holds(rack.segment).look() if hold.level == "lan"] == [said]
         watch([rack], until=lambda: rack.events[-1].kind == "waiting")
         assert rack.segment.words[System.TICK] < CYCLE
         rack.stop("test")
