@@ -9,8 +9,10 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
+from typing import TYPE_CHECKING
 
-from rack.backplane.segment import Segment
+if TYPE_CHECKING:
+    from rack.backplane.segment import Segment
 
 _FLOCK = struct.Struct("hhqqi4x")
 """`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description have none)."""
@@ -32,13 +34,6 @@ class ByteLock:
             return False
         return True
 
-    @staticmethod
-    def is_taken(segment: Segment, address: int) -> bool:
-        """Say whether the byte at a bus address is locked, without taking the lock."""
-        asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
-        kind: int = _FLOCK.unpack(fcntl.fcntl(segment.fd, fcntl.F_OFD_GETLK, asked))[0]
-        return kind != fcntl.F_UNLCK
-
     def release(self) -> None:
         """Release the lock; it may be taken again."""
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._unlock)
@@ -48,3 +43,10 @@ class ByteLock:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+
+def is_locked(fd: int, address: int) -> bool:
+    """Say whether the byte at a bus address of an open segment is locked, without taking the lock."""
+    asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
+    kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
+    return kind != fcntl.F_UNLCK

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from rack.backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
 from rack.backplane.byte_lock import ByteLock
@@ -74,6 +75,18 @@ class RequestEntry:
         return RequestStage(self.words[RequestWord.STAGE])
 
 
+class Claim(NamedTuple):
+    """A request that its client has added. While it waits, its `lock` shows that the client lives."""
+
+    entry: RequestEntry
+    ticket: int
+    lock: ByteLock
+
+    def leave(self) -> None:
+        """Be its client no more."""
+        self.lock.close()
+
+
 class OperatorTable:
     """The table of one rack. `entries` holds all entries, free ones too."""
 
@@ -86,9 +99,9 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        entry, claim = self._add(request)
-        claim.close()
-        return entry
+        claim = self._await_turn(request, has_client=False)
+        claim.leave()
+        return claim.entry
 
     @contextmanager
     def claim(self, request: Request) -> Iterator[RequestEntry]:
@@ -96,33 +109,42 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        entry, claim = self._add(request, has_client=True)
-        ticket = entry[RequestWord.TICKET]
+        claim = self._await_turn(request, has_client=True)
         try:
-            yield entry
+            yield claim.entry
         finally:
-            self.withdraw(entry, ticket)
-            claim.close()
+            self.withdraw(claim.entry, claim.ticket)
+            claim.leave()
 
-    def _add(self, request: Request, has_client: bool = False) -> tuple[RequestEntry, ByteLock]:
+    def _await_turn(self, request: Request, has_client: bool) -> Claim:
+        # Bounded by the time in which another process fills an entry.
+        while (claim := self.try_claim(request, has_client)) is None:
+            continue
+        return claim
+
+    def try_claim(self, request: Request, has_client: bool = True) -> Claim | None:
+        """Add a request without waiting; None while another process fills an entry, and might be preempted meanwhile.
+
+        Raises `OperatorTableError` when all entries wait for their ticks.
+        """
         lock = ByteLock(self._segment, self._segment.map.operator)
         try:
-            # Bounded by the time in which another process fills an entry.
-            while not lock.take():
-                continue
-            settled = [entry for entry in self.entries if not self.is_waiting(entry)]
-            if not settled:
-                why = f"{len(self.entries)} commands wait for their ticks"
-                raise OperatorTableError(f"the operator table is full: {why}; permitted: once one of them is given")
-            entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
-            ticket = self._words[System.REQUESTED] + 1
-            claim = ByteLock(self._segment, _CLAIMS + ticket)
-            if has_client:
-                claim.take()
-            self._fill(entry, request, ticket, has_client)
+            return self._add(request, has_client) if lock.take() else None
         finally:
             lock.close()
-        return entry, claim
+
+    def _add(self, request: Request, has_client: bool) -> Claim:
+        settled = [entry for entry in self.entries if not self.is_waiting(entry)]
+        if not settled:
+            why = f"{len(self.entries)} commands wait for their ticks"
+            raise OperatorTableError(f"the operator table is full: {why}; permitted: once one of them is given")
+        entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
+        ticket = self._words[System.REQUESTED] + 1
+        lock = ByteLock(self._segment, _CLAIMS + ticket)
+        if has_client:
+            lock.take()
+        self._fill(entry, request, ticket, has_client)
+        return Claim(entry, ticket, lock)
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
         """Withdraw a request that still waits; False when it was issued."""
@@ -138,9 +160,7 @@ class OperatorTable:
         words = entry.words
         if words[RequestWord.STAGE] != RequestStage.WAITING:
             return False
-        return not words[RequestWord.HAS_CLIENT] or ByteLock.is_taken(
-            self._segment, _CLAIMS + words[RequestWord.TICKET]
-        )
+        return not words[RequestWord.HAS_CLIENT] or self._segment.is_locked(_CLAIMS + words[RequestWord.TICKET])
 
     def waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""

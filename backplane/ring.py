@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +18,17 @@ class Drained(NamedTuple):
 
 
 class Ring:
-    """A ring of fixed records that another process writes; `head` holds the number of records written."""
+    """A ring of fixed records that another process writes; `head` holds the number of records written.
 
-    def __init__(self, memory: memoryview, dtype: np.dtype, head: memoryview) -> None:
+    `oldest` returns the number of the oldest record in `memory`, where that is a mirror without the others.
+    """
+
+    def __init__(
+        self, memory: memoryview, dtype: np.dtype, head: memoryview, oldest: Callable[[], int] = lambda: 0
+    ) -> None:
         # As plain bytes: copying by field would skip the padding, and checksums would not match.
         self._rows, self._dtype = np.frombuffer(memory, dtype=f"V{dtype.itemsize}"), dtype
-        self._head = head
+        self._head, self._oldest = head, oldest
         self._depth = len(self._rows)
         self._taken = 0
 
@@ -38,7 +44,7 @@ class Ring:
     def drain(self) -> Drained:
         """Read every record written since the last call."""
         head = self._head[0]
-        first = max(self._taken + 1, head - self._depth + 1)
+        first = max(self._taken + 1, head - self._depth + 1, self._oldest())
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
         # Rows that the writer reached during the copy.
         torn = max(0, oldest_kept(self._head[0], self._depth) - first)

@@ -14,11 +14,12 @@ import stat
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import posix_ipc
 
 from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
+from rack.backplane.byte_lock import is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.layout import ExchangeSpec, FieldSpec, Layout, MailboxSpec, TaskSpec
 from rack.backplane.process import is_alive, start_time
@@ -31,13 +32,28 @@ SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
 
 
-class Segment:
-    """An attached segment: `layout`, `config` (TOML text), `map`, and its memory as `words` and `bytes`."""
+class Launch(NamedTuple):
+    """When a segment was made, ns: on the wall clock, and on CLOCK_MONOTONIC of its machine."""
 
-    def __init__(self, rack: str, fd: int, size: int) -> None:
+    created_ns: int
+    monotonic_ns: int
+
+    @property
+    def wall_offset_ns(self) -> int:
+        """Wall clock less CLOCK_MONOTONIC: one for the whole run, as the wall clock may be set meanwhile."""
+        return self.created_ns - self.monotonic_ns
+
+
+class Segment:
+    """An attached segment: `layout`, `config` (TOML text), `map`, and its memory as `words` and `bytes`.
+
+    A mirror of one on another machine has no file, thus no `fd`: it learns who is alive there by other ways.
+    """
+
+    def __init__(self, rack: str, memory: mmap.mmap, fd: int = -1) -> None:
         self.rack = rack
         self.fd = fd
-        self.bytes = memoryview(mmap.mmap(fd, size))
+        self.bytes = memoryview(memory)
         self.words = self.bytes.cast("q")
         self.layout: Layout
         self.config: str
@@ -59,7 +75,7 @@ class Segment:
         try:
             # Otherwise a full /dev/shm would raise SIGBUS at the first access to a page.
             os.posix_fallocate(fd, 0, size)
-            segment = cls(layout.rack, fd, size)
+            segment = cls(layout.rack, mmap.mmap(fd, size), fd)
             segment.layout, segment.config, segment.map = layout, config, places
             segment._fill_head(texts)
             segment._take_name()
@@ -93,7 +109,7 @@ class Segment:
         self.words[Head.SIZE] = len(self.bytes)
         self.words[Head.LAUNCHER_PID] = os.getpid()
         self.words[Head.LAUNCHER_START] = start_time(os.getpid())
-        self.words[Head.CREATED_NS] = time.time_ns()
+        self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS] = time.time_ns(), time.monotonic_ns()
         # Last, so that no process attaches to half a segment.
         self.words[Head.MAGIC] = MAGIC
 
@@ -105,7 +121,7 @@ class Segment:
         """
         segment = cls.open(rack)
         try:
-            segment._read_head()
+            segment.read_head()
         except SegmentError:
             segment.close()
             raise
@@ -129,9 +145,10 @@ class Segment:
             os.close(shm.fd)
             why = f"owner {found.st_uid}, {found.st_size} bytes: not a segment of this user's"
             raise SegmentError(f"rack '{rack}': {why}")
-        return cls(rack, shm.fd, found.st_size)
+        return cls(rack, mmap.mmap(shm.fd, found.st_size), shm.fd)
 
-    def _read_head(self) -> None:
+    def read_head(self) -> None:
+        """Read layout and config. Raises `SegmentError` when size or version is wrong."""
         if self.words[Head.MAGIC] != MAGIC or self.words[Head.VERSION] != VERSION:
             raise SegmentError(
                 f"rack '{self.rack}': layout version {self.words[Head.VERSION]}; this program attaches to {VERSION}"
@@ -157,6 +174,22 @@ class Segment:
         """Return a task's control block, as words (`words.Block`). Raises `KeyError`."""
         start = self.map.blocks[task] // 8
         return self.words[start : start + max(Block) + 1]
+
+    def is_locked(self, address: int) -> bool:
+        """Say whether a process holds the lock on the byte at a bus address: see `rack.backplane.byte_lock`."""
+        return is_locked(self.fd, address)
+
+    def oldest(self, ring: int) -> int:
+        """Return the number of the oldest record that is here of the ring whose head word is at a bus address; 0: all.
+
+        A mirror lacks records: those that it did not fetch, or that were overwritten before it could.
+        """
+        return 0
+
+    @property
+    def launch(self) -> Launch:
+        """When it was made."""
+        return Launch(self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS])
 
     @property
     def launcher(self) -> int:

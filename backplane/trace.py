@@ -12,6 +12,7 @@ task may have been preempted.
 from __future__ import annotations
 
 from enum import IntFlag
+from functools import partial
 from struct import Struct
 
 import numpy as np
@@ -79,7 +80,8 @@ def trace_ring(segment: Segment, task: str) -> Ring:
     """Return the reading end of a task's trace ring; its rows are of dtype `RECORD`."""
     spec = segment.layout.task(task)
     head = segment.block(task)[Block.TRACE_HEAD : Block.TRACE_HEAD + 1]
-    return Ring(segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE), RECORD, head)
+    memory = segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
+    return Ring(memory, RECORD, head, partial(segment.oldest, segment.map.blocks[task] + 8 * Block.TRACE_HEAD))
 
 
 class CycleRecord:

@@ -9,6 +9,19 @@ from __future__ import annotations
 from enum import IntEnum
 
 
+def switch(tick: int, is_on: bool) -> int:
+    """Return the value of a word that switches on, or off, at `tick`: until then the opposite holds.
+
+    So readers agree on it by ticks alone, whenever they look. Each switch follows the opposite one; 0: never on.
+    """
+    return 2 * tick + is_on
+
+
+def is_on(word: int, tick: int) -> bool:
+    """Say whether such a word is on at `tick`."""
+    return bool(word & 1) == (tick >= word >> 1)
+
+
 class Head(IntEnum):
     """Words at the head of the segment, written once by the Rack."""
 
@@ -22,6 +35,7 @@ class Head(IntEnum):
     LAYOUT_SIZE = 7
     CONFIG_AT = 8
     CONFIG_SIZE = 9
+    CREATED_MONOTONIC_NS = 10  # the same moment as CREATED_NS, CLOCK_MONOTONIC
 
 
 class System(IntEnum):
@@ -50,6 +64,7 @@ class System(IntEnum):
     COMMANDED = 52  # serial of the newest command issued; written by the clock
     HOLD_AT = 53  # 1 + tick before which lockstep holds, for single steps; 0: it does not. Written by the host
     HELD = 54  # 1 + tick before which it holds now; 0: it does not. Written by the clock
+    PEER_STOP = 55  # while another rack is lost, the arm is to stop: see `switch`. Written by the network adapter
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 
@@ -120,6 +135,8 @@ class Box(IntEnum):
     REFUSED = 6  # of a queue: messages refused because it was full
     SENT = 7  # of a queue: serial of the newest message of its own writer; HEAD is greater while another has published
     TAKEN = 8  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
+    VOID = 9  # of what comes from another rack, while that is lost: its writer counts as lost. See `switch`
+    KEPT = 10  # the same, for racks that go on: its information does not grow too old. See `switch`
 
 
 class Slot(IntEnum):

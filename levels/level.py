@@ -85,7 +85,8 @@ class Input(NamedTuple):
     """A mailbox ("world.model"), or relative to the level: "above.command", "below.status", "own.plan". A config may
     wire the port elsewhere."""
     many: bool = False
-    """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order, in place of one."""
+    """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order, in place of one. By
+    mailbox where the config names several of one board."""
     optional: bool = False
     """With `many`: the level also works without any such neighbour."""
 
@@ -169,6 +170,7 @@ class LevelContext:
     below: Mapping[str, Pace] = field(default_factory=dict)  # boards of the level below, by name
     params: Mapping[str, Any] = field(default_factory=dict)  # `[board.<name>.params]`, as given
     phase: int = 0  # first tick of the level, less than `every`
+    rack: str = ""  # name of the rack
 
     @property
     def period_s(self) -> float:

@@ -9,6 +9,7 @@ at ticks.
 
 from __future__ import annotations
 
+from functools import partial
 from hashlib import blake2b
 
 import numpy as np
@@ -33,7 +34,8 @@ class MailboxRing(Ring):
         address, self._stride = segment.map.mailboxes[name], slot_stride(spec)
         self._box = segment.words[address // 8 : address // 8 + len(Box)]
         memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
-        super().__init__(memory, row_dtype(spec), self._box[Box.HEAD : Box.HEAD + 1])
+        oldest = partial(segment.oldest, address + 8 * Box.HEAD)
+        super().__init__(memory, row_dtype(spec), self._box[Box.HEAD : Box.HEAD + 1], oldest)
         self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
     def drain(self) -> Drained:

@@ -106,10 +106,15 @@ class ProperContent:
     def __init__(self, fields: tuple[FieldSpec, ...]) -> None:
         self._numbers = [field.name for field in fields if np.dtype(field.kind).kind == "f"]
         self._enums = [(field.name, [number for _, number in field.values]) for field in fields if field.values]
+        self._groups = [(field.name, ProperContent(field.fields)) for field in fields if field.fields]
 
     def __call__(self, message: Message) -> bool:
         """Say whether a message is proper."""
-        record = message.record
+        return self._permits(message.record)
+
+    def _permits(self, record: np.ndarray | np.void) -> bool:
         if any(np.isnan(record[name]).any() for name in self._numbers):
             return False
-        return all(np.isin(record[name], numbers).all() for name, numbers in self._enums)
+        if not all(np.isin(record[name], numbers).all() for name, numbers in self._enums):
+            return False
+        return all(content._permits(record[name]) for name, content in self._groups)

@@ -6,6 +6,7 @@ An alarm is raised once per episode: when a condition is found, not in every cyc
 from __future__ import annotations
 
 from enum import IntEnum
+from functools import partial
 from os import eventfd_write
 from time import monotonic_ns
 
@@ -29,6 +30,10 @@ RECORD = np.dtype(
 )
 
 
+PEER = -2
+"""Subject of a demand on the arm that the loss of another rack makes."""
+
+
 class Alarm(IntEnum):
     """Kinds of alarms. In brackets: subject; value."""
 
@@ -37,7 +42,7 @@ class Alarm(IntEnum):
     FAULT_ENDS = 2  # [entry; times it acted]
     HANG = 3  # [task; releases missed]
     REJOINED = 4  # [task, -1: the clock itself; ticks it was away]
-    DEMAND = 5  # [task whose loss demands it, -1: the emergency stop or nobody; Demand]
+    DEMAND = 5  # [task whose loss demands it, PEER: another rack's, -1: the emergency stop or nobody; Demand]
     COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was issued
     # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release
@@ -73,6 +78,11 @@ class Alarm(IntEnum):
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
     MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
+    # Raised by the network adapter: other racks, and those who ask from other machines.
+    PEER_LOST = 60  # [number among the level's `names`; -]
+    PEER_BACK = 61  # [number; ticks it was away]  the same launch as before
+    PEER_RESTARTED = 62  # [number; ticks it was away]  another launch
+    REMOTE_STOP = 63  # [number; -]  another machine has set the emergency stop
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
@@ -107,7 +117,8 @@ def alarm_ring(segment: Segment, task: str) -> Ring:
     """Return the reading end of an alarm ring; its rows are of dtype `RECORD`."""
     address = segment.map.alarms[task]
     head = segment.words[address // 8 : address // 8 + 1]
-    return Ring(segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE), RECORD, head)
+    memory = segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE)
+    return Ring(memory, RECORD, head, partial(segment.oldest, address))
 
 
 CLEAN_READS = 20

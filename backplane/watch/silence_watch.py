@@ -3,7 +3,7 @@
 Executors write in every cycle, so the age of their messages has a limit; plans have none. Silence alone is a reason to
 hold (`is_lost`) but does not prove a fault. For an alarm the writer must be dead or stopped, or must have finished
 cycles for which no message came. A mailbox that is written only when there is something new has a limit of its own, for
-the age of its information; its writer reports why nothing comes.
+the age of its information; its writer reports why nothing comes, and may void what it wrote, or keep it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
-from rack.backplane.words import Block, Box
+from rack.backplane.words import Block, Box, is_on
 
 MUTE_CYCLES = 3
 """Age in cycles of the writer from which silence is investigated; two are normal."""
 STALE_CYCLES = 4
 LONG_AGO = -(1 << 62)
-_LOST, _CLAIMANT = int(Block.LOST), int(Box.CLAIMANT)
+_LOST, _CLAIMANT, _VOID, _KEPT = int(Block.LOST), int(Box.CLAIMANT), int(Box.VOID), int(Box.KEPT)
 
 
 class ReadingTask:
@@ -82,7 +82,9 @@ class SilenceWatch:
     def is_lost(self, tick: int) -> bool:
         """Say whether the writer is lost or has been silent for too long; raise an alarm if the cause is proven."""
         if max_age := self._reader.spec.max_age:
-            return tick - self._reader.basis > max_age or self.is_writer_lost(tick)
+            box = self._slots.box
+            is_old = tick - self._reader.basis > max_age and not is_on(box[_KEPT], tick)
+            return is_old or is_on(box[_VOID], tick) or self.is_writer_lost(tick)
         newest = self._reader.newest
         age = tick - newest
         if age >= self.quiet:

@@ -41,7 +41,8 @@ def named_classes(tables: Tables) -> tuple[str, ...]:
 def read(name_or_path: str | Path) -> Tables:
     """Return the tables of a config, merged with those of the files that it extends.
 
-    A name means a bundled config; text that contains '/' or ends in '.toml' is a path. Raises `ConfigError`.
+    A name means a bundled config; text that contains '/' or ends in '.toml' is a path, if it is no name as `names`
+    lists them, or such a file exists. Raises `ConfigError`.
     """
     return _read(_path(name_or_path, "config", CONFIGS), (), {})
 
@@ -68,10 +69,14 @@ def with_faults(tables: Tables, name_or_path: str | Path, own: Path | None = Non
 def names(folder: Path = CONFIGS) -> list[str]:
     """Return the names of the bundled racks, or of the configs in another folder.
 
-    A config is `<name>.toml`, or `<name>/<name>.toml`, next to its page.
+    A config is `<name>.toml`, or `<name>/<name>.toml`, next to its page. Other racks in that folder, files with a name
+    of their own, are `<name>/<rack>`.
     """
-    found = [*folder.glob("*.toml"), *(path for path in folder.glob("*/*.toml") if path.stem == path.parent.name)]
-    return sorted(path.stem for path in found)
+    found = [path.stem for path in folder.glob("*.toml")]
+    for main in (path for path in folder.glob("*/*.toml") if path.stem == path.parent.name):
+        racks = [path.stem for path in main.parent.glob("*.toml") if path == main or "name" in _tables(path)]
+        found += [main.stem if rack == main.stem else f"{main.stem}/{rack}" for rack in racks]
+    return sorted(found)
 
 
 def file_at(path: Path) -> Path | None:
@@ -126,7 +131,8 @@ def portable(model: Path) -> str:
 def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
-    files = [file_at(Path(text))] if is_path else [_named(text, folder) for folder in folders]
+    known = [folder for folder in folders if not is_path or text in names(folder)]
+    files = [*([file_at(Path(text))] if is_path else []), *(_named(text, folder) for folder in known)]
     found = next((file for file in files if file is not None), None)
     if found is None:
         by_name = ", ".join(names(folders[-1]))

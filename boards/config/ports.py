@@ -166,7 +166,13 @@ def _sources(
             mistakes.append(Mistake(f"{table_of(place)}.{at}", given, why))
         elif port in wired or start not in ("above", "below") or {*boards} <= config.board.keys() - {name}:
             # A neighbour that does not exist is reported by the rules.
-            yield port, {box.partition(".")[0]: box for box in found} if entry.many else found[0]
+            yield port, _by_board(found) if entry.many else found[0]
+
+
+def _by_board(mailboxes: Sources) -> dict[str, str]:
+    """Return the mailboxes of a port that reads many, by board, or by their names if one board writes several."""
+    boards = [box.partition(".")[0] for box in mailboxes]
+    return {board if boards.count(board) == 1 else box: box for board, box in zip(boards, mailboxes, strict=True)}
 
 
 def _own_wiring(config: RackConfig, place: TaskPlace) -> tuple[str, Mapping[str, Sources], Sources, Sources]:

@@ -283,6 +283,7 @@ class _Examined:
             task=config.task,
             sizes=self._sizes,
             params=params,
+            rack=config.name,
         )
 
 

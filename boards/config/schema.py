@@ -235,7 +235,9 @@ class LanConfig(LanTable):
         """Return the board."""
         own = {key: getattr(self, key) for key in LanConfig.model_fields.keys() - LanTable.model_fields.keys()}
         params = self.model_dump(exclude_none=True, by_alias=True, include=set(LanTable.model_fields))
-        return BoardConfig(executor=LAN_ADAPTER, params=params, **own)
+        # Without its adapter a rack does not know which others are there.
+        on_loss: OnLoss = "stop" if self.on_peer_loss == "stop" else "hold"
+        return BoardConfig(executor=LAN_ADAPTER, params=params, on_loss=on_loss, **own)
 
 
 class AdapterConfig(Table):

@@ -13,7 +13,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import MISSES, Alarm, alarm_ring
+from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
 from rack.boards.config.commands import setting_name
@@ -26,6 +26,7 @@ from rack.levels.operator import Operation
 
 About = Literal["task", "mailbox", "joint", "geom", "name", "nothing"]
 EMERGENCY_STOP = "emergency stop"
+ANOTHER_RACK = "another rack"
 
 KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
@@ -35,8 +36,11 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.BRAKES_CLOSED: "reaction",
     Alarm.BRAKES_OPENED: "recovery",
     Alarm.RE_REFERENCED: "recovery",
+    Alarm.PEER_BACK: "recovery",
+    Alarm.PEER_RESTARTED: "recovery",
     Alarm.LATCHED: "reaction",
     Alarm.QUEUE_FULL: "held",
+    Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
 }
 """The kind of event for each alarm; any other alarm is a detection."""
@@ -70,6 +74,10 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
     Alarm.MODIFICATION: ("name", "control modification '{subject}' failed and was taken out"),
+    Alarm.PEER_LOST: ("name", "rack '{subject}' is lost: its network adapter ended, or is out of reach"),
+    Alarm.PEER_BACK: ("name", "rack '{subject}' is back after {span}"),
+    Alarm.PEER_RESTARTED: ("name", "rack '{subject}' is back after {span}: it was restarted"),
+    Alarm.REMOTE_STOP: ("name", "'{subject}' has set the emergency stop from another machine"),
     Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
 }
 
@@ -87,13 +95,13 @@ class AlarmWatch:
 
     def __init__(self, segment: Segment, config: RackConfig) -> None:
         self._rings = {name: alarm_ring(segment, name) for name in (CLOCK, *(t.name for t in segment.layout.tasks))}
-        robot = config.robot
+        robot, name = config.robot, partial(setting_name, config)
         if robot is None:
-            self._events = AlarmEvents(segment)
+            self._events = AlarmEvents(segment, name=name)
         else:
             # The cell is built at the first collision.
             geom = partial(geom_name, robot, config.scene, config.clock_ns)
-            self._events = AlarmEvents(segment, robot.joints, geom, partial(setting_name, config))
+            self._events = AlarmEvents(segment, robot.joints, geom, name)
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:
@@ -144,7 +152,8 @@ class AlarmEvents:
             code = Operation(message.what).name.lower()
             text = f"{describe(message)} (command {value:.0f})"
         elif alarm == Alarm.DEMAND:
-            subject, demand = self._task(number, EMERGENCY_STOP), Demand(int(value))
+            demand = Demand(int(value))
+            subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
             kind, text = ("reaction" if demand else "recovery"), _demand(demand, subject)
         elif alarm == Alarm.BRAKES_CLOSED:
             subject, text = "", f"brakes engaged: no torque for {self._span(value)}" if value else "brakes engaged"
@@ -195,5 +204,6 @@ def counting(number: float, noun: str) -> str:
 def _demand(demand: Demand, subject: str) -> str:
     if demand == Demand.NONE:
         return "arm released: no stop is requested"
-    why = "the emergency stop is latched" if subject == EMERGENCY_STOP else f"'{subject}' is lost"
+    named = {EMERGENCY_STOP: "the emergency stop is latched", ANOTHER_RACK: "a rack that it works with is lost"}
+    why = named.get(subject, f"'{subject}' is lost")
     return f"the arm must {'ramp to rest, then brake' if demand == Demand.STOP else 'brake at once'}: {why}"

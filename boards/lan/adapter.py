@@ -3,24 +3,30 @@
 It is an ordinary board with a rate, and a priority above its neighbours'. In its cycles it sends what it exports, takes
 what has come of its imports, notes who is there, and answers questions; in between only the network's own threads run,
 which have its core and priority. Nothing here waits, but in lockstep, where time stands still meanwhile.
+
+A restarted adapter continues from its own mailboxes. The status is written before the messages that it counts: an
+adapter killed in between has lost a message, but none is passed twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
 
+from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, MessageType, State
 from rack.backplane.segment import Segment
-from rack.backplane.words import Head
+from rack.backplane.words import Head, System, switch
 from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
+from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
+from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import LanLink
+from rack.boards.lan.link import RETRY_MS, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
@@ -28,95 +34,160 @@ from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.peer import PEER, peer_port
 from rack.levels.tables import read_params
 
+TOKENS = 1024
+"""Racks that may come or go between two cycles of the adapter."""
+_LAUNCH_MASK = (1 << 62) - 1
+
 
 class LanAdapter(Adapter):
-    """Exchanges mailboxes with other racks. Its status shows every entry and every other rack."""
+    """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each rack."""
 
     params = LanParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._table = read_params(LanParams, context.params)
-        self._peers = Peers(self._table.racks)
+        self._table = table = read_params(LanParams, context.params)
+        self._peers = Peers(table.racks, table.on_peer_loss == "go on")
         self._exports: dict[str, Export] = {}
         self._imports: dict[str, Import] = {}
         self._link: LanLink | None = None
         self._barrier: Barrier | None = None
 
     @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return the other racks, and those who may ask questions: alarms name them by number."""
+        table = LanParams.found_in(params)
+        return () if table is None else tuple(dict.fromkeys([*table.racks, *table.permit]))
+
+    @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
-        """Return a port to read for each export, one to write for each import, and the status."""
+        """Return a port to read for each export, one to write for each import and rack, and the status."""
         table = LanParams.found_in(params)
         if table is None:
             return MadePorts(is_whole=False)
         known = {port: entry for port, entry in table.exports.items() if entry.source in types}
         inputs = {port: Input(types[entry.source], entry.source) for port, entry in known.items()}
-        outputs = {}
+        outputs = {STATUS: Output(status_of(table.exports, table.imports))}
         for port, entry in table.imports.items():
             try:
                 outputs[port] = Output(entry.message_type(), max_age_s=entry.max_age_ms * 1e-3)
             except LookupError:
                 continue
-        is_whole = len(known) == len(table.exports) and len(outputs) == len(table.imports)
+        is_whole = len(known) == len(table.exports) and len(outputs) == 1 + len(table.imports)
         outputs |= {peer_port(rack): Output(PEER) for rack in table.racks}
-        outputs[STATUS] = Output(status_of(table.exports, table.imports))
         return MadePorts(inputs, outputs, is_whole)
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
-        """Take the segment: its grid, and the mailboxes to exchange."""
-        words = segment.words
-        launch = xxh3(bytes(words[Head.LAUNCHER_PID : Head.CREATED_NS + 1]))
-        self._rack, self._launch, self._grid = segment.rack, launch, OwnGrid(segment)
-        self._exports = {port: Export(segment, table, launch) for port, table in self._table.exports.items()}
-        for port, entry in self._table.imports.items():
-            peer = self._peers[entry.rack]
-            self._imports[port] = Import(segment, f"{self.context.board}.{port}", entry, peer)
-        if self._grid.is_lockstep and self._table.racks:
-            self._barrier = Barrier(segment, self.context.board, self._table.racks)
+        """Take the segment: its grid, and the mailboxes to exchange, continued where they stand."""
+        words, board, table = segment.words, self.context.board, self._table
+        launch = xxh3(bytes(words[Head.LAUNCHER_PID : Head.CREATED_NS + 1])) & _LAUNCH_MASK
+        self._words, self._rack, self._launch = words, segment.rack, launch
+        self._grid = OwnGrid(segment, self.context.every)
+        self._clocks = Clocks(segment, self._peers, launch, self._grid)
+        # In the time of a lease and a connection the token of every rack that is still there has come.
+        seen_by = words[System.TICK] + self._grid.ticks_in((table.lease_ms + RETRY_MS[1]) * 1e6)
+        for peer in self._peers:
+            if (before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()).is_there:
+                peer.resume(before.value, seen_by)
+        self._exports = {port: Export(segment, entry, launch) for port, entry in table.exports.items()}
+        self._imports = {
+            port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack])
+            for port, entry in table.imports.items()
+        }
+        status = open_observer(segment, f"{board}.{STATUS}")
+        if (before := status.peek()).is_there:
+            for port, export in self._exports.items():
+                export.resume(getattr(before.value, f"export_{port}"))
+            for port, entry in self._imports.items():
+                entry.resume(getattr(before.value, f"import_{port}"), status.newest)
+        if self._grid.is_lockstep and table.racks:
+            self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
+        self._desk = Desk(segment, table.permit, self.names(self.context.params), self.findings)
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
-        way, barrier = self._barrier or link, self._barrier
+        barrier, way = self._barrier, self._barrier or link
         for entry in self._imports.values():
-            entry.open(way, link.sealer)
+            entry.open(way, link.sealer, self._grid)
         for export in self._exports.values():
-            export.open(way, link.sealer)
+            export.open(way, link.sealer, self._grid)
+        self._clocks.open(link, link.sealer)
+        self._desk.open(link, self._launch)
         if barrier is not None:
             barrier.open(link, self._launch)
-        self._peers.watch(link.watch_alive() if barrier is None else barrier.changes)
+            self._recall(barrier)
+        self._peers.watch(link.watch_alive(TOKENS) if barrier is None else barrier.changes, barrier is not None)
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
+
+    def _recall(self, barrier: Barrier) -> None:
+        """Repeat the last step of an adapter before this one: it may have died with that before it left the machine."""
+        if barrier.done >= 0:
+            for export in self._exports.values():
+                export.recall(barrier.done, self.context.every)
+            barrier.prepare(barrier.done)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Exchange what is due."""
         cycle = tick // self.context.every
-        for port, export in self._exports.items():
-            if self._is_due(self._table.exports[port].rate_hz, cycle):
-                export.exchange(getattr(read, port), self._grid, tick)
-        if self._barrier is not None and not self._barrier.meet(tick):
-            return
-        self._peers.look(tick)
+        if self._barrier is None:
+            self._look(tick)
+        for export in self._exports.values():
+            if cycle % export.every == 0:
+                export.exchange(tick)
+        if self._barrier is not None:
+            if not self._barrier.meet(tick):
+                return
+            self._look(tick)
         for port, entry in self._imports.items():
-            if self._is_due(self._table.imports[port].rate_hz, cycle):
-                entry.exchange(getattr(write, port), self._grid, tick)
+            entry.look(tick)
+            if cycle % entry.every == 0:
+                entry.exchange(getattr(write, port), tick)
+        self._clocks.exchange()
+        self._desk.answer(tick)
         self._report(write, tick)
 
-    def _is_due(self, rate_hz: float, cycle: int) -> bool:
-        return cycle % max(1, round(1.0 / (rate_hz * self.context.period_s))) == 0
+    def _look(self, tick: int) -> None:
+        """Note who has come, and who has gone."""
+        arrivals = self._peers.arrivals
+        self.findings += self._peers.look(tick)
+        self._demand_stop(tick)
+        if self._peers.arrivals != arrivals:
+            for export in self._exports.values():
+                export.is_asked = True
+
+    def _demand_stop(self, tick: int) -> None:
+        """Demand that the arm stop while a rack that had been there is lost, if it is to stop then."""
+        must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost)
+        if must_stop != bool(self._words[System.PEER_STOP] & 1):
+            # In lockstep other boards, and the clock, may be ahead in their ticks of this cycle.
+            since = tick + self.context.every if self._grid.is_lockstep else tick
+            self._words[System.PEER_STOP] = switch(since, must_stop)
 
     def _report(self, write: Ports, tick: int) -> None:
         status: Message = write.status
+        self._clocks.count(status.clocks)
         for port, export in self._exports.items():
             export.fill(getattr(status, f"export_{port}"))
         for port, entry in self._imports.items():
-            entry.fill(getattr(status, f"import_{port}"), self._grid, tick)
+            entry.fill(getattr(status, f"import_{port}"), tick)
         for peer in self._peers:
             out = getattr(write, peer_port(peer.rack))
-            out.presence, out.launches, out.losses, out.since = peer.presence, peer.launches, peer.losses, peer.since
-        absent = [peer.rack for peer in self._peers if not peer.is_there]
-        status.state = State.HOLDING if absent else State.EXECUTING
-        status.reason = f"rack '{absent[0]}' is not there" if absent else ""
+            self._clocks.fill(out, peer.rack, tick)
+            peer.fill(out, self._grid.is_lockstep)
+        status.reason = reason = self._trouble(tick)
+        status.state = State.HOLDING if reason else State.EXECUTING
+
+    def _trouble(self, tick: int) -> str:
+        """Return what keeps the exchange from its work; empty: nothing."""
+        for peer in self._peers:
+            if not peer.is_there:
+                return f"rack '{peer.rack}' is {'lost' if peer.launches else 'not there yet'}"
+            if len(peer.tokens) > 1:
+                return f"{len(peer.tokens)} racks are named '{peer.rack}'"
+        old = [port for port, entry in self._imports.items() if entry.is_old(tick)]
+        return f"'{self._table.imports[old[0]].source}' is older than max_age_ms" if old else ""
 
     def close(self) -> None:
         """Leave the network."""

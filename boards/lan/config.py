@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, ValidationError
 
 from rack.backplane.message import MessageType
 from rack.boards.lan.endpoint import Endpoint, proper
@@ -16,6 +16,7 @@ FASTEST_HZ = 50.0
 """Fastest exchange over a network."""
 OnPeerLoss = Literal["hold", "stop", "go on"]
 Right = Literal["watch", "command", "stop"]
+Rights = Annotated[tuple[Right, ...], BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given)]
 PeerName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
 EndpointText = Annotated[str, AfterValidator(proper)]
@@ -78,15 +79,16 @@ class LanTable(Table):
     lease_ms: float = Field(200.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms")
     on_peer_loss: OnPeerLoss = Field(
         "hold",
-        description="while a peer is lost: hold: levels find what it writes lost, and hold; stop: the arm ramps to "
-        "rest, then brakes; go on: levels keep the last message",
+        description="while a rack that was there is lost: hold: levels find what it writes lost at once, and hold, "
+        "until its first message after that; stop: the same, and the arm ramps to rest, then brakes, until it is back; "
+        "go on: levels keep its last message, however old",
     )
     peers: tuple[PeerName, ...] = Field(
         (),
         description="racks with which this one works, besides those from which it imports: they may import, and "
         "lockstep waits for them",
     )
-    permit: dict[PeerName, tuple[Right, ...]] = Field(
+    permit: dict[PeerName, Rights] = Field(
         {},
         description="what others may do besides exchanging mailboxes, by name; watch: read status and signals; "
         "command: command levels; stop: set the emergency stop",

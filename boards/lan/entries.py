@@ -3,139 +3,201 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from itertools import chain, repeat
+from typing import Any
 
 from rack.backplane.mailbox.host_ring import ProperContent
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.mailbox.slots import Slots, message_dtype
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment
+from rack.backplane.words import Box, switch
 from rack.boards.lan.config import ExportConfig, ImportConfig
+from rack.boards.lan.counts import ImportCount, MessageOrder
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import Arrived, LanLink
 from rack.boards.lan.lockstep import Barrier
-from rack.boards.lan.peers import PeerRack
-from rack.levels.level import Reading
+from rack.boards.lan.peers import NONE, PeerRack
 
 NEVER = -1
+LARGEST = 1 << 62
+"""Greater than every number of a launch, serial or message: what is not was made up."""
 
 
 class Export:
-    """A mailbox of this rack: each new message is sent, in the cycles of its exchange."""
+    """A mailbox of this rack: each new message is sent, in every n-th cycle, n being `every`.
+
+    `is_asked`: somebody has come who needs the newest message even if it is not new.
+    """
 
     def __init__(self, segment: Segment, table: ExportConfig, launch: int) -> None:
         self._source = open_observer(segment, table.source)
         spec = self._source.spec
         self._kind, self._launch = kind_of(spec.message, spec.version, message_dtype(spec.fields, spec.size)), launch
         self._key = out_key(segment.rack, table.source)
+        self._rate_hz, self.every, self.is_asked = table.rate_hz, 1, False
         self.sent = self.serial = 0
         self._put: Callable[[bytes, bytes], None]
 
-    def open(self, way: LanLink | Barrier, sealer: Sealer) -> None:
-        """Publish it."""
-        self._put, self._sealer = way.publish(self._key), sealer
+    def resume(self, record: Any) -> None:
+        """Continue with the counts in the status of an adapter before this one."""
+        self.sent, self.serial = int(record["sent"]), int(record["serial"])
 
-    def exchange(self, reading: Reading, grid: OwnGrid, tick: int) -> None:
-        """Send the message, if it is new."""
-        # A reading does not say which message it is, and when that was written.
-        self._source.read(tick)
-        if not reading.is_there or self._source.serial == self.serial:
+    def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
+        """Publish it."""
+        self._put, self._sealer, self._grid = way.publish(self._key), sealer, grid
+        self.every = grid.cycles(self._rate_hz)
+
+    def recall(self, tick: int, ticks: int) -> None:
+        """Send what an adapter before this one sent at `tick`, if it did; `ticks` are those of its cycle."""
+        if (tick // ticks) % self.every:
             return
-        written = self._source.newest
-        self.sent, self.serial = self.sent + 1, self._source.serial
-        payload = bytes(reading.value.raw)
-        head = Envelope(
-            self._kind, self._launch, self.serial, self.sent, written, grid.time_ns(written), grid.stamp_ns(written)
-        )
+        self._source.read(tick - self.every * ticks)
+        before = self._source.serial
+        self._source.read(tick)
+        if self._source.serial == self.serial != before:
+            self.sent, self.serial = self.sent - 1, before
+            self.exchange(tick)
+
+    def exchange(self, tick: int) -> None:
+        """Send the newest message, if it is new or asked for."""
+        # Not the reading of the port: it does not say which message it is, and when that was written.
+        source, grid = self._source, self._grid
+        reading = source.read(tick)
+        if not reading.is_there:
+            return
+        if source.serial != self.serial:
+            self.sent, self.serial = self.sent + 1, source.serial
+        elif not self.is_asked or grid.is_lockstep:
+            return
+        self.is_asked = False
+        written, payload = source.newest, bytes(reading.value.raw)
+        times = written, grid.time_ns(written), grid.stamp_ns(written)
+        head = Envelope(self._kind, self._launch, self.serial, self.sent, *times)
         self._put(payload, self._sealer.seal(self._key, head, payload))
 
-    def fill(self, record: object) -> None:
+    def fill(self, record: Any) -> None:
         """Write its counts into the group of a status."""
-        record[...] = (self.sent, self.serial)  # type: ignore[index]
-
-
-@dataclass
-class ImportCount:
-    """What came of one import: see `rack.boards.lan.messages.IMPORT`."""
-
-    taken: int = 0
-    missing: int = 0
-    repeated: int = 0
-    late: int = 0
-    refused: int = 0
-    strange: int = 0
-    overtaken: int = 0
+        record[...] = (self.sent, self.serial)
 
 
 class Import:
     """A mailbox of another rack: the newest good message of each exchange becomes one here.
 
-    Its type is that of the mailbox `lan.<port>` into which it is written.
+    Its type is that of the mailbox `lan.<port>` into which it is written. While its rack is lost, and until its first
+    message after that, readers there find the writer lost or, if levels are to go on, the last message not too old.
     """
 
     def __init__(self, segment: Segment, own: str, table: ImportConfig, peer: PeerRack) -> None:
         spec = segment.layout.mailbox(own)
         dtype = message_dtype(spec.fields, spec.size)
         self._kind, self._is_proper = kind_of(spec.message, spec.version, dtype), ProperContent(spec.fields)
-        self._buffer = Message(dtype)
-        self._peer, self._max_age, self._key = peer, spec.max_age, out_key(table.rack, table.mailbox)
-        self._launch = self._number = self.serial = 0
-        self._basis = NEVER
+        self._buffer, self._key = Message(dtype), out_key(table.rack, table.mailbox)
+        self._max_age, self._delay, self._peer = spec.max_age, spec.delay, peer
+        self._box = Slots(segment, spec).box
+        self._word = int(Box.KEPT if peer.goes_on else Box.VOID)
+        self._is_away, self._losses = bool(self._box[self._word] & 1), peer.losses
+        self._rate_hz, self.every = table.rate_hz, 1
+        self._basis: int | None = None
+        # What came before its time, with the tick at which it came.
+        self._early: list[tuple[int, Arrived]] = []
         self.count = ImportCount()
+        self._order = MessageOrder(self.count)
         self._arrived: Callable[[], Iterator[Arrived]]
 
-    def open(self, way: LanLink | Barrier, sealer: Sealer) -> None:
-        """Subscribe to it."""
-        self._arrived, self._sealer = way.subscribe(self._key), sealer
+    def resume(self, record: Any, tick: int) -> None:
+        """Continue after the status that an adapter before this one wrote at `tick`."""
+        self.count.resume(record)
+        self._order.resume(*(int(record[name]) for name in ("launch", "number", "serial")))
+        self._basis = None if record["age"] == NEVER else tick - int(record["age"])
 
-    def exchange(self, out: Message, grid: OwnGrid, tick: int) -> None:
+    def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
+        """Subscribe to it."""
+        self._arrived, self._sealer, self._grid = way.subscribe(self._key), sealer, grid
+        self.every = grid.cycles(self._rate_hz)
+
+    def is_old(self, tick: int) -> bool:
+        """Say whether its information is older than permitted."""
+        return self._basis is not None and tick - self._basis > self._max_age
+
+    def look(self, tick: int) -> None:
+        """Void what is here, or keep it, if its rack has been lost since the last look."""
+        if self._peer.losses != self._losses:
+            self._losses = self._peer.losses
+            if not self._is_away:
+                self._switch(True, tick + self._delay if self._grid.is_lockstep else tick)
+
+    def _switch(self, is_away: bool, tick: int) -> None:
+        self._is_away, self._box[self._word] = is_away, switch(tick, is_away)
+
+    def exchange(self, out: Message, tick: int) -> None:
         """Take what has come, and pass the newest good message on."""
-        newest: Envelope | None = None
-        for arrived in self._arrived():
-            head = self._judged(arrived)
-            if head is not None:
-                self.count.overtaken += newest is not None
-                newest = head
-        if newest is None:
+        early, self._early = self._early, []
+        newest, basis = False, tick
+        for came, arrived in chain(early, zip(repeat(tick), self._arrived(), strict=False)):
+            head = self._opened(arrived)
+            if head is not None and self._is_due(head, arrived, came, tick) and self._is_next(head, arrived.payload):
+                self.count.overtaken += newest
+                newest, basis = True, min(came, self._grid.tick_of(head, self._peer, tick))
+        if not newest:
             return
-        basis = grid.tick_of(newest, self._peer, tick)
         if tick - basis > self._max_age:
             self.count.late += 1
             return
-        self._basis = basis
         self.count.taken += 1
+        self._basis = basis
         out.raw[:] = self._buffer.raw
-        out.send(basis)
+        # Ticks of mailboxes are not negative; what was written before this rack's first one is.
+        out.send(max(0, basis))
+        if self._is_away:
+            self._switch(False, tick + self._delay)
 
-    def _judged(self, arrived: Arrived) -> Envelope | None:
-        """Return the head of a message that is good and new, with its content in the buffer; else count why not."""
-        head, count = self._sealer.opened(arrived.key, arrived.envelope, arrived.payload), self.count
-        if isinstance(head, Flaw) or head.kind != self._kind or len(arrived.payload) != len(self._buffer.raw):
-            count.refused += 1
-            return None
-        if head.launch != self._peer.launch:
-            count.strange += 1
-            return None
-        if head.launch != self._launch:
-            self._launch, self._number, self.serial = head.launch, head.number - 1, 0
-        if head.serial <= self.serial:
-            count.repeated += 1
-            return None
-        message = Message(self._buffer.record.dtype, memoryview(bytearray(arrived.payload)))
+    def _opened(self, arrived: Arrived) -> Envelope | None:
+        """Return the head of what came, if it may be a message of this mailbox; else count that it was refused."""
+        head = self._sealer.opened(arrived.key, arrived.envelope, arrived.payload)
+        is_fit = len(arrived.payload) == len(self._buffer.raw)
+        if not isinstance(head, Flaw) and head.kind == self._kind and is_fit and max(head[1:4]) < LARGEST:
+            return head
+        self.count.refused += 1
+        return None
+
+    def _is_due(self, head: Envelope, arrived: Arrived, came: int, tick: int) -> bool:
+        """Say whether a message is of the launch that is there, and of known age. If it may yet be, keep it for later.
+
+        In lockstep it is: see `Barrier`.
+        """
+        if self._grid.is_lockstep:
+            return True
+        is_strange = self._peer.is_over(head.launch) or tick - came > self._max_age
+        is_known = self._peer.is_there and head.launch == self._peer.launch
+        # Its age decides: until the clocks have been compared it may be too old.
+        is_due = is_known and self._peer.offset_ns is not None
+        if is_strange:
+            self.count.strange += 1
+        elif not is_due:
+            self._early.append((came, arrived))
+            if len(self._early) > 1:
+                del self._early[0]
+                self.count.overtaken += is_known
+                self.count.strange += not is_known
+        return is_due and not is_strange
+
+    def _is_next(self, head: Envelope, payload: bytes) -> bool:
+        """Say whether a message is good and the newest so far, and if so keep its content."""
+        message = Message(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not self._is_proper(message):
-            count.refused += 1
-            return None
-        count.missing += max(0, head.number - self._number - 1)
-        self._number, self.serial = head.number, head.serial
+            self.count.refused += 1
+            return False
+        if not self._order.admits(head):
+            return False
         self._buffer.raw[:] = message.raw
-        return head
+        return True
 
-    def fill(self, record: object, grid: OwnGrid, tick: int) -> None:
+    def fill(self, record: Any, tick: int) -> None:
         """Write its counts into the group of a status."""
-        c = self.count
-        age = NEVER if self._basis == NEVER else tick - self._basis
-        age_s = -1.0 if age == NEVER else age * grid.tick_s
-        counts = (c.taken, c.missing, c.repeated, c.late, c.refused, c.strange, c.overtaken)
-        record[...] = (*counts, self.serial, age, age_s)  # type: ignore[index]
+        age = NEVER if self._basis is None else tick - self._basis
+        age_s = -1.0 if age == NEVER else age * self._grid.tick_s
+        order, launch = self._order, NONE if self._grid.is_lockstep else self._order.launch
+        record[...] = (*self.count.values, launch, order.number, order.serial, age, age_s)

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
-from rack.backplane.clock.system_clock import SystemClock
+from math import ceil
+
+from rack.backplane.clock.system_clock import SystemClock, ticks_of
 from rack.backplane.segment import Segment
 from rack.boards.lan.envelope import Envelope
 from rack.boards.lan.peers import PeerRack
 
 
 class OwnGrid:
-    """Converts ticks. In lockstep all racks have one simulated time; in real time each has an epoch of its own."""
+    """Converts ticks. In lockstep all racks have one simulated time; in real time each has an epoch of its own.
 
-    def __init__(self, segment: Segment) -> None:
+    `every`: ticks of the adapter's cycle.
+    """
+
+    def __init__(self, segment: Segment, every: int) -> None:
         self._clock, self._clock_ns = SystemClock(segment), segment.layout.clock_ns
+        self._cycle_ns = every * self._clock_ns
         self.is_lockstep = self._clock.is_lockstep
         self.tick_s = self._clock_ns * 1e-9
         """One tick, s of simulated time."""
+
+    def cycles(self, rate_hz: float) -> int:
+        """Return the period, in cycles of the adapter, of an exchange."""
+        return ticks_of(rate_hz, self._cycle_ns, "an exchange")
+
+    def ticks_in(self, real_ns: float) -> int:
+        """Return the ticks within which that much real time has passed."""
+        return ceil(real_ns / self._clock.period_ns)
 
     def time_ns(self, tick: int) -> int:
         """Return the simulated time of a tick, ns."""
@@ -28,11 +42,10 @@ class OwnGrid:
     def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:
         """Return the tick here at which a message was written there, at most `tick`, now.
 
-        Until the other clock has been compared with ours it counts as written now.
+        The clocks have been compared. It counts as written as early as the uncertainty of that permits: never as
+        younger than it is.
         """
         if self.is_lockstep:
             return min(tick, head.time_ns // self._clock_ns)
-        if peer.offset_ns is None:
-            return tick
-        here_ns = head.stamp_ns - peer.offset_ns
+        here_ns = head.stamp_ns - (peer.offset_ns or 0) - peer.uncertainty_ns
         return min(tick, (here_ns - self._clock.time_of(0)) // self._clock.period_ns)

@@ -90,16 +90,20 @@ class Barrier:
     Exports and imports use it in place of the network: they `publish` and `subscribe`.
     """
 
-    def __init__(self, segment: Segment, board: str, racks: Iterable[str]) -> None:
+    def __init__(self, segment: Segment, board: str, racks: Iterable[str], lost: Iterable[str]) -> None:
+        """Step with `racks`, except those that an adapter before this one has `lost`."""
         self._segment, self._words, self._block = segment, segment.words, segment.block(board)
         self._partners = {rack: Partner(rack, place) for place, rack in enumerate(racks)}
+        for rack in lost:
+            self._partners[rack].is_out = True
         self._tick_ns = segment.layout.clock_ns
         self.cycle_ns = segment.layout.task(board).every * self._tick_ns
         """Length of the adapter's cycle, ns of simulated time; equal in all racks."""
-        done = self._block[Block.DONE]
-        self._is_restarted = done >= 0
-        # What the process before this one has passed on does not come again.
-        self._passed_ns = done * self._tick_ns if self._is_restarted else NEVER
+        self.done = self._block[Block.DONE]
+        """Last cycle that an adapter before this one has finished, a tick; -1: none."""
+        self._is_restarted = self.done >= 0
+        # What has been passed on does not come again.
+        self._passed_ns = self.done * self._tick_ns if self._is_restarted else NEVER
         self._is_first, self._has_begun, self._has_refused = True, self._is_restarted, False
         self._block[Block.AWAITS] = 0
         self._exports: list[Arrived] = []
@@ -138,18 +142,25 @@ class Barrier:
         changes, self._changes = self._changes, []
         yield from changes
 
+    def prepare(self, tick: int) -> None:
+        """Make a step of what was published since the last one."""
+        awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
+        content, self._exports = pack_step(self.cycle_ns, awaited, self._exports), []
+        if len(content) > MOST_STEP:
+            self._refuse(f"a cycle exports {len(content)} bytes; lockstep permits {MOST_STEP}")
+        self._steps.append((tick * self._tick_ns, content))
+
     def meet(self, tick: int) -> bool:
         """Send the step of this cycle, and wait for those of all others; return False if the run is over.
 
         Raises `CannotGoOn` if a rack cannot step with this one.
         """
         self._now_ns = now_ns = tick * self._tick_ns
-        awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
-        content, self._exports = pack_step(self.cycle_ns, awaited, self._exports), []
-        if len(content) > MOST_STEP:
-            self._refuse(f"a cycle exports {len(content)} bytes; lockstep permits {MOST_STEP}")
-        self._steps.append((now_ns, content))
-        self._send(now_ns, content, self._first)
+        self.prepare(tick)
+        if self._is_first:
+            self._send_again(StepFlag.FIRST)
+        else:
+            self._send(*self._steps[-1], StepFlag(0))
         while late := [partner for partner in self._partners.values() if not partner.has_reached(now_ns)]:
             try:
                 self._note(self._events.get(timeout=LOOK_S))
@@ -158,9 +169,9 @@ class Barrier:
                     return False
                 self._look_at(late[0])
         self._block[Block.AWAITS] = 0
-        self._is_first, self._has_begun = False, True
         for partner in self._partners.values():
             self._pass_on(partner)
+        self._is_first, self._has_begun = False, True
         return True
 
     def close(self) -> None:
@@ -275,7 +286,7 @@ class Barrier:
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:
                     self._imports[export.key].append(export)
         is_there = partner.time_ns >= self._now_ns
-        if is_there != partner.is_there:
+        if is_there != partner.is_there or self._is_first:
             partner.is_there = is_there
             self._changes.append((partner.rack, partner.launch, is_there))
 

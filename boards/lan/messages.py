@@ -20,14 +20,27 @@ IMPORT = MessageType(
     (
         Field("taken", "u4", "1", "messages passed to the backplane"),
         Field("missing", "u4", "1", "messages sent that never came, or came after a later one"),
-        Field("repeated", "u4", "1", "messages that came twice, or after a later one"),
+        Field("disordered", "u4", "1", "messages that came after a later one, and were not passed"),
+        Field("repeated", "u4", "1", "messages that came twice"),
         Field("late", "u4", "1", "messages older than max_age_ms when they came"),
         Field("refused", "u4", "1", "messages refused: malformed, unsigned, oversized, NaN, or of another type"),
-        Field("strange", "u4", "1", "messages of a launch that is over, or not known yet"),
+        Field("strange", "u4", "1", "messages of a launch that is over, or not there"),
         Field("overtaken", "u4", "1", "messages that a newer one overtook before the exchange"),
-        Field("serial", "i8", "1", "serial of the newest message passed; 0: none"),
+        Field("launch", "i8", "1", "number of the launch that wrote the newest message taken; 0: none, or in lockstep"),
+        Field("number", "i8", "1", "number of that message among those sent from its mailbox"),
+        Field("serial", "i8", "1", "its serial in its mailbox; 0: none"),
         Field("age", "i8", "tick", "age of its information in this rack's ticks; -1: none yet"),
         Field("age_s", "f8", "s", "the same in simulated time; -1: none yet"),
+    ),
+)
+CLOCKS = MessageType(
+    "lan_clocks",
+    1,
+    (
+        Field("taken", "u4", "1", "round trips measured"),
+        Field("answered", "u4", "1", "pings of other racks answered"),
+        Field("withheld", "u4", "1", "pings not answered: they came too fast, or from too many racks"),
+        Field("refused", "u4", "1", "pings and answers refused: malformed, unsigned, or to nothing that was asked"),
     ),
 )
 
@@ -37,6 +50,7 @@ def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
     return status(
         "lan_status",
         1,
+        Field("clocks", CLOCKS, "1", "round trips to compare clocks; none in lockstep"),
         *(Field(f"export_{port}", EXPORT, "1", f"export {port}") for port in exports),
         *(Field(f"import_{port}", IMPORT, "1", f"import {port}") for port in imports),
     )

@@ -18,16 +18,16 @@ from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import State
 from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import Alarm, AlarmWriter
-from rack.backplane.words import Block, Demand, Run, System
+from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
+from rack.backplane.words import Block, Demand, Run, System, is_on
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.wiring import ClockWiring
 
 HEAD_START_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that its start-up does not delay a tick."""
 # Plain integers for the hot path.
-_LOSSES, _EMERGENCY, _REQUESTED, _INJECTED = (
-    int(word) for word in (System.LOSSES, System.EMERGENCY_STOP, System.REQUESTED, System.INJECTED)
+_LOSSES, _EMERGENCY, _REQUESTED, _INJECTED, _PEER_STOP = (
+    int(word) for word in (System.LOSSES, System.EMERGENCY_STOP, System.REQUESTED, System.INJECTED, System.PEER_STOP)
 )
 
 
@@ -38,7 +38,7 @@ class SystemController:
         self._words, self._wiring, self._driver = segment.words, wiring, driver
         self._faults = FaultStage(segment, driver)
         self._desk = OperatorDesk(segment, driver.alarms)
-        self._settled: tuple[int, int, int] | None = None
+        self._settled: tuple[int, int, int, int] | None = None
         self._demand = Demand(self._words[System.DEMAND])
 
     def begin(self, tick: int) -> None:
@@ -48,7 +48,7 @@ class SystemController:
             faults.advance(tick)
         if desk.waiting or words[_REQUESTED] != desk.requested:
             desk.advance(tick)
-        if self._settled != (words[_LOSSES], self._driver.watchdog.losses, words[_EMERGENCY]):
+        if self._settled != (words[_LOSSES], self._driver.watchdog.losses, words[_EMERGENCY], words[_PEER_STOP]):
             self._handle_losses(tick)
 
     def released(self, tick: int) -> None:
@@ -63,8 +63,11 @@ class SystemController:
         for task in lost:
             self._handle_loss(task, tick)
         lost = [task for task in lost if task.lost_tick >= 0]
+        # Read before they are acted on: a change in between is handled at the next tick.
+        emergency, peer = words[_EMERGENCY], words[_PEER_STOP]
         self._set_demand(lost, tick)
-        self._settled = (*seen, words[_EMERGENCY]) if not lost else None
+        # So is a switch that lies ahead.
+        self._settled = (*seen, emergency, peer) if not lost and peer >> 1 <= tick else None
 
     def _handle_loss(self, task: ReleasedTask, tick: int) -> None:
         lockstep = self._wiring.lockstep
@@ -87,6 +90,8 @@ class SystemController:
         asked = [(self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost]
         if self._words[_EMERGENCY]:
             asked.append((Demand.BRAKE, -1))
+        if is_on(self._words[_PEER_STOP], tick):
+            asked.append((Demand.STOP, PEER))
         demand, subject = max(asked, default=(Demand.NONE, -1))
         if demand != self._demand:
             self._driver.settle()

@@ -6,6 +6,7 @@ from rack.levels.servo.gateway import JointGateway
 from rack.levels.servo.joint_servo import JointServo
 from rack.levels.servo.modification import Hook, LawContext, LawSample, Modification
 from rack.levels.servo.planner import ServoPlanner
+from rack.levels.servo.sharing import SharingServoExecutor
 
 __all__ = [
     "ArmExecutor",
@@ -17,4 +18,4 @@ __all__ = [
     "Modification",
     "ServoExecutor",
 ]
-__all__ += ["ServoPlanner"]
+__all__ += ["ServoPlanner", "SharingServoExecutor"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -45,10 +45,10 @@ class ServoExecutor(ArmDriver):
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
     }
-    params = ServoParams
+    params: ClassVar[type[ServoParams]] = ServoParams
 
     def __init__(self, context: LevelContext) -> None:
-        params = read_params(ServoParams, context.params)
+        self.given = params = read_params(self.params, context.params)
         super().__init__(context, params)
         cell = self.cell
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)  # set points, interpolated

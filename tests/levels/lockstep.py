@@ -117,8 +117,9 @@ class Lockstep:
         seed: int = 1990,
         outside: Mapping[str, MessageType] | None = None,
         clock_ns: int = CLOCK_NS,
+        name: str = "",
     ) -> None:
-        """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`."""
+        """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`; `name` is the rack's."""
         self.tick, self._clock_ns = 0, clock_ns
         self.demand = Demand.NONE
         self._coming: dict[int, list[Callable[[], None]]] = {}
@@ -146,6 +147,7 @@ class Lockstep:
                 above={name: paces[name] for name in listed(b.above) if name in paces},
                 below={name: paces[name] for name in listed(b.below) if name in paces},
                 params=b.params,
+                rack=name,
             )
             for b in boards
         }

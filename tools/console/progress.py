@@ -61,14 +61,14 @@ def progress_for(silent: bool) -> Iterator[Progress]:
         yield Progress(bar)
 
 
-def reading_progress(silent: bool) -> Callable[[float], None]:
-    """Return a function that takes the part of a run that is read, 0 to 1, and prints it on stderr now and then."""
+def reading_progress(silent: bool, what: str = "reading the run") -> Callable[[float], None]:
+    """Return a function that takes the part of the work that is done, 0 to 1, and prints it on stderr now and then."""
     shown = time.monotonic()
 
     def show(part: float) -> None:
         nonlocal shown
         if not silent and time.monotonic() - shown > PATIENCE_S:
             shown = time.monotonic()
-            print(f"reading the run: {part:.0%}", file=sys.stderr, flush=True)
+            print(f"{what}: {part:.0%}", file=sys.stderr, flush=True)
 
     return show

@@ -117,8 +117,8 @@ class Recorder:
         self._view = view
         self._segment, self._words = segment, segment.words
         # The spool first: it fails where another recorder is running, and leaves that one's files alone.
-        self._spool = Spool(folder, layout)
-        self._files = RunFiles(folder, layout)
+        self._spool = Spool(folder, layout, segment.launch)
+        self._files = RunFiles(folder, layout, segment.launch)
         self._spool.resume(self._files.add)
         traces = {task.name: trace_ring(segment, task.name) for task in layout.tasks}
         mailboxes = {mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in layout.timed}

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.mailbox.slots import message_dtype
 from rack.boards.adapters.adapter import STATUS
 from rack.boards.adapters.bus_adapter import BusAdapter
 from rack.boards.adapters.entries import AdapterParams, EntryConfig
@@ -18,7 +15,6 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.wiring import Entries
 from rack.levels.level import Executor
 from rack.tools.console.answer import Failure
-from rack.tools.runs.parquet import columns_of
 from rack.tools.runs.recording import Recording
 
 
@@ -66,12 +62,6 @@ def _rows(recording: Recording, box: MailboxSpec, is_queued: bool) -> list[tuple
     """Return ticks and messages of a mailbox; of one that repeats itself only the changes."""
     if box.name not in recording.mailboxes:
         return []
-    ticks = recording.signal(box.name, "tick")
-    messages = np.zeros(len(ticks), message_dtype(box.fields, box.size))
-    for column in columns_of(box):
-        part = messages
-        for key in column.path[:-1]:
-            part = part[key]
-        part[column.path[-1]] = recording.signal(box.name, column.name.removeprefix(f"{box.name}."))
+    ticks, messages = recording.signal(box.name, "tick"), recording.messages(box)
     rows = [(int(tick), message.tobytes()) for tick, message in zip(ticks, messages, strict=True)]
     return [row for at, row in enumerate(rows) if is_queued or not at or row[1] != rows[at - 1][1]]

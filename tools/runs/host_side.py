@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
@@ -52,7 +51,7 @@ def host_rows(segment: Segment) -> tuple[HostRow, ...]:
 def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
     block = segment.block(host.name)
     # The process that runs a host board locks this word, and the kernel unlocks it.
-    runs = ByteLock.is_taken(segment, segment.map.blocks[host.name] + 8 * Block.PID)
+    runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
     state = TaskState(block[Block.STATE])
     heads = [segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == host.name]
     return HostRow(

@@ -2,8 +2,8 @@
 
 cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks. signals.parquet is what the
 tasks wrote to their mailboxes: one row a message. Each of its row groups holds rows of one mailbox, whose own columns
-are filled; those of all others are null. Its metadata hold the checksum of the config.toml next to it: a config that is
-cut off at the end of a table is a valid config.
+are filled; those of all others are null. Its metadata hold when the rack was launched, and the checksum of the
+config.toml next to it: a config that is cut off at the end of a table is a valid config.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from xxhash import xxh3_64_hexdigest
 
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
+from rack.backplane.segment import Launch
 from rack.backplane.trace import FIELDS
 from rack.tools.runs.cores import UNMEASURED, CoreRecord
 
@@ -75,7 +76,7 @@ class CyclesFile:
 class SignalsFile:
     """signals.parquet, being written."""
 
-    def __init__(self, path: Path, layout: Layout) -> None:
+    def __init__(self, path: Path, layout: Layout, launch: Launch | None = None) -> None:
         self._columns = {mailbox.name: columns_of(mailbox) for mailbox in layout.mailboxes}
         self._waiting: dict[str, list[np.ndarray]] = {name: [] for name in self._columns}
         head = [
@@ -84,6 +85,7 @@ class SignalsFile:
         ]
         fields = head + [column.field for columns in self._columns.values() for column in columns]
         metadata = {"layout": json.dumps(asdict(layout)), "config": config_check(path.parent)}
+        metadata |= {} if launch is None else {"launch": json.dumps(launch)}
         self._schema = pa.schema(fields, metadata=metadata)
         texts = [column.name for columns in self._columns.values() for column in columns if column.kind[1] == "S"]
         self._writer = pq.ParquetWriter(

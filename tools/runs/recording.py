@@ -14,15 +14,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.segment import mailbox_of
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.mailbox.history import row_dtype
+from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.segment import Launch, layout_of, mailbox_of
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, loads
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.runs.cores import UNMEASURED, CoreRecord
-from rack.tools.runs.parquet import CONFIG, HEAD, config_check
+from rack.tools.runs.parquet import CONFIG, HEAD, columns_of, config_check
 from rack.tools.runs.spool import mend
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
@@ -109,6 +111,21 @@ class Recording:
             return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes), hosts)
 
     @cached_property
+    def whole_layout(self) -> Layout:
+        """The rack's layout with the fields of its messages."""
+        with _naming(self.folder / "signals.parquet"):
+            return layout_of({"hosts": (), **json.loads(self._signals.schema_arrow.metadata[b"layout"])})
+
+    @property
+    def launch(self) -> Launch:
+        """When the rack was launched. Raises `Failure` for recordings of earlier versions, which do not hold it."""
+        text = (self._signals.schema_arrow.metadata or {}).get(b"launch")
+        if text is None:
+            why = "does not say when the rack was launched: it was recorded by an earlier version; run the rack again"
+            raise Failure(f"{self.folder}: {why}", 2)
+        return Launch(*json.loads(text))
+
+    @cached_property
     def lost(self) -> dict[str, int]:
         """Rows overwritten before the recorder took them, by task and by mailbox."""
         with _naming(self.folder):
@@ -160,6 +177,27 @@ class Recording:
         if not values:
             return np.empty((0, *shape))
         return np.concatenate(values).reshape(-1, *shape)
+
+    def messages(self, box: MailboxSpec) -> np.ndarray:
+        """Return every message of a mailbox as it was written, oldest first; `box` with its fields."""
+        found = np.zeros(len(self.signal(box.name, "tick")), message_dtype(box.fields, box.size))
+        for column in columns_of(box):
+            part = found
+            for key in column.path[:-1]:
+                part = part[key]
+            part[column.path[-1]] = self.signal(box.name, column.name.removeprefix(f"{box.name}."))
+        return found
+
+    def rows(self, name: str) -> np.ndarray:
+        """Return what a recorder took from a ring, oldest first: trace records of a task, or messages of a mailbox."""
+        if name in self.cycles:
+            return self.cycles[name]
+        box = self.whole_layout.mailbox(name)
+        found = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
+        for field in HEAD:
+            found[field] = self.signal(name, field)
+        found["message"] = self.messages(box)
+        return found
 
     def fields(self, mailbox: str) -> set[str]:
         """Return the fields of a mailbox's messages."""

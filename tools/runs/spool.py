@@ -24,7 +24,7 @@ import pyarrow as pa
 
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.history import row_dtype
-from rack.backplane.segment import layout_of
+from rack.backplane.segment import Launch, layout_of
 from rack.backplane.trace import RECORD
 from rack.tools.console.answer import Failure
 from rack.tools.runs.cores import UNMEASURED, CoreRecord
@@ -32,10 +32,10 @@ from rack.tools.runs.parquet import CyclesFile, SignalsFile
 
 CYCLES, SIGNALS, SPOOL = "cycles.parquet", "signals.parquet", "recorder.spool"
 MENDED = "-mended"
-MAGIC = b"RACKSPL1"
+MAGIC = b"RACKSPL2"
 FLUSH_S = 0.25
 _HEAD = struct.Struct("<8sII")
-"""Magic, size and CRC of the layout that follows as JSON."""
+"""Magic, size and CRC of the layout and launch that follow as JSON."""
 _FRAME = struct.Struct("<IIIII")
 """Ring, rows, rows lost before them, size and CRC of the data that follow."""
 
@@ -54,12 +54,12 @@ class RunFiles:
     By ring, `lost` counts the rows lost, and `taken` those plus the rows written: all its records so far.
     """
 
-    def __init__(self, folder: Path, layout: Layout, suffix: str = "") -> None:
+    def __init__(self, folder: Path, layout: Layout, launch: Launch, suffix: str = "") -> None:
         self.tasks = [task.name for task in layout.tasks]
         self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
         self.taken = dict(self.lost)
         self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}")
-        self._signals = SignalsFile(folder / f"{SIGNALS}{suffix}", layout)
+        self._signals = SignalsFile(folder / f"{SIGNALS}{suffix}", layout, launch)
 
     def add(self, frame: Frame) -> None:
         """Add rows of a ring."""
@@ -88,8 +88,8 @@ def mend(folder: Path) -> bool:
         return False
     with path.open("rb") as file:
         _lock(file, path)
-        layout = _read_layout(file, path)
-        files = RunFiles(folder, layout, MENDED)
+        layout, launch = _read_head(file, path)
+        files = RunFiles(folder, layout, launch, MENDED)
         for frame in _read_frames(file, layout):
             files.add(frame)
     files.close()
@@ -105,7 +105,7 @@ class Spool:
     Raises `Failure` when another recorder has it open, or it belongs to another rack.
     """
 
-    def __init__(self, folder: Path, layout: Layout) -> None:
+    def __init__(self, folder: Path, layout: Layout, launch: Launch) -> None:
         self.path = folder / SPOOL
         # Readable as well, and unbuffered: the kernel has at once whatever is written.
         self._file = self.path.open("a+b", buffering=0)
@@ -117,11 +117,11 @@ class Spool:
         try:
             _lock(self._file, self.path)
             if not self.path.stat().st_size:
-                text = json.dumps(asdict(layout)).encode()
+                text = json.dumps({"layout": asdict(layout), "launch": launch}).encode()
                 self._file.write(_HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text)
             self._file.seek(0)
-            if (found := _read_layout(self._file, self.path)) != layout:
-                raise Failure(f"{self.path}: holds a recording of another rack, '{found.rack}'")
+            if (found := _read_head(self._file, self.path)) != (layout, launch):
+                raise Failure(f"{self.path}: holds a recording of another launch or rack, '{found[0].rack}'")
         except BaseException:
             self.close()
             raise
@@ -169,7 +169,7 @@ class Spool:
         self._file.close()
 
 
-def _read_layout(file: IO[bytes], path: Path) -> Layout:
+def _read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size or not head.startswith(MAGIC):
         raise Failure(f"{path}: not a recorder's spool", 2)
@@ -177,7 +177,8 @@ def _read_layout(file: IO[bytes], path: Path) -> Layout:
     text = file.read(size)
     if len(text) < size or zlib.crc32(text) != crc:
         raise Failure(f"{path}: truncated before its first row", 2)
-    return layout_of(json.loads(text))
+    head = json.loads(text)
+    return layout_of(head["layout"]), Launch(*head["launch"])
 
 
 def _read_frames(file: IO[bytes], layout: Layout) -> Iterator[Frame]:

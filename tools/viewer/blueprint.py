@@ -1,9 +1,9 @@
-"""The first view of a run: the blueprint of all views, the place of the eye, and the config as a document."""
+"""The first view of one run or several: the blueprint of all views, the place of the eye, the config as a document."""
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -33,21 +33,10 @@ DISTANCE = 1.75
 ENDLESS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 
 
-def blueprint(layout: Layout, config: RackConfig, cell: Cell | None, live: bool) -> rrb.Blueprint:
-    """Return the blueprint of a rack: its cell in 3D, curves, lanes, log; `live` follows the newest data."""
-    has_arm = cell is not None and any(mailbox.message in DRIVING for mailbox in layout.mailboxes)
-    names = config.robot.joints if config.robot is not None and has_arm else ()
-    doing = lanes_view("levels and events, whole run", [_all(EVENTS), _all(LEVELS)])
-    below = rrb.Horizontal(doing, _graph(layout, config), column_shares=[3, 2])
-    left = below if cell is None else rrb.Vertical(_cell_view(cell), below, row_shares=[11, 9])
-    right = rrb.Vertical(
-        _joints(names) if names else _curves("signals", [_all(SIGNALS)]),
-        lanes_view("boards, cycle by cycle", [_all(BOARDS)], CYCLES_S),
-        rrb.Horizontal(_load(config), _ages(layout), _log(), column_shares=[3, 3, 4]),
-        row_shares=[4, 5, 3],
-    )
+def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
+    """Return the blueprint of a view; `live` follows the newest data."""
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[2, 3]),
+        root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=SIM_TIME, play_state="following" if live else "paused"),
@@ -56,70 +45,120 @@ def blueprint(layout: Layout, config: RackConfig, cell: Cell | None, live: bool)
     )
 
 
-def _cell_view(cell: Cell) -> rrb.View:
-    shown, eye = [_all(CELL), f"- {path(CELL, COLLISION)}/**", _all(FRAMES)], eye_on(cell)
-    return rrb.Spatial3DView(origin=path(CELL), contents=shown, name="cell", eye_controls=eye, line_grid=False)
+def together(racks: Mapping[str, RackViews]) -> rrb.Container:
+    """Return the view of several racks, by name: all at once, and in further tabs each by itself.
+
+    All at once are the cells next to each other, or curves of racks without one, then levels and events, and the log.
+    """
+    scenes = rrb.Horizontal(*(views.scene(name) for name, views in racks.items()))
+    doing = rrb.Vertical(*(views.doing(name) for name, views in racks.items()))
+    columns = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["entitypath", "loglevel", "body"])
+    logs = [views.all(LOG) for views in racks.values()]
+    log = rrb.TextLogView(origin="/", contents=[f"{path(LOG)}/**", *logs], name="log of all", columns=columns)
+    below = rrb.Horizontal(doing, log, column_shares=[3, 2])
+    shown = rrb.Vertical(scenes, below, row_shares=[3, 2], name="all racks")
+    return rrb.Tabs(shown, *(views.everything(name) for name, views in racks.items()), active_tab=0)
 
 
-def _joints(names: Sequence[str]) -> rrb.Container:
-    """Return a view of all joints for each quantity, and in a second tab one of each joint with its limits."""
-    views = [
-        rrb.Tabs(
-            _curves(quantity, [path(JOINTS, name, quantity) for name in names], legend=quantity == "torque"),
-            rrb.Grid(*(_joint(name, quantity) for name in names), name="by joint, with limits"),
+class RackViews:
+    """The views of one rack: its cell in 3D, curves, lanes, log. Its entities are below `root`."""
+
+    def __init__(self, layout: Layout, config: RackConfig, cell: Cell | None, root: Sequence[str] = ()) -> None:
+        self._layout, self._config, self._cell, self._root = layout, config, cell, root
+        has_arm = cell is not None and any(mailbox.message in DRIVING for mailbox in layout.mailboxes)
+        self._joints = config.robot.joints if config.robot is not None and has_arm else ()
+
+    def path(self, *entity: str) -> str:
+        """Return the path of an entity."""
+        return path(*self._root, *entity)
+
+    def all(self, *entity: str) -> str:
+        """Return the query for an entity and all below it."""
+        return f"{self.path(*entity)}/**"
+
+    def everything(self, name: str | None = None) -> rrb.Container:
+        """Return all views."""
+        below = rrb.Horizontal(self.doing("levels and events, whole run"), self._graph(), column_shares=[3, 2])
+        left = below if self._cell is None else rrb.Vertical(self.scene("cell"), below, row_shares=[11, 9])
+        right = rrb.Vertical(
+            self._arm() if self._joints else self._signals(),
+            lanes_view("boards, cycle by cycle", [self.all(BOARDS)], CYCLES_S),
+            rrb.Horizontal(self._load(), self._ages(), self._log(), column_shares=[3, 3, 4]),
+            row_shares=[4, 5, 3],
         )
-        for quantity in QUANTITIES
-    ]
-    error = rrb.Tabs(_curves("tracking error, mrad", [path(ERROR)]), _curves("gripper", [_all(GRIPPER)]))
-    return rrb.Grid(*views, error, grid_columns=2)
+        return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
 
+    def scene(self, name: str) -> rrb.View:
+        """Return the view of the cell; of a rack without one that of its signals."""
+        if (cell := self._cell) is None:
+            return _curves(name, [self.all(SIGNALS)])
+        shown = [self.all(CELL), f"- {self.all(CELL, COLLISION)}", self.all(FRAMES)]
+        eye = eye_on(cell)
+        return rrb.Spatial3DView(origin=self.path(CELL), contents=shown, name=name, eye_controls=eye, line_grid=False)
 
-def _joint(name: str, quantity: str) -> rrb.View:
-    return _curves(name, [path(JOINTS, name, quantity), path(JOINTS, name, quantity, "limits")], legend=False)
+    def doing(self, name: str) -> rrb.View:
+        """Return the view of what levels do, and of events, in the whole run."""
+        return lanes_view(name, [self.all(EVENTS), self.all(LEVELS)])
 
+    def _arm(self) -> rrb.Container:
+        """Return a view of all joints for each quantity, and in a second tab one of each joint with its limits."""
+        views = [
+            rrb.Tabs(
+                _curves(
+                    quantity,
+                    [self.path(JOINTS, name, quantity) for name in self._joints],
+                    legend=quantity == "torque",
+                ),
+                rrb.Grid(*(self._joint(name, quantity) for name in self._joints), name="by joint, with limits"),
+            )
+            for quantity in QUANTITIES
+        ]
+        error = _curves("tracking error, mrad", [self.path(ERROR)])
+        return rrb.Grid(*views, rrb.Tabs(error, _curves("gripper", [self.all(GRIPPER)])), grid_columns=2)
 
-def _load(config: RackConfig) -> rrb.Container | rrb.View:
-    if config.clock.mode == "lockstep":
-        return _curves("execution, ms; no deadlines in lockstep", [_all(timing.TIMES)])
-    use = _curves("use of the time slice, %", [_all(timing.LOAD)])
-    return rrb.Tabs(use, _curves("lateness and execution, ms", [_all(timing.TIMES)]))
+    def _joint(self, name: str, quantity: str) -> rrb.View:
+        shown = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]
+        return _curves(name, shown, legend=False)
 
+    def _signals(self) -> rrb.View:
+        return _curves("signals", [self.all(SIGNALS)])
 
-def _ages(layout: Layout) -> rrb.Container:
-    """Return the ages; plans, which may be old, have their own scale."""
-    plans = [path(timing.AGES, mailbox.name) for mailbox in layout.mailboxes if mailbox.name.endswith(".plan")]
-    sampled = [_all(timing.AGES), *(f"- {plan}" for plan in plans)]
-    return rrb.Tabs(
-        _curves("age of messages read, ms", sampled, legend=False),
-        _curves("plans", plans),
-        _curves("signals", [_all(SIGNALS)]),
-    )
+    def _load(self) -> rrb.Container | rrb.View:
+        times = self.all(timing.TIMES)
+        if self._config.clock.mode == "lockstep":
+            return _curves("execution, ms; no deadlines in lockstep", [times])
+        use = _curves("use of the time slice, %", [self.all(timing.LOAD)])
+        return rrb.Tabs(use, _curves("lateness and execution, ms", [times]))
 
+    def _ages(self) -> rrb.Container:
+        """Return the ages; plans, which may be old, have their own scale."""
+        boxes = [mailbox.name for mailbox in self._layout.mailboxes]
+        plans = [self.path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
+        sampled = [self.all(timing.AGES), *(f"- {plan}" for plan in plans)]
+        return rrb.Tabs(
+            _curves("age of messages read, ms", sampled, legend=False), _curves("plans", plans), self._signals()
+        )
 
-def _log() -> rrb.Container:
-    columns = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
-    log = rrb.TextLogView(origin=path(LOG), name="log", columns=columns)
-    config = rrb.TextDocumentView(origin=path(CONFIG), name="config")
-    return rrb.Tabs(log, config, _curves("recorder", [_all(RECORDER)]))
+    def _log(self) -> rrb.Container:
+        columns = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
+        log = rrb.TextLogView(origin=self.path(LOG), name="log", columns=columns)
+        config = rrb.TextDocumentView(origin=self.path(CONFIG), name="config")
+        return rrb.Tabs(log, config, _curves("recorder", [self.all(RECORDER)]))
 
-
-def _graph(layout: Layout, config: RackConfig) -> rrb.View:
-    places = positions(layout, rack_timing(config, layout)).values()
-    columns, rows = zip(*places, strict=True)
-    bounds = rrb.VisualBounds2D(
-        x_range=(min(columns) - 0.6 * COLUMN, max(columns) + 0.6 * COLUMN), y_range=(min(rows) - ROW, max(rows) + ROW)
-    )
-    return rrb.GraphView(origin=path(HIERARCHY), name="hierarchy", visual_bounds=bounds)
+    def _graph(self) -> rrb.View:
+        places = positions(self._layout, rack_timing(self._config, self._layout)).values()
+        columns, rows = zip(*places, strict=True)
+        bounds = rrb.VisualBounds2D(
+            x_range=(min(columns) - 0.6 * COLUMN, max(columns) + 0.6 * COLUMN),
+            y_range=(min(rows) - ROW, max(rows) + ROW),
+        )
+        return rrb.GraphView(origin=self.path(HIERARCHY), name="hierarchy", visual_bounds=bounds)
 
 
 def _curves(name: str, contents: list[str], legend: bool = True) -> rrb.View:
     axis = rrb.TimeAxis(link="LinkToGlobal")
     shown = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
     return rrb.TimeSeriesView(origin="/", contents=contents, name=name, axis_x=axis, plot_legend=shown)
-
-
-def _all(entity: str) -> str:
-    return f"{path(entity)}/**"
 
 
 def eye_on(cell: Cell) -> rrb.EyeControls3D:

@@ -47,19 +47,19 @@ def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
 
 def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Log all geoms, and the frames that never move with their poses in `data`."""
-    stream.static((CELL,), rr.CoordinateFrame(WORLD))
+    stream.static((CELL,), stream.within(WORLD))
     shown = {geom: _is_shown(model, geom) for geom in range(model.ngeom)}
     for geom in shown:
         shape = shape_of(model, geom)
         if shape is not None:
             entity = _entity(model, geom, shown[geom] or not any(shown.values()))
-            stream.static(entity, shape, rr.CoordinateFrame(frame_of(model, int(model.geom_bodyid[geom]))))
+            stream.static(entity, shape, stream.within(frame_of(model, int(model.geom_bodyid[geom]))))
     for body in set(range(1, model.nbody)) - set(moving_bodies(model).tolist()):
         pose = rr.Transform3D(
             translation=data.xpos[body],
             quaternion=rr.Quaternion(xyzw=xyzw(data.xquat[body])),
-            parent_frame=WORLD,
-            child_frame=frame_of(model, body),
+            parent_frame=stream.frame(WORLD),
+            child_frame=stream.frame(frame_of(model, body)),
         )
         stream.static((FRAMES, frame_of(model, body)), pose)
 
@@ -80,10 +80,11 @@ class Poses:
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
         self._bodies = moving_bodies(cell.model)
-        self._frames = [frame_of(cell.model, int(body)) for body in self._bodies]
+        self._world = stream.frame(WORLD)
+        self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._every = max(1, round(POSES_S * 1e9 / clock_ns))
         self._last = -1
-        stream.static(TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), rr.CoordinateFrame(WORLD))
+        stream.static(TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write poses, one every 20 ms of simulated time."""
@@ -111,7 +112,7 @@ class Poses:
         poses = rr.Transform3D.columns(
             translation=positions.reshape(-1, 3),
             quaternion=xyzw(quaternions).reshape(-1, 4),
-            parent_frame=[WORLD] * (len(chosen) * count),
+            parent_frame=[self._world] * (len(chosen) * count),
             child_frame=self._frames * len(chosen),
         )
         self._stream.columns((FRAMES,), times.columns(np.repeat(ticks, count), np.repeat(stamps, count)), poses)
@@ -123,7 +124,7 @@ class PlannedPath:
     def __init__(self, stream: Stream, cell: Cell) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
         for entity in (PATH, WAYPOINTS):
-            stream.static(entity, rr.CoordinateFrame(WORLD))
+            stream.static(entity, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write every plan; a plan for the gripper clears the path."""
@@ -162,7 +163,7 @@ class Goals:
         self._moves: dict[int, tuple[list[float], str]] = {}
         self._plans, self._current = Changes(), Changes()
         for entity in (GOALS, CURRENT_GOAL):
-            stream.static(entity, rr.CoordinateFrame(WORLD))
+            stream.static(entity, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the goals of every new plan."""

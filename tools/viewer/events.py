@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rerun as rr
 
 from rack.tools.viewer.levels import LOG, Hierarchy
@@ -82,25 +83,36 @@ class Events:
 
 
 class Losses:
-    """Writes how many rows were overwritten before the recorder took them, and its load; logs every loss."""
+    """Writes how many rows were overwritten before the recorder took them; logs every loss."""
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
         self._logged: dict[str, int] = {}
         stream.static((RECORDER, "rows_lost"), rr.SeriesLines(names=["rows lost"], colors=[(230, 50, 50)]))
-        stream.static((RECORDER, "load"), rr.SeriesLines(names=["recorder, % of a core"]))
-        self._cpu_s, self._wall_s = time.process_time(), time.monotonic()
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write the losses and the load since the last call."""
-        stamp_ns = time.monotonic_ns()
+        """Write the losses since the last call."""
+        stamp_ns = int(self._stream.times.stamps_of(np.array([tick]))[0])
         for ring, count in lost.items():
             if count > self._logged.get(ring, 0):
                 line = rr.TextLog(f"recorder: {count - self._logged.get(ring, 0)} rows of {ring} lost", level="ERROR")
                 self._stream.at(tick, stamp_ns, (LOG, "recorder"), line)
         self._logged = dict(lost)
         self._stream.at(tick, stamp_ns, (RECORDER, "rows_lost"), rr.Scalars(sum(lost.values())))
+
+
+class RecorderLoad:
+    """Writes the load of this process: a recorder."""
+
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
+        stream.static((RECORDER, "load"), rr.SeriesLines(names=["recorder, % of a core"]))
+        self._cpu_s, self._wall_s = time.process_time(), time.monotonic()
+
+    def advance(self, tick: int) -> None:
+        """Write the load since the last call."""
         cpu_s, wall_s = time.process_time(), time.monotonic()
         share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
         self._cpu_s, self._wall_s = cpu_s, wall_s
+        stamp_ns = int(self._stream.times.stamps_of(np.array([tick]))[0])
         self._stream.at(tick, stamp_ns, (RECORDER, "load"), rr.Scalars(100.0 * share))

@@ -6,14 +6,16 @@ from collections import defaultdict
 from collections.abc import Mapping
 from itertools import chain, count
 from pathlib import Path
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
-from rack.backplane.words import Head, System
+from rack.backplane.words import System
 from rack.boards.config import RackConfig, loads, rack_timing
+from rack.boards.config.timing import tick_ns
 from rack.levels.joint_messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.messages import (
     ARM_STATE,
@@ -25,12 +27,12 @@ from rack.levels.messages import (
 )
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.trajectory.messages import MOTION_STATUS
-from rack.tools.viewer.blueprint import blueprint, write_document
+from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
-from rack.tools.viewer.events import Events, Losses
+from rack.tools.viewer.events import Events, Losses, RecorderLoad
 from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Moves, Requests
-from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
 SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
@@ -46,24 +48,35 @@ def next_file(folder: Path) -> Path:
     return next(folder / name for name in names if not (folder / name).is_file())
 
 
-class ViewSink:
-    """Writes run.rrd of one rack into `folder`; with a port, also serves it to a viewer on this machine."""
+class Ran(NamedTuple):
+    """What a view needs to know of a rack before its first row: its layout, its config, its cell, its event log."""
 
-    def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
-        layout, words = segment.layout, segment.words
-        config = loads(segment.config)
-        cell = None
-        if config.robot is not None:
-            cell = build_cell(config.robot, config.scene, config.clock_ns)
-        self._times = Timelines(layout.clock_ns, words[Head.CREATED_NS])
-        view = blueprint(layout, config, cell, live=port is not None)
-        run = f"{folder.name}-{words[Head.CREATED_NS]}"
-        self._stream = stream = Stream(folder.name, run, next_file(folder), self._times, view, port)
-        write_document(stream, segment.config, config, layout)
+    layout: Layout
+    text: str
+    config: RackConfig
+    cell: Cell | None
+    events: Path
+
+    @classmethod
+    def of(cls, layout: Layout, text: str, folder: Path) -> Self:
+        """Return it for a run in `folder`; `text` is the resolved config."""
+        config = loads(text)
+        robot = config.robot
+        cell = None if robot is None else build_cell(robot, config.scene, config.clock_ns)
+        return cls(layout, text, config, cell, folder / "events.jsonl")
+
+
+class RackWriter:
+    """Writes what one rack left in its rings to a stream, in blocks."""
+
+    def __init__(self, stream: Stream, ran: Ran) -> None:
+        layout, config, cell = ran.layout, ran.config, ran.cell
+        self._times = stream.times
+        write_document(stream, ran.text, config, layout)
         if cell is not None:
             write_geometry(stream, cell.model, cell.start())
         of_mailbox = _parts_of(stream, layout, config, cell)
-        lockstep, period_ns = bool(words[System.LOCKSTEP]), words[System.PERIOD_NS]
+        lockstep, period_ns = config.clock.mode == "lockstep", tick_ns(config)
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
         self._of_task: dict[str, list[ViewPart]] = {
@@ -81,12 +94,43 @@ class ViewSink:
             of_mailbox[mailbox].append(age.write)
         self._parts = self._of_task | of_mailbox
         self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
-        self._events = Events(stream, folder / "events.jsonl", self._hierarchy)
+        self._events = Events(stream, ran.events, self._hierarchy)
         self._losses = Losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
+
+    def write(self, taken: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]) -> None:
+        """Write the rows of all rings, each (rows,), by ring: everything before `tick`. `lost` counts rows by ring."""
+        if (fastest := taken.get(self._fastest)) is not None:
+            self._times.learn(fastest["tick"], fastest["start_ns"])
+        for ring, rows in taken.items():
+            if ring in self._of_task:
+                block = RowBlock(rows, "start_ns", self._times)
+                self._hierarchy.write(ring, block)
+            else:
+                block = RowBlock(rows, "stamp_ns", self._times)
+            for write in self._parts[ring]:
+                write(block)
+        for age in self._ages.values():
+            age.advance(tick)
+        self._events.advance()
+        self._hierarchy.advance()
+        self._losses.advance(tick, lost)
+
+
+class ViewSink:
+    """Writes run.rrd of one rack into `folder`; with a port, also serves it to a viewer on this machine."""
+
+    def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
+        layout, launch = segment.layout, segment.launch
+        ran = Ran.of(layout, segment.config, folder)
+        view = blueprint(RackViews(layout, ran.config, ran.cell).everything(), live=port is not None)
+        run = f"{folder.name}-{launch.created_ns}"
+        recording = new_recording(folder.name, run, next_file(folder), view, port)
+        self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
+        self._writer, self._load = RackWriter(self._stream, ran), RecorderLoad(self._stream)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
-        self._block = max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
-        self._written = words[System.TICK]
+        self._block = block_of(layout)
+        self._written = segment.words[System.TICK]
 
     def add(self, ring: str, rows: np.ndarray) -> None:
         """Take rows of a ring, shape (rows,)."""
@@ -111,22 +155,13 @@ class ViewSink:
     def _write(self, tick: int, lost: Mapping[str, int]) -> None:
         self._written = tick
         waiting, self._waiting = self._waiting, defaultdict(list)
-        taken = {ring: np.concatenate(blocks) for ring, blocks in waiting.items()}
-        if (fastest := taken.get(self._fastest)) is not None:
-            self._times.learn(fastest["tick"], fastest["start_ns"])
-        for ring, rows in taken.items():
-            if ring in self._of_task:
-                block = RowBlock(rows, "start_ns", self._times)
-                self._hierarchy.write(ring, block)
-            else:
-                block = RowBlock(rows, "stamp_ns", self._times)
-            for write in self._parts[ring]:
-                write(block)
-        for age in self._ages.values():
-            age.advance(tick)
-        self._events.advance()
-        self._hierarchy.advance()
-        self._losses.advance(tick, lost)
+        self._writer.write({ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost)
+        self._load.advance(tick)
+
+
+def block_of(layout: Layout) -> int:
+    """Return the ticks of one block."""
+    return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
 def _parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> dict[str, list[ViewPart]]:

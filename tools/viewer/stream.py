@@ -5,15 +5,18 @@ Its rows have three timelines: simulated time, tick, wall clock. They come in bl
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+
+from rack.backplane.segment import Launch
+from rack.tools.runs.time_line import Placed
 
 Ints = NDArray[np.int64]
 
@@ -27,30 +30,41 @@ SERVER_MEMORY = "200MB"
 """What the server keeps for a viewer that joins later."""
 
 
+class Times(NamedTuple):
+    """Times of rows, each (rows,): simulated, ns; tick; wall clock, ns."""
+
+    simulated_ns: Ints
+    ticks: Ints
+    wall_ns: Ints
+
+
 class Timelines:
     """Converts ticks and CLOCK_MONOTONIC stamps to time columns; all integers, ns.
 
-    `launched_ns`: when the rack was launched, CLOCK_REALTIME.
+    Of a rack `placed` on the time line of another one, all three are that one's.
     """
 
-    def __init__(self, clock_ns: int, launched_ns: int) -> None:
+    def __init__(self, clock_ns: int, launch: Launch, placed: Placed | None = None) -> None:
         self.clock_ns = clock_ns
-        # One offset for the whole recording: setting the clock meanwhile must not fold the timeline.
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._offset_ns, self._placed = launch.wall_offset_ns, placed
         self._ticks: Ints = np.zeros(1, dtype=np.int64)
-        self._stamps: Ints = np.array([self.monotonic(launched_ns)])
+        self._stamps: Ints = np.array([launch.monotonic_ns])
+
+    def times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> Times:
+        """Return the times of rows released at `ticks`, `within_ns` of simulated time later, stamped `stamps_ns`."""
+        if (placed := self._placed) is None:
+            return Times(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
+        simulated_ns = placed.times_ns(ticks, within_ns)
+        return Times(simulated_ns, simulated_ns // placed.line.clock_ns, placed.wall_ns(stamps_ns))
 
     def columns(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> list[rr.TimeColumn]:
-        """Return the columns of rows released at `ticks`, `within_ns` of simulated time later, stamped `stamps_ns`."""
+        """Return the same times as columns."""
+        found = self.times(ticks, stamps_ns, within_ns)
         return [
-            rr.TimeColumn(SIM_TIME, duration=(ticks * self.clock_ns + within_ns).astype("timedelta64[ns]")),
-            rr.TimeColumn(TICK, sequence=ticks),
-            rr.TimeColumn(WALL, timestamp=(stamps_ns + self._offset_ns).astype("datetime64[ns]")),
+            rr.TimeColumn(SIM_TIME, duration=found.simulated_ns.astype("timedelta64[ns]")),
+            rr.TimeColumn(TICK, sequence=found.ticks),
+            rr.TimeColumn(WALL, timestamp=found.wall_ns.astype("datetime64[ns]")),
         ]
-
-    def wall(self, stamp_ns: int) -> np.datetime64:
-        """Return a CLOCK_MONOTONIC stamp on the wall clock."""
-        return np.datetime64(stamp_ns + self._offset_ns, "ns")
 
     def learn(self, ticks: Ints, stamps_ns: Ints) -> None:
         """Remember when ticks happened; both are sorted."""
@@ -112,35 +126,54 @@ class Changes:
         return np.flatnonzero(changed)
 
 
-class Stream:
-    """One recording being written. Entities are named by parts, which may hold any character.
+def new_recording(
+    name: str, run: str, file: Path, blueprint: rrb.Blueprint, port: int | None = None
+) -> rr.RecordingStream:
+    """Return a recording to be written into a file, and served on a port of this machine, if one is given.
 
-    Files of one `run` are shown as one recording. `flush` raises `RuntimeError` once the file cannot be written.
+    Files of one `run` are shown as one recording.
+    """
+    # Otherwise a mistake is a warning on stderr and a gap in the recording.
+    rr.set_strict_mode(True)
+    recording = rr.RecordingStream(APPLICATION, recording_id=run)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    sinks: list[rr.FileSink | rr.GrpcServerSink] = [rr.FileSink(str(file))]
+    if port is not None:
+        # A server, not a client: a client without its viewer would block the file as well.
+        sinks.append(rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=SERVER_MEMORY))
+    recording.set_sinks(*sinks, default_blueprint=blueprint)
+    recording.send_recording_name(name)
+    return recording
+
+
+class Stream:
+    """What one rack adds to a recording. Entities are named by parts, which may hold any character.
+
+    All of them are below `root`. `flush` raises `RuntimeError` once the file cannot be written.
     """
 
-    def __init__(
-        self, name: str, run: str, file: Path, times: Timelines, blueprint: rrb.Blueprint, port: int | None
-    ) -> None:
-        self.times = times
-        # Otherwise a mistake is a warning on stderr and a gap in the recording.
-        rr.set_strict_mode(True)
-        self._recording = rr.RecordingStream(APPLICATION, recording_id=run)
-        self._recording.set_log_time_enabled(False)
-        self._recording.set_log_tick_enabled(False)
-        sinks: list[rr.FileSink | rr.GrpcServerSink] = [rr.FileSink(str(file))]
-        if port is not None:
-            # A server, not a client: a client without its viewer would block the file as well.
-            sinks.append(rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=SERVER_MEMORY))
-        self._recording.set_sinks(*sinks, default_blueprint=blueprint)
-        self._recording.send_recording_name(name)
+    def __init__(self, recording: rr.RecordingStream, times: Timelines, root: Sequence[str] = ()) -> None:
+        self._recording, self.times, self._root = recording, times, root
+
+    def frame(self, name: str) -> str:
+        """Return the name of a coordinate frame: frames are known to all entities of a recording."""
+        return "/".join((*self._root, name))
+
+    def within(self, frame: str) -> rr.CoordinateFrame:
+        """Return what puts an entity into a frame."""
+        return rr.CoordinateFrame(self.frame(frame))
+
+    def _path(self, entity: Sequence[str]) -> str:
+        return path(*self._root, *entity)
 
     def static(self, entity: Sequence[str], *archetypes: rr.AsComponents) -> None:
         """Log what holds at all times."""
-        self._recording.log(path(*entity), *archetypes, static=True)
+        self._recording.log(self._path(entity), *archetypes, static=True)
 
     def columns(self, entity: Sequence[str], times: list[rr.TimeColumn], columns: rr.ComponentColumnList) -> None:
         """Send a block of rows."""
-        self._recording.send_columns(path(*entity), times, columns)
+        self._recording.send_columns(self._path(entity), times, columns)
 
     def scalars(self, entity: Sequence[str], times: list[rr.TimeColumn], values: np.ndarray) -> None:
         """Send a block of curves, shape (rows,) or (rows, curves)."""
@@ -148,14 +181,15 @@ class Stream:
 
     def at(self, tick: int, stamp_ns: int, entity: Sequence[str], archetype: rr.AsComponents) -> None:
         """Log a single item, at a tick and a time of CLOCK_MONOTONIC."""
-        self._recording.set_time(SIM_TIME, duration=np.timedelta64(tick * self.times.clock_ns, "ns"))
-        self._recording.set_time(TICK, sequence=tick)
-        self._recording.set_time(WALL, timestamp=self.times.wall(stamp_ns))
-        self._recording.log(path(*entity), archetype)
+        found = self.times.times(np.array([tick]), np.array([stamp_ns]))
+        self._recording.set_time(SIM_TIME, duration=np.timedelta64(int(found.simulated_ns[0]), "ns"))
+        self._recording.set_time(TICK, sequence=int(found.ticks[0]))
+        self._recording.set_time(WALL, timestamp=np.datetime64(int(found.wall_ns[0]), "ns"))
+        self._recording.log(self._path(entity), archetype)
 
     def property(self, name: str, values: rr.AsComponents) -> None:
         """Log a property of the run."""
-        self._recording.send_property(name, values)
+        self._recording.send_property(" ".join((*self._root, name)), values)
 
     def flush(self) -> None:
         """Write everything to the file. Raises `RuntimeError` when that fails."""

@@ -38,6 +38,8 @@ KINDS = {
     Alarm.BRAKES_CLOSED: "reaction",
     Alarm.BRAKES_OPENED: "recovery",
     Alarm.RE_REFERENCED: "recovery",
+    Alarm.PEER_BACK: "recovery",
+    Alarm.PEER_RESTARTED: "recovery",
     Alarm.LATCHED: "reaction",
     Alarm.QUEUE_FULL: "held",
 }

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple, cast
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from rack.backplane.message import Message
+from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS
 from rack.levels.algebra import Array
@@ -46,9 +46,13 @@ class Found(NamedTuple):
 class ServoRig:
     """Runs executor and planner of the servo level tick by tick; the set points come from a function of time."""
 
-    def __init__(self, robot: RobotConfig, scene: SceneConfig, **params: float | str) -> None:
-        board = BoardSpec("servo", 1, ServoExecutor, ServoPlanner, PERIOD, above="primitive", params=params)
-        self.rack = Lockstep([board], robot, scene, outside={"primitive.command": JOINT_SET_POINT})
+    executor: type[ServoExecutor] = ServoExecutor
+    outside: Mapping[str, MessageType] = {"primitive.command": JOINT_SET_POINT}
+    """Mailboxes that the test writes."""
+
+    def __init__(self, robot: RobotConfig, scene: SceneConfig, name: str = "", **params: Any) -> None:
+        board = BoardSpec("servo", 1, self.executor, ServoPlanner, PERIOD, above="primitive", params=params)
+        self.rack = Lockstep([board], robot, scene, outside=self.outside, name=name)
         self.command: Message = self.rack.message("primitive.command")
         self.command.opening, self.command.force, self.command.held = 0.04, 20.0, -1
         self.targets: list[Array] = []

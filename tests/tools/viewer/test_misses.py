@@ -10,9 +10,10 @@ import pytest
 import rerun.blueprint as rrb
 
 from rack.backplane.layout import TaskSpec
+from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, Flag
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.stream import RowBlock, Stream, Timelines
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines, new_recording
 from rack.tools.viewer.timing import Misses
 
 TICK_NS = 2_500_000
@@ -22,8 +23,8 @@ TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 4)
 
 def recorded(folder: Path, missed: list[list[int]]) -> Path:
     """Write blocks of 400 cycles with misses at those ticks."""
-    times = Timelines(TICK_NS, time.time_ns())
-    stream = Stream("misses", "run", folder / "run.rrd", times, rrb.Blueprint(), None)
+    times = Timelines(TICK_NS, Launch(time.time_ns(), 0))
+    stream = Stream(new_recording("misses", "run", folder / "run.rrd", rrb.Blueprint()), times)
     part = Misses(stream, TASK)
     for number, ticks in enumerate(missed):
         rows = np.zeros(400, dtype=RECORD)

@@ -1,0 +1,103 @@
+"""Bodies that several racks simulate: each rack has a copy of its own, and one of them at a time moves the body.
+
+All that passes between the simulations is a mailbox, `servo.shared`, up to 50 times a second. A body belongs to the
+rack whose gripper has begun to touch it last: that rack's simulation moves it, and the copies of the others stay where
+it reports the body to be. To begin to touch is to claim, with the next number. Of two claims the one with the greater
+number stands, of two equal ones that of the rack whose name comes last: all racks that have read the same messages
+agree. A body that nobody has touched yet moves in every simulation by itself.
+
+Modelled: one body in one place, carried by one arm after the other. Not modelled: forces between arms of two racks, on
+each other or through a body that both touch; the program keeps the arms apart. A copy is as late as the messages, and
+where none come any more it stays where it is. A rack that is launched anew takes over what the others know, its own
+claims of before included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rack.backplane.message import Field, Message, MessageType
+from rack.levels.algebra import Array
+
+MOST_SHARED = 4
+"""Bodies that one rack shares, at most: the message has the same layout in every rack."""
+NAME_BYTES = 40
+
+SHARED_BODY = MessageType(
+    "shared_body",
+    1,
+    (
+        Field("name", f"S{NAME_BYTES}", "ASCII", "body, by its name in the model; empty: none"),
+        Field("claim", "u4", "1", "number of the claim that stands, as far as this rack knows; 0: none yet"),
+        Field("owner", f"S{NAME_BYTES}", "ASCII", "rack whose claim that is: its simulation moves the body"),
+        Field("touched", "u1", "1", "1: the gripper of this rack touches it"),
+        Field("position", "f8", "m", "body origin in this rack's simulation", (3,)),
+        Field("quaternion", "f8", "1", "body orientation, likewise", (4,)),
+    ),
+)
+
+SHARED_BODIES = MessageType(
+    "shared_bodies",
+    1,
+    (
+        Field("rack", f"S{NAME_BYTES}", "ASCII", "rack that writes this"),
+        Field("bodies", SHARED_BODY, "", "the bodies that it shares", (MOST_SHARED,)),
+    ),
+)
+
+
+@dataclass(order=True)
+class Claim:
+    """The claim to a body that stands: of two, the greater one."""
+
+    number: int = 0
+    owner: bytes = b""
+
+
+@dataclass
+class SharedBody:
+    """What one rack, `rack`, knows of a body that it shares."""
+
+    name: bytes
+    rack: bytes
+    claim: Claim = field(default_factory=Claim)
+    is_touched: bool = False
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether the simulation of another rack moves it."""
+        return self.claim.owner not in (b"", self.rack)
+
+    def touch(self, touches: bool) -> None:
+        """Claim the body if this rack's gripper begins to touch it."""
+        if touches and not self.is_touched and self.claim.owner != self.rack:
+            self.claim = Claim(self.claim.number + 1, self.rack)
+        self.is_touched = touches
+
+    def hear(self, message: Message) -> Array | None:
+        """Take what another rack says; return where the body is, (7,), m and quaternion; None: nothing new.
+
+        What counts is a greater claim, whoever reports it, and after that the word of the owner.
+        """
+        for told in message.bodies[message.bodies["name"] == self.name]:
+            claim = Claim(int(told["claim"]), bytes(told["owner"]))
+            if claim > self.claim or (
+                claim == self.claim and self.is_elsewhere and message.record["rack"] == claim.owner
+            ):
+                self.claim = claim
+                return np.concatenate((told["position"], told["quaternion"]))
+        return None
+
+    def recall(self, message: Message) -> None:
+        """Take over what this rack itself said last, after a restart of the board."""
+        for told in message.bodies[message.bodies["name"] == self.name]:
+            self.claim = Claim(int(told["claim"]), bytes(told["owner"]))
+            self.is_touched = bool(told["touched"])
+
+    def show(self, record: np.void, pose: Array) -> None:
+        """Fill a `SHARED_BODY`; `pose` (7,) is that of the own simulation."""
+        record["name"], record["touched"] = self.name, self.is_touched
+        record["claim"], record["owner"] = self.claim.number, self.claim.owner
+        record["position"], record["quaternion"] = pose[:3], pose[3:]

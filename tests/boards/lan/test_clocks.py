@@ -1,0 +1,296 @@
+"""The clocks of other racks: the estimator as pure arithmetic, then machines whose clocks truly differ."""
+
+from __future__ import annotations
+
+import json
+import select
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rack.backplane.layout import Layout
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import System
+from rack.boards.lan.clocks import (
+    _PING_KIND,
+    ANSWER_NS,
+    MOST_ASKERS,
+    RECENT,
+    ClockOffset,
+    PeerClock,
+    Responder,
+    RoundTrip,
+)
+from rack.boards.lan.envelope import Envelope, Sealer
+from rack.boards.lan.grid import OwnGrid
+from rack.boards.lan.link import Arrived
+from rack.boards.lan.peers import PeerRack
+from rack.levels.peer import DRIFT_PPM
+from rack.tools.runs.window import free_port
+from tests.boards.lan.clock_machine import CLOCK_NS, PERIOD_NS
+
+ROOT = Path(__file__).resolve().parents[3]
+S, MS, US = 1_000_000_000, 1_000_000, 1_000
+WATCHDOG_S = 30.0
+AHEAD_S = 1000
+TRIPS = 4
+
+DELAYS = st.integers(1 * US, 2 * S)
+PING = st.tuples(st.integers(0, 5 * S), DELAYS, st.integers(0, 1 * MS), DELAYS)
+
+
+@given(offset=st.integers(-(10**18), 10**18), rate=st.integers(-DRIFT_PPM, DRIFT_PPM), pings=st.lists(PING, min_size=1))
+def test_the_true_offset_is_always_within_the_uncertainty(
+    offset: int, rate: int, pings: list[tuple[int, int, int, int]]
+) -> None:
+    def theirs(now: int) -> int:
+        return now + offset + now * rate // 1_000_000
+
+    found, now = ClockOffset(), 0
+    for pause, there, answering, back in pings:
+        sent = now + pause
+        received, answered = sent + there, sent + there + answering
+        now = answered + back
+        assert found.add(RoundTrip(sent, theirs(received), theirs(answered), now))
+        assert found.steps == 0
+        assert found.best is not None
+        for later in (now, now + 7 * S):
+            assert abs(found.best.offset_ns - (theirs(later) - later)) <= found.best.uncertainty_ns(later)
+
+
+def trip(at: int, offset: int, there: int = 200 * US, back: int = 200 * US) -> RoundTrip:
+    return RoundTrip(at, at + there + offset, at + there + offset, at + there + back)
+
+
+def test_the_shortest_recent_round_trip_counts_until_it_is_too_old() -> None:
+    found = ClockOffset()
+    best = trip(0, 5 * S, 20 * US, 20 * US)
+    found.add(best)
+    found.add(trip(1 * S, 5 * S))
+    assert found.best == best
+    for at in range(2, RECENT + 2):
+        found.add(trip(at * S, 5 * S))
+    assert found.best is not None
+    assert found.best.sent > S
+
+
+@pytest.mark.parametrize("step", [3 * MS, -3 * MS, 10**12])
+def test_a_clock_that_steps_begins_a_new_estimate(step: int) -> None:
+    found = ClockOffset()
+    for at in range(5):
+        found.add(trip(at * S, 0))
+    found.add(trip(5 * S, step))
+    assert found.steps == 1
+    assert len(found) == 1
+    assert found.best is not None
+    assert found.best.offset_ns == step
+
+
+def test_a_slow_answer_does_not_contradict_a_good_estimate() -> None:
+    found = ClockOffset()
+    found.add(trip(0, 0))
+    found.add(trip(1 * S, 0, 500 * MS, 1 * MS))
+    assert found.steps == 0
+    assert found.best is not None
+    assert found.best.lasted_ns == 400 * US
+
+
+@pytest.mark.parametrize("bad", [RoundTrip(100, 0, 500, 200), RoundTrip(200, 0, 0, 100), RoundTrip(100, 500, 400, 200)])
+def test_what_cannot_be_a_round_trip_is_refused(bad: RoundTrip) -> None:
+    found = ClockOffset()
+    assert not found.add(bad)
+    assert found.best is None
+
+
+def test_another_launch_and_a_loss_begin_anew() -> None:
+    peer = PeerRack("b")
+    clock = PeerClock(peer)
+    for change, is_anew in (
+        (lambda: peer.comes(7, 0), True),
+        (lambda: peer.goes(7, 1), True),
+        (lambda: peer.comes(7, 2), False),  # the loss has begun it anew
+        (lambda: peer.comes(8, 3), True),
+    ):
+        clock.offset.add(trip(0, 0))
+        peer.offset_ns = 0
+        change()
+        clock.begin()
+        assert (clock.offset.best is None) == (peer.offset_ns is None) == is_anew
+
+
+@pytest.fixture
+def segment(rack_name: str) -> Iterator[Segment]:
+    made = Segment.create(Layout(rack_name, CLOCK_NS, (), ()), "")
+    yield made
+    made.close()
+    unlink(rack_name)
+
+
+def test_a_message_counts_as_old_as_it_may_be(segment: Segment) -> None:
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    segment.words[System.EPOCH_NS] = 100 * S
+    grid, peer = OwnGrid(segment, 1), PeerRack("b")
+    head = Envelope(0, 0, 1, 1, 0, 0, stamp_ns=1100 * S + 10 * PERIOD_NS)
+    peer.offset_ns, peer.uncertainty_ns = 1000 * S, 0
+    assert grid.tick_of(head, peer, tick=50) == 10
+    peer.uncertainty_ns = 3 * PERIOD_NS
+    assert grid.tick_of(head, peer, tick=50) == 7
+
+
+class Answers:
+    """Takes answers in place of a network."""
+
+    def __init__(self) -> None:
+        self.sent: list[str] = []
+
+    def on(self, key: str, callback: Any) -> None:
+        """Bring nothing: the tests do."""
+
+    def publish(self, key: str) -> Any:
+        return lambda payload, envelope: self.sent.append(key)
+
+
+def ping(asker: str, sealer: Sealer, to: str) -> Arrived:
+    key = f"rack/{asker}/ping/{to}"
+    return Arrived(key, sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b""), b"")
+
+
+def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
+    responder, network, sealer = Responder(segment, 1), Answers(), Sealer(b"secret")
+    responder.open(network, sealer)  # type: ignore[arg-type]
+    began = time.monotonic_ns()
+    for _ in range(1000):
+        responder._on_ping(ping("flood", sealer, segment.rack))
+    most = 1 + (time.monotonic_ns() - began) // ANSWER_NS
+    assert 1 <= len(network.sent) == responder.answered <= most
+    assert responder.withheld == 1000 - responder.answered
+    # One rack's flood takes nothing from another; but of racks, too, there are not endlessly many.
+    for at in range(MOST_ASKERS):
+        responder._on_ping(ping(f"rack-{at}", sealer, segment.rack))
+    assert len(set(network.sent)) == MOST_ASKERS
+    assert f"rack/{segment.rack}/pong/rack-0" in network.sent
+
+
+def test_a_ping_without_the_secret_gets_no_answer(segment: Segment) -> None:
+    responder, network = Responder(segment, 1), Answers()
+    responder.open(network, Sealer(b"secret"))  # type: ignore[arg-type]
+    responder._on_ping(ping("stranger", Sealer(b"guessed"), segment.rack))
+    assert network.sent == []
+    assert (responder.answered, responder.refused) == (0, 1)
+
+
+@contextmanager
+def machine(names: tuple[str, str], table: dict[str, Any], *within: str) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", "tests.boards.lan.clock_machine", *names, json.dumps(table), str(TRIPS)]
+    with subprocess.Popen([*within, *command], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            with suppress(BrokenPipeError):
+                process.stdin.close()  # type: ignore[union-attr]
+            try:
+                process.wait(WATCHDOG_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def found(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    assert process.stdout is not None
+    assert select.select([process.stdout], [], [], WATCHDOG_S)[0], "no round trip"
+    return dict(json.loads(process.stdout.readline()))
+
+
+def compared(name: str, port: int, *within: str, through: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what two machines find of each other; the second runs `within` a command, and calls `through` a port."""
+    names = (f"{name}-a", f"{name}-b")
+    here = {"listen": [f"tcp/127.0.0.1:{port}"], "insecure": True}
+    there = {"connect": [f"tcp/127.0.0.1:{through or port}"], "insecure": True}
+    with machine(names, here) as one, machine(names[::-1], there, *within) as other:
+        return found(one), found(other)
+
+
+def check_grids(one: dict[str, Any], other: dict[str, Any]) -> None:
+    """Check that simulated times follow from the grids: both run at twice the time."""
+    assert one["speed"] == other["speed"] == CLOCK_NS / PERIOD_NS
+    epochs_s = (other["epoch_ns"] - one["epoch_ns"]) * 1e-9
+    assert one["ahead"] == pytest.approx((one["offset"] - epochs_s) * one["speed"], abs=1e-6)
+    assert other["ahead"] == pytest.approx((other["offset"] + epochs_s) * one["speed"], abs=1e-6)
+
+
+def test_two_machines_with_one_clock_find_no_offset(rack_name: str) -> None:
+    one, other = compared(rack_name, free_port())
+    for seen in (one, other):
+        assert abs(seen["offset"]) <= seen["uncertainty"] < 1.0
+        assert 0.0 < seen["round_trip"] <= 2 * seen["uncertainty"]
+    check_grids(one, other)
+
+
+def why_no_time_namespace() -> str:
+    """Return why no process can have a clock of its own here; empty where one can."""
+    if shutil.which("unshare") is None:
+        return "no unshare (util-linux)"
+    done = subprocess.run(["unshare", "--time", "--monotonic", "1", "--fork", "true"], capture_output=True, text=True)
+    return f"no time namespace: {done.stderr.strip() or done.returncode}" if done.returncode else ""
+
+
+def test_a_machine_that_is_a_thousand_seconds_ahead_is_found_to_be(rack_name: str) -> None:
+    if reason := why_no_time_namespace():
+        pytest.skip(reason)
+    one, other = compared(rack_name, free_port(), "unshare", "--time", "--monotonic", str(AHEAD_S), "--fork")
+    assert abs(one["offset"] - AHEAD_S) <= one["uncertainty"] < 1.0
+    assert abs(other["offset"] + AHEAD_S) <= other["uncertainty"] < 1.0
+    check_grids(one, other)
+
+
+DELAY_S = 0.04
+
+
+@contextmanager
+def slow_one_way(port: int) -> Iterator[int]:
+    """Relay connections to a port; what goes there takes `DELAY_S` longer than what comes back."""
+    with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as open_sockets:
+
+        def pass_on(source: socket.socket, to: socket.socket, delay_s: float) -> None:
+            with suppress(OSError):
+                while content := source.recv(1 << 16):
+                    time.sleep(delay_s)
+                    to.sendall(content)
+            with suppress(OSError):
+                to.shutdown(socket.SHUT_RDWR)
+
+        def serve() -> None:
+            with suppress(OSError):
+                while near := open_sockets.enter_context(server.accept()[0]):
+                    try:
+                        far = open_sockets.enter_context(socket.create_connection(("127.0.0.1", port)))
+                    except ConnectionRefusedError:  # not listening yet
+                        near.close()
+                        continue
+                    for way in ((near, far, DELAY_S), (far, near, 0.0)):
+                        threading.Thread(target=pass_on, args=way, daemon=True).start()
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield int(server.getsockname()[1])
+        with suppress(OSError):
+            server.shutdown(socket.SHUT_RDWR)
+
+
+def test_a_way_that_is_slower_than_the_way_back_is_within_the_uncertainty(rack_name: str) -> None:
+    port = free_port()
+    with slow_one_way(port) as through:
+        one, other = compared(rack_name, port, through=through)
+    for seen in (one, other):
+        # The error is real, and stated.
+        assert DELAY_S / 4 < abs(seen["offset"]) <= seen["uncertainty"]
+        assert seen["uncertainty"] >= DELAY_S / 2

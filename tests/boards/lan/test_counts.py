@@ -1,0 +1,88 @@
+"""The order of an import's messages: loss, duplicates, disorder and restarts, counted exactly."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rack.boards.lan.counts import WINDOW, ImportCount, MessageOrder
+from rack.boards.lan.envelope import Envelope
+
+
+def head(number: int, launch: int = 7, serial: int = 0) -> Envelope:
+    """Return the head of the message of that number; each is of a later write than the one before."""
+    return Envelope(1, launch, serial or 3 * number, number, 0, 0, 0)
+
+
+def order() -> tuple[MessageOrder, ImportCount]:
+    """Return an order and its counts."""
+    count = ImportCount()
+    return MessageOrder(count), count
+
+
+def test_messages_in_order_are_all_new() -> None:
+    found, count = order()
+    assert all(found.admits(head(number)) for number in range(5, 10))
+    assert count == ImportCount()
+
+
+def test_what_is_missing_is_counted_and_what_comes_late_is_disorder_once() -> None:
+    found, count = order()
+    assert [found.admits(head(number)) for number in (1, 4, 3, 3, 4, 5)] == [True, True, False, False, False, True]
+    assert (count.missing, count.disordered, count.repeated) == (2, 1, 2)
+
+
+def test_a_new_launch_begins_anew() -> None:
+    found, count = order()
+    assert found.admits(head(90))
+    assert found.admits(head(4, launch=8))
+    assert (found.launch, found.number, count.missing, count.repeated) == (8, 4, 0, 0)
+    assert found.admits(head(6, launch=8))
+    assert count.missing == 1
+
+
+def test_a_restarted_reader_takes_nothing_twice() -> None:
+    found, count = order()
+    found.resume(7, 20, 60)
+    assert not found.admits(head(20))
+    assert not found.admits(head(19))
+    assert (count.repeated, count.disordered) == (2, 0)
+    assert found.admits(head(23))
+    assert count.missing == 2
+
+
+def test_a_restarted_sender_may_give_one_number_twice() -> None:
+    found, count = order()
+    assert found.admits(head(20, serial=60))
+    assert found.admits(head(20, serial=64))
+    assert found.admits(head(21, serial=65))
+    assert count == ImportCount()
+
+
+def test_a_reader_resumed_without_launches_goes_on() -> None:
+    found, count = order()
+    found.resume(0, 20, 60)
+    assert not found.admits(head(20))
+    assert found.admits(head(21))
+    assert count.missing == 0
+    assert found.launch == 7
+
+
+@given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
+def test_every_message_is_new_disordered_or_repeated_and_what_never_came_is_the_rest(numbers: list[int]) -> None:
+    found, count = order()
+    first = numbers[0]
+    came = [number for number in numbers if number >= first]
+    new = sum(found.admits(head(number, serial=number + 1)) for number in came)
+    assert new + count.disordered + count.repeated == len(came)
+    assert new + count.disordered == len(set(came))
+    assert count.missing - count.disordered == max(came) - first + 1 - len(set(came))
+
+
+def test_what_comes_after_the_window_is_bounded() -> None:
+    found, count = order()
+    assert found.admits(head(1))
+    assert found.admits(head(WINDOW * 4))
+    assert not found.admits(head(2))
+    assert not found.admits(head(2))
+    assert count.disordered == 2

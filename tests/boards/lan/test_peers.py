@@ -1,0 +1,191 @@
+"""Which launch of another rack is there, whatever the order in which tokens come and go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
+from rack.boards.lan.peers import REMEMBERED, PeerRack, Peers
+from rack.levels.peer import PEER, Presence
+
+OLD, NEW = 11, 22
+
+
+def alarms(peer: PeerRack) -> list[Alarm]:
+    """Return the alarms that a rack's coming and going has raised so far."""
+    return [finding.alarm for finding in peer.findings]
+
+
+def test_a_rack_is_there_from_its_token_to_the_end_of_it() -> None:
+    peer = PeerRack("b")
+    assert peer.presence is Presence.AWAITED
+    peer.goes(OLD, 3)
+    assert peer.presence is Presence.AWAITED
+    peer.comes(OLD, 5)
+    assert (peer.presence, peer.since, peer.launches, alarms(peer)) == (Presence.THERE, 5, 1, [])
+    peer.goes(OLD, 9)
+    assert (peer.presence, peer.since, peer.losses, alarms(peer)) == (Presence.LOST, 9, 1, [Alarm.PEER_LOST])
+
+
+def test_a_partition_is_not_a_restart() -> None:
+    peer = PeerRack("b")
+    peer.comes(OLD, 5)
+    peer.goes(OLD, 9)
+    peer.comes(OLD, 20)
+    assert (peer.launches, peer.losses, peer.since) == (1, 1, 20)
+    assert alarms(peer) == [Alarm.PEER_LOST, Alarm.PEER_BACK]
+    assert peer.findings[-1].value == 11
+
+
+def test_a_new_launch_replaces_one_whose_token_has_not_expired() -> None:
+    peer = PeerRack("b")
+    peer.comes(OLD, 5)
+    peer.comes(NEW, 9)
+    assert (peer.launch, peer.launches, peer.losses) == (NEW, 2, 1)
+    assert alarms(peer) == [Alarm.PEER_LOST, Alarm.PEER_RESTARTED]
+    peer.goes(OLD, 40)
+    assert (peer.launch, peer.is_there, peer.losses) == (NEW, True, 1)
+    assert peer.is_over(OLD)
+    assert not peer.is_over(NEW)
+    # A late token, as over another way through the network.
+    peer.comes(OLD, 41)
+    assert (peer.launch, peer.launches) == (NEW, 2)
+
+
+def test_of_two_tokens_seen_at_once_the_one_that_stays_is_there() -> None:
+    for first, second in ((OLD, NEW), (NEW, OLD)):
+        peer = PeerRack("b")
+        peer.comes(first, 0)
+        peer.comes(second, 0)
+        peer.goes(OLD, 80)
+        assert (peer.launch, peer.is_there, peer.launches) == (NEW, True, 2)
+
+
+def test_a_new_launch_after_a_loss_is_a_restart_even_if_the_old_token_was_never_seen_to_go() -> None:
+    peer = PeerRack("b")
+    peer.comes(OLD, 5)
+    peer.goes(OLD, 9)
+    peer.comes(NEW, 20)
+    assert alarms(peer) == [Alarm.PEER_LOST, Alarm.PEER_RESTARTED]
+    assert (peer.launches, peer.losses) == (2, 1)
+
+
+def taken(changes: list[tuple[str, int, bool]]) -> Iterator[tuple[str, int, bool]]:
+    """Take the changes out of a list."""
+    while changes:
+        yield changes.pop(0)
+
+
+def restarted(peer: PeerRack, confirm_by: int) -> PeerRack:
+    """Return the rack as a restarted adapter finds it in its mailbox."""
+    message, after = Message(PEER.dtype({})), PeerRack("b")
+    peer.fill(message, is_lockstep=False)
+    after.resume(message, confirm_by)
+    return after
+
+
+def test_a_restarted_adapter_goes_on_with_the_same_launch() -> None:
+    peer = PeerRack("b")
+    peer.comes(OLD, 5)
+    after = restarted(peer, 100)
+    assert (after.presence, after.launch, after.launches, after.since) == (Presence.THERE, OLD, 1, 5)
+    after.comes(OLD, 50)
+    assert (after.presence, after.launches, after.losses, alarms(after)) == (Presence.THERE, 1, 0, [])
+    assert after.confirm_by < 0
+
+
+def test_a_rack_that_ended_while_the_adapter_was_away_is_lost_in_time() -> None:
+    peers = Peers(["b"])
+    there = PeerRack("b")
+    there.comes(OLD, 5)
+    message = Message(PEER.dtype({}))
+    there.fill(message, is_lockstep=False)
+    peers["b"].resume(message, 100)
+    assert peers.look(99) == []
+    assert peers["b"].is_there
+    assert [finding.alarm for finding in peers.look(100)] == [Alarm.PEER_LOST]
+    assert peers.lost == ["b"]
+    assert peers.look(101) == []
+
+
+def test_a_launch_that_came_while_the_adapter_was_away_is_a_restart() -> None:
+    peer = PeerRack("b")
+    peer.comes(OLD, 5)
+    after = restarted(peer, 100)
+    after.comes(NEW, 50)
+    assert (after.launch, after.launches, after.losses) == (NEW, 2, 1)
+
+
+def test_alarms_name_the_rack_by_its_number_and_strangers_are_no_peers() -> None:
+    peers = Peers(["a", "b"])
+    changes = [("b", OLD, True), ("stranger", 5, True), ("b", OLD, False)]
+    peers.watch(partial(taken, changes), is_lockstep=False)
+    assert [(finding.alarm, finding.subject) for finding in peers.look(7)] == [(Alarm.PEER_LOST, 1)]
+    assert peers.arrivals == 2
+    assert [peer.rack for peer in peers] == ["a", "b"]
+
+
+def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_and_an_adapter_started_anew_adds_nothing() -> None:
+    message = Message(PEER.dtype({}))
+    written = []
+    for launch, restarted_at in ((OLD, 400), (NEW, 160)):
+        rows = []
+        for tick in range(0, 800, 8):
+            if tick in (0, restarted_at):
+                peers, coming = Peers(["b"]), [("b", launch, True)]
+                peers.watch(partial(taken, coming), is_lockstep=True)
+                if tick:
+                    peers["b"].resume(message, tick + 80)
+            coming += [("b", launch, False)] if tick == 600 else []
+            found = peers.look(tick)
+            assert [finding.alarm for finding in found] == [Alarm.PEER_LOST] * (tick == 600)
+            peers["b"].fill(message, is_lockstep=True)
+            rows.append(bytes(message.raw))
+        assert (message.presence, message.since, message.launches, message.losses) == (Presence.LOST, 600, 1, 1)
+        written.append(rows)
+    assert written[0] == written[1]
+
+
+@given(st.lists(st.tuples(st.integers(1, 4), st.booleans()), max_size=40))
+def test_a_rack_is_there_exactly_if_a_launch_that_is_not_over_is(
+    steps: list[tuple[int, bool]],
+) -> None:
+    peer, tokens = PeerRack("b"), set[int]()
+    for tick, (launch, has_come) in enumerate(steps):
+        was_over = [old for old in range(1, 5) if peer.is_over(old)]
+        (peer.comes if has_come else peer.goes)(launch, tick)
+        (tokens.add if has_come else tokens.discard)(launch)
+        living = {token for token in tokens if not peer.is_over(token)}
+        assert peer.is_there == bool(living)
+        assert not peer.is_there or peer.launch in living
+        # What is over stays over.
+        assert all(peer.is_over(old) for old in was_over)
+        assert peer.launches <= 4
+        assert len(peer.tokens) <= REMEMBERED
+    back = sum(alarm in (Alarm.PEER_BACK, Alarm.PEER_RESTARTED) for alarm in alarms(peer))
+    assert alarms(peer).count(Alarm.PEER_LOST) == peer.losses
+    assert peer.losses - back == (peer.presence is Presence.LOST)
+
+
+def test_a_flood_of_tokens_is_bounded() -> None:
+    peer = PeerRack("b")
+    for launch in range(1, 10 * REMEMBERED):
+        peer.comes(launch, launch)
+    assert len(peer.tokens) == REMEMBERED
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_message_of_the_peer_shows_its_launch_in_real_time_only(is_there: bool) -> None:
+    peer, message = PeerRack("b"), Message(PEER.dtype({}))
+    if is_there:
+        peer.comes(OLD, 5)
+    peer.fill(message, is_lockstep=False)
+    assert message.launch == (OLD if is_there else 0)
+    peer.fill(message, is_lockstep=True)
+    assert message.launch == 0

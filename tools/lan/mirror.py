@@ -1,0 +1,222 @@
+"""A mirror of a rack's segment in this process: a window of another machine's memory, mapped into one's own.
+
+What reads a segment reads a mirror too, unchanged. `refresh` fetches what has changed: the words of the clock, control
+blocks and heads first, then the records that the heads count. The newest record of a mailbox is fetched again each
+time: if a forged message was there, its writer has put its own in that place.
+
+Nothing in it is a fact about this machine: process ids are those of the other one, and so is CLOCK_MONOTONIC.
+"""
+
+from __future__ import annotations
+
+import mmap
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from rack.backplane.address_map import (
+    ALARM_DEPTH,
+    ALARM_RECORD_SIZE,
+    BLOCK_SIZE,
+    FAULT_ENTRIES,
+    FAULT_ENTRY_SIZE,
+    LINE,
+    MAILBOX_HEAD_SIZE,
+    OPERATOR_ENTRIES,
+    TRACE_RECORD_SIZE,
+    oldest_kept,
+    operator_entry_size,
+    slot_stride,
+)
+from rack.backplane.errors import SegmentError
+from rack.backplane.layout import Layout
+from rack.backplane.operator_table import OperatorTable, RequestStage
+from rack.backplane.segment import MAGIC, VERSION, Segment
+from rack.backplane.words import Block, Box, Head, System
+from rack.boards.lan.questions import MOST_CONTENT, DeskAnswer, Stretch
+
+WORDS = Stretch(0, 8 * 96)
+"""The words of head, clock and utility lines."""
+MOST_SIZE = 1 << 30
+"""Bytes of the largest segment that is mirrored."""
+NEWEST = 2
+"""Messages of a mailbox that are kept up to date: the newest, and the one before in case that is damaged."""
+
+Fetch = Callable[[Sequence[Stretch]], tuple[list[bytes], DeskAnswer]]
+"""Returns the content of stretches of the other segment, each of at most `MOST_CONTENT` bytes, and the last answer."""
+
+
+@dataclass
+class MirroredRing:
+    """A ring of records: the bus addresses of its head word and its records; `taken` records were fetched so far.
+
+    `most` of the newest are fetched; `oldest` is the number of the oldest that is here with all after it.
+    """
+
+    head: int
+    first: int
+    stride: int
+    depth: int
+    most: int
+    is_mailbox: bool
+    taken: int = 0
+    oldest: int = 0
+
+    def wanted(self, count: int) -> Iterator[Stretch]:
+        """Yield the stretches of the records to fetch when `count` have been written."""
+        first = max(self.taken + 1, count - self.most + 1, count + 2 - self.depth, 1)
+        if first > self.taken + 1:
+            self.oldest = first
+        at_once = max(1, MOST_CONTENT // self.stride)
+        while first <= count:
+            place = first % self.depth
+            records = min(count + 1 - first, self.depth - place, at_once)
+            yield Stretch(self.first + place * self.stride, records * self.stride)
+            first += records
+
+    def is_hurried(self, count: int) -> bool:
+        """Say whether its writer may have overwritten a record while it was fetched."""
+        return count - self.taken > self.depth // 2 < self.most
+
+    def took(self, count: int) -> None:
+        """Note that `count` records have been fetched, or were skipped."""
+        self.taken = max(0, count - 1) if self.is_mailbox else count
+
+
+class Mirror(Segment):
+    """A mirror; `is_there` says whether the rack answered last time. Its `rack` is the name by which users know it."""
+
+    def __init__(self, rack: str, fetch: Fetch) -> None:
+        """Fetch layout and config. Raises `SegmentError` when the other program has another version."""
+        self._fetch = fetch
+        (head,), answer = fetch([WORDS])
+        words = memoryview(head).cast("q")
+        is_known = words[Head.MAGIC] == MAGIC and words[Head.VERSION] == VERSION
+        if not is_known or not len(head) < words[Head.SIZE] <= MOST_SIZE:
+            raise SegmentError(f"rack '{rack}': another version; this program mirrors layouts of version {VERSION}")
+        super().__init__(rack, mmap.mmap(-1, words[Head.SIZE]))
+        self.is_there = True
+        self._note(answer)
+        texts = [_cut(words[at], words[at + 1], len(self.bytes)) for at in (Head.LAYOUT_AT, Head.CONFIG_AT)]
+        self._fill([WORDS, *texts[0], *texts[1]])
+        self.read_head()
+        self._rings = {ring.head: ring for ring in _rings(self)}
+        self._watched = [WORDS, *_merged([*_heads(self), *(Stretch(head, 8) for head in self._rings)])]
+        self._requests = OperatorTable(self).entries
+
+    def follow(self, mailbox: str) -> None:
+        """Fetch every message of a mailbox from now on, as far as its slots reach back."""
+        ring = self._rings[self.map.mailboxes[mailbox] + 8 * Box.HEAD]
+        ring.most = ring.depth
+
+    def follow_all(self) -> None:
+        """Fetch every message of every mailbox from now on, as a recorder needs them."""
+        for name in self.map.mailboxes:
+            self.follow(name)
+
+    def refresh(self) -> None:
+        """Fetch what has changed since the last call."""
+        news, answer = self._fetch(self._watched)
+        self._note(answer)
+        heads = _words_of(self._watched, news)
+        fresh = [*self._tables(heads)]
+        hurried = [ring for at, ring in self._rings.items() if ring.is_hurried(heads[at])]
+        for at, ring in self._rings.items():
+            fresh += ring.wanted(heads[at])
+            ring.took(heads[at])
+        self._fill(fresh)
+        if hurried:
+            later = _words_of(self._watched, self._fetch(self._watched)[0])
+            for ring in hurried:
+                ring.oldest = max(ring.oldest, oldest_kept(later[ring.head], ring.depth))
+        # Last: a head never counts more than is here.
+        self._store(self._watched, news)
+
+    def _tables(self, heads: dict[int, int]) -> Iterator[Stretch]:
+        """Yield the entries of the fault and the operator table to fetch."""
+        injected = min(heads[8 * System.INJECTED], FAULT_ENTRIES)
+        yield from _cut(self.map.faults, injected * FAULT_ENTRY_SIZE, len(self.bytes))
+        requested = heads[8 * System.REQUESTED]
+        # An entry is changed until it is issued; issued at once, it never waited here.
+        is_open = any(entry.stage == RequestStage.WAITING for entry in self._requests)
+        if is_open or requested != self.words[System.REQUESTED]:
+            used = min(requested, OPERATOR_ENTRIES) * operator_entry_size(self.layout)
+            yield from _cut(self.map.operator, used, len(self.bytes))
+
+    def _fill(self, stretches: Sequence[Stretch]) -> None:
+        if stretches:
+            self._store(stretches, self._fetch(stretches)[0])
+
+    def _store(self, stretches: Sequence[Stretch], contents: Iterable[bytes]) -> None:
+        for (address, size), content in zip(stretches, contents, strict=True):
+            self.bytes[address : address + size] = content
+
+    def _note(self, answer: DeskAnswer) -> None:
+        self._hosts = answer.hosts
+        self.realtime_offset_ns = answer.realtime_ns - answer.monotonic_ns
+        """CLOCK_REALTIME of its machine less CLOCK_MONOTONIC there."""
+        self.monotonic_offset_ns = answer.monotonic_ns - time.monotonic_ns()
+        """CLOCK_MONOTONIC of its machine less that of this one, to within the way of an answer."""
+
+    @property
+    def launcher_is_alive(self) -> bool:
+        """Whether the rack still answers: its adapter ends with its launcher."""
+        return self.is_there
+
+    def is_locked(self, address: int) -> bool:
+        """Say whether a host board lives; no other lock is mirrored."""
+        hosts = [self.map.blocks[host.name] + 8 * Block.PID for host in self.layout.hosts]
+        return bool(self._hosts >> hosts.index(address) & 1)
+
+    def oldest(self, ring: int) -> int:
+        """Return the number of the oldest record here of the ring whose head word is at a bus address."""
+        return self._rings[ring].oldest
+
+    @property
+    def has_its_name(self) -> bool:
+        """Whether it is still the same launch."""
+        return self.is_there
+
+
+def _cut(address: int, size: int, end: int) -> list[Stretch]:
+    """Return a stretch in pieces that fit an answer. Raises `SegmentError` when it is not in the segment."""
+    if not 0 <= address <= address + size <= end:
+        raise SegmentError(f"{size} bytes at {address}: outside the segment, which has {end} bytes")
+    return [Stretch(at, min(MOST_CONTENT, address + size - at)) for at in range(address, address + size, MOST_CONTENT)]
+
+
+def _heads(segment: Segment) -> Iterator[Stretch]:
+    """Yield the control blocks and the words of mailboxes."""
+    yield from (Stretch(address, BLOCK_SIZE) for address in segment.map.blocks.values())
+    yield from (Stretch(address, 8 * len(Box)) for address in segment.map.mailboxes.values())
+
+
+def _rings(segment: Segment) -> Iterator[MirroredRing]:
+    layout: Layout = segment.layout
+    for task in layout.processes:
+        head, first = segment.map.blocks[task.name] + 8 * Block.TRACE_HEAD, segment.map.traces[task.name]
+        yield MirroredRing(head, first, TRACE_RECORD_SIZE, task.depth, task.depth, is_mailbox=False)
+    for address in segment.map.alarms.values():
+        yield MirroredRing(address, address + LINE, ALARM_RECORD_SIZE, ALARM_DEPTH, ALARM_DEPTH, is_mailbox=False)
+    for box in layout.mailboxes:
+        address = segment.map.mailboxes[box.name]
+        most = box.depth if box.name.endswith(".operator") else NEWEST
+        first = address + MAILBOX_HEAD_SIZE
+        yield MirroredRing(address + 8 * Box.HEAD, first, slot_stride(box), box.depth, most, is_mailbox=True)
+
+
+def _merged(stretches: Iterable[Stretch]) -> list[Stretch]:
+    """Return stretches in the order of their addresses, those that lie in another one left out."""
+    found: list[Stretch] = []
+    for stretch in sorted(stretches, key=lambda s: (s.address, -s.size)):
+        if not found or stretch.address >= sum(found[-1]):
+            found.append(stretch)
+    return found
+
+
+def _words_of(stretches: Sequence[Stretch], contents: Iterable[bytes]) -> dict[int, int]:
+    """Return the words in stretches by their bus addresses."""
+    found: dict[int, int] = {}
+    for (address, _), content in zip(stretches, contents, strict=True):
+        found |= {address + 8 * at: word for at, word in enumerate(memoryview(content).cast("q"))}
+    return found
