@@ -75,7 +75,7 @@ class RequestEntry:
         return RequestStage(self.words[RequestWord.STAGE])
 
 
-class Claim(NamedTuple):
+class RequestClaim(NamedTuple):
     """A request that its client has added. While it waits, its `lock` shows that the client lives."""
 
     entry: RequestEntry
@@ -116,13 +116,13 @@ class OperatorTable:
             self.withdraw(claim.entry, claim.ticket)
             claim.leave()
 
-    def _await_turn(self, request: Request, has_client: bool) -> Claim:
+    def _await_turn(self, request: Request, has_client: bool) -> RequestClaim:
         # Bounded by the time in which another process fills an entry.
         while (claim := self.try_claim(request, has_client)) is None:
             continue
         return claim
 
-    def try_claim(self, request: Request, has_client: bool = True) -> Claim | None:
+    def try_claim(self, request: Request, has_client: bool = True) -> RequestClaim | None:
         """Add a request without waiting; None while another process fills an entry, and might be preempted meanwhile.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
@@ -133,7 +133,7 @@ class OperatorTable:
         finally:
             lock.close()
 
-    def _add(self, request: Request, has_client: bool) -> Claim:
+    def _add(self, request: Request, has_client: bool) -> RequestClaim:
         settled = [entry for entry in self.entries if not self.is_waiting(entry)]
         if not settled:
             why = f"{len(self.entries)} commands wait for their ticks"
@@ -144,7 +144,7 @@ class OperatorTable:
         if has_client:
             lock.take()
         self._fill(entry, request, ticket, has_client)
-        return Claim(entry, ticket, lock)
+        return RequestClaim(entry, ticket, lock)
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
         """Withdraw a request that still waits; False when it was issued."""

@@ -50,6 +50,8 @@ class Segment:
     A mirror of one on another machine has no file, thus no `fd`: it learns who is alive there by other ways.
     """
 
+    is_mirror = False
+
     def __init__(self, rack: str, memory: mmap.mmap, fd: int = -1) -> None:
         self.rack = rack
         self.fd = fd

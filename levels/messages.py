@@ -46,6 +46,7 @@ class Error(IntEnum):
     STALLED = 14  # nothing has moved for the time that the task permits
     MOTORS = 15  # a motor did not give its torque, however often it was retried
     TABLE = 16  # a state table came to a row with status error
+    GIVEN_UP = 17  # the program of several racks was given up, for a reason in another one
 
 
 class Verb(IntEnum):

@@ -5,9 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rack.tools.console.answer import Failure, print_answer, print_json
+
+if TYPE_CHECKING:
+    from rack.tools.console.address import Asker
 
 
 def list_racks(as_json: bool) -> None:
@@ -44,18 +47,14 @@ def describe(name: str) -> dict[str, str | int | float]:
     return {"rack": name, "state": state, "detail": detail, "launcher": launcher, "age_s": round(age_s, 3)}
 
 
-def show_status(rack: str | None, as_json: bool) -> None:
+def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly one."""
-    from rack.backplane.segment import Segment, racks
+    from rack.tools.runs.watched import watched
 
-    running = racks()
-    if rack is None and len(running) != 1:
-        names = ", ".join(running)
-        raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
-    segment = Segment.attach(rack or running[0])
-    from rack.tools.runs.snapshot import RackMonitor
+    with watched(rack or _only_rack(), asker) as one:
+        from rack.tools.runs.snapshot import RackMonitor
 
-    found = RackMonitor(segment).look()
+        found = RackMonitor(one.segment).look()
     if as_json:
         print_json(asdict(found))
         return
@@ -63,6 +62,16 @@ def show_status(rack: str | None, as_json: bool) -> None:
     from rack.tools.runs.display import RackView
 
     console().print(RackView(found))
+
+
+def _only_rack() -> str:
+    from rack.backplane.segment import racks
+
+    running = racks()
+    if len(running) != 1:
+        names = ", ".join(running)
+        raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
+    return running[0]
 
 
 def show_report(run: str | Path, as_json: bool) -> None:

@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
+from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
+from rack.tools.console.parameters import AnyRackName, AskAs, Certificates, Json, Timeout, check_timeout
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 DONE_AT_ONCE = ("resume", "modify", "table")
@@ -34,7 +35,7 @@ List = Annotated[bool, typer.Option("--list", help="list the levels, the command
 
 
 def command(
-    rack: RackName,
+    rack: AnyRackName,
     level: Level = None,
     what: What = None,
     goal: Goals = None,
@@ -43,6 +44,8 @@ def command(
     wait: Wait = False,
     timeout: Timeout = None,
     is_list: List = False,
+    certificates: Certificates = "",
+    name: AskAs = OPERATOR,
     as_json: Json = False,
 ) -> None:
     """Command one level of a running rack, overriding the level above it.
@@ -75,20 +78,22 @@ def command(
       rack command brown joints modify friction on --at 2.5
       rack command nist-state-table task table careful
       rack command nist-state-table elemental_move do pick block1 --wait
+      rack command 192.168.1.5/cell task hold --certificates ~/cell
     """
     from rack.tools.console.tables import terminal_width
     from rack.tools.runs.desk import LiveDesk
     from rack.tools.runs.holds import resume_command
+    from rack.tools.runs.watched import watched
 
-    desk = LiveDesk(rack)
-    if is_list:
-        print_answer(desk.levels(), desk.text(terminal_width()), as_json)
-        return
-    if level is None or what is None:
-        raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
     check_timeout(timeout, wait)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
-    with INTERRUPT.raising():
+    with INTERRUPT.raising(), watched(rack, Asker.of(name, certificates)) as one:
+        desk = LiveDesk(one)
+        if is_list:
+            print_answer(desk.levels(), desk.text(terminal_width()), as_json)
+            return
+        if level is None or what is None:
+            raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
         given = {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}
         reply = desk.give(given, wait, timeout)
     print_answer(reply.document(), reply.line, as_json)

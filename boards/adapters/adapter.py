@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 from rack.backplane.segment import Segment
 from rack.boards.adapters.entries import Rows
@@ -13,6 +14,9 @@ STATUS = "status"
 
 class Adapter(Executor):
     """A board that passes messages between the backplane and what is not on it."""
+
+    wired_by: ClassVar[str]
+    """Key of its board under which its ports are listed."""
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
         """Take the segment, before the self-test; in a replay with what was recorded in place of what is out."""

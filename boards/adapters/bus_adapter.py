@@ -44,6 +44,7 @@ class BusAdapter(Adapter):
     """Passes mailboxes between the two sides. Its status is done when the programs of all its host boards are."""
 
     params = AdapterParams
+    wired_by = "params.pass"
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -19,10 +19,11 @@ from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
 from rack.boards.config.exchange import asynchronous_queues, exchanges, strict_mistakes
+from rack.boards.config.lan import entry_mistakes, is_taken
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports, table_of
 from rack.boards.config.queues import queue_mistakes, queue_slots
-from rack.boards.config.schema import UNREAD, RackConfig, TaskPlace
+from rack.boards.config.schema import LAN, UNREAD, RackConfig, TaskPlace
 from rack.boards.config.sides import Sides, key_of
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
@@ -74,6 +75,7 @@ class Wiring:
         # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
         self._unknown = {place.board for place in places if place.name not in found}
         self._unknown |= {place.removeprefix("board.").removeprefix("host.") for place in broken}
+        self._unknown |= {LAN} if "adapter" in broken or is_taken(config) else set()
         self.writers: dict[str, tuple[TaskPorts, Output]] = {}
         for ports in self._ports:
             self._add_writer(ports)
@@ -82,6 +84,7 @@ class Wiring:
         for ports in self._ports:
             self._check_reads(ports)
         self._check_rest()
+        self.mistakes += entry_mistakes(self, has_clock="clock" not in broken)
         crossing = list(self.sides.mistakes(self._unknown))
         self.mistakes += crossing or queue_mistakes(self)
         self.mistakes += asynchronous_queues(self)

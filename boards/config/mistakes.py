@@ -20,6 +20,7 @@ from pydantic_core import ErrorDetails
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import ClockError
 from rack.boards.config.files import file_at
+from rack.boards.config.lan import lan_mistakes
 from rack.boards.config.network import network_mistakes
 from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, HostConfig, RackConfig
 from rack.boards.errors import Mistake
@@ -121,6 +122,7 @@ def disagreements(config: RackConfig, broken: frozenset[str] = frozenset()) -> l
         *_circles(config),
         *_slots(config),
         *_ends(config),
+        *lan_mistakes(config),
         *network_mistakes(config),
         *(_scene(config) if "scene" not in broken else ()),
         *(_robot(config) if "robot" not in broken else ()),

@@ -20,15 +20,17 @@ def network_mistakes(config: RackConfig) -> Iterator[Mistake]:
     if table is None:
         return
     for key, endpoint in table.endpoints:
-        if why := _why_not(endpoint, table):
-            yield Mistake(f"{PLACE}.{key}", f"{endpoint.protocol}/{endpoint.host}:{endpoint.port}", why)
+        if why := _why_not(endpoint, table, connects=key.startswith("connect")):
+            yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
     if table.has_tls and table.certificates is None:
         yield Mistake(f"{PLACE}.certificates", None, "missing; TLS needs them: see rack lan certificates --help")
     if table.has_tls and table.exports and not table.racks:
         yield Mistake(f"{PLACE}.peers", None, "missing; with TLS only racks that it names may import from this one")
 
 
-def _why_not(endpoint: Endpoint, table: LanTable) -> str:
+def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
+    if endpoint.has_tls and connects and ":" in endpoint.host:
+        return "zenoh checks no certificate for an address of IPv6; permitted: a host name, or an address of IPv4"
     if not endpoint.has_tls and table.has_tls:
         return "without TLS, which others have: who comes here is not known; permitted: all with TLS, or none"
     if not endpoint.has_tls and not endpoint.is_loopback and not table.insecure:
@@ -47,4 +49,5 @@ def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
     heard = [Endpoint.of(text) for text in table.listen]
     addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
-        yield Mistake(f"{PLACE}.certificates", str(flaw.path), flaw.why)
+        # The file first: a long path is cut short.
+        yield Mistake(f"{PLACE}.certificates", None, f"{flaw.path.name}: {flaw.why}; in {table.certificates}")

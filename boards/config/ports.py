@@ -56,9 +56,16 @@ def all_ports(config: RackConfig, mistakes: list[Mistake]) -> list[TaskPorts]:
     """Return the ports of every task and host board whose class is found; add all mistakes to `mistakes`."""
     wired = [_wired(config, place, mistakes) for place in (*config.tasks(), *config.hosts())]
     found = [ports for ports in wired if ports is not None]
-    types = {box: ports.outputs[port].type for ports in found for port, box in ports.writes.items()}
-    whole = [_with_made_ports(config, ports, types) for ports in found]
+    whole, types, before = found, _types(found), -1
+    # What one board makes another may pass on.
+    while len(types) != before:
+        before, whole = len(types), [_with_made_ports(config, ports, types) for ports in found]
+        types = _types(whole)
     return [_with_exchange(config, ports, mistakes) for ports in whole]
+
+
+def _types(found: list[TaskPorts]) -> dict[str, MessageType]:
+    return {box: ports.outputs[port].type for ports in found for port, box in ports.writes.items()}
 
 
 def _with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]) -> TaskPorts:

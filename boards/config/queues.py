@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rack.backplane.layout import depth_for
 from rack.backplane.mailbox.queue import taken_name
+from rack.boards.config.schema import LAN
 from rack.boards.errors import Mistake
 
 if TYPE_CHECKING:
@@ -41,7 +42,11 @@ def _wired(wiring: Wiring, mailbox: str) -> Iterator[Mistake]:
         why = f"the reader of the queue '{mailbox}' writes its position under this name; rename the port"
         yield Mistake(f"mailbox {taken_name(mailbox)}", None, why)
     readers = [f"{task.task} ({port})" for task in wiring.tasks for port, box in task.sources if box == mailbox]
-    if len(readers) > 1:
+    exports = [port for task in wiring.tasks if task.task == LAN for port, box in task.sources if box == mailbox]
+    if wiring.config.adapter.lan is not None and exports:
+        why = "a queue gives each message once, to its one reader here; permitted: mailboxes that hold one message"
+        yield Mistake(f"adapter.lan.export.{exports[0]}.from", mailbox, why)
+    elif len(readers) > 1:
         why = f"a queue gives each message once, so it has one reader, not {len(readers)}: {', '.join(readers)}"
         yield Mistake(f"mailbox {mailbox}", None, why)
     elif not readers and not wiring.has_unknown:

@@ -24,6 +24,7 @@ from rack.boards.config.commands import command_mistakes, requests
 from rack.boards.config.exchange import exchanges
 from rack.boards.config.faults import fault_mistakes, injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
+from rack.boards.config.lan import at_adapter
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
 from rack.boards.config.network import credential_mistakes
@@ -202,6 +203,7 @@ class _Examined:
         boards = frozenset(place.removeprefix("board.") for place in broken if place.startswith("board."))
         self.mistakes += fault_mistakes(faults, config, None if self.mistakes else self._layout, boards)
         self.mistakes += command_mistakes(commands, config, boards)
+        self.mistakes = [at_adapter(mistake, config) for mistake in self.mistakes]
 
     def _misfits(self) -> Iterator[Mistake]:
         """Yield what levels find wrong with their neighbours."""

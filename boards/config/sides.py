@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
 
+from rack.boards.adapters.adapter import Adapter
 from rack.boards.adapters.bus_adapter import BusAdapter
 from rack.boards.config.ports import TaskPorts, table_of
 from rack.boards.errors import Mistake
@@ -53,6 +54,6 @@ class Sides:
 
 def key_of(task: TaskPorts) -> str:
     """Return the key of a board under which its ports are wired."""
-    if issubclass(task.kind, BusAdapter):
-        return "params.pass"
+    if issubclass(task.kind, Adapter):
+        return task.kind.wired_by
     return "planner_reads" if task.place.role == "planner" else "reads"

@@ -23,7 +23,7 @@ from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import Rows
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
-from rack.boards.lan.desk import Desk
+from rack.boards.lan.desk import Desk, Permit
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, LanLink
@@ -43,6 +43,7 @@ class LanAdapter(Adapter):
     """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each rack."""
 
     params = LanParams
+    wired_by = "params.export"
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -94,15 +95,17 @@ class LanAdapter(Adapter):
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack])
             for port, entry in table.imports.items()
         }
+        permit = Permit(table.permit, self.names(self.context.params))
+        self._desk = Desk(segment, self._grid, permit, self.findings)
         status = open_observer(segment, f"{board}.{STATUS}")
         if (before := status.peek()).is_there:
             for port, export in self._exports.items():
                 export.resume(getattr(before.value, f"export_{port}"))
             for port, entry in self._imports.items():
                 entry.resume(getattr(before.value, f"import_{port}"), status.newest)
+            self._desk.resume(before.value.desk)
         if self._grid.is_lockstep and table.racks:
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
-        self._desk = Desk(segment, table.permit, self.names(self.context.params), self.findings)
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
@@ -172,6 +175,7 @@ class LanAdapter(Adapter):
             export.fill(getattr(status, f"export_{port}"))
         for port, entry in self._imports.items():
             entry.fill(getattr(status, f"import_{port}"), tick)
+        self._desk.fill(status.desk)
         for peer in self._peers:
             out = getattr(write, peer_port(peer.rack))
             self._clocks.fill(out, peer.rack, tick)

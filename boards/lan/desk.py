@@ -23,7 +23,7 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.host_ring import ProperContent
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
-from rack.backplane.operator_table import Claim, OperatorTable, Request, RequestStage, RequestWord
+from rack.backplane.operator_table import OperatorTable, Request, RequestClaim, RequestStage, RequestWord
 from rack.backplane.segment import VERSION, Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block
@@ -33,6 +33,7 @@ from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import ASKED
 from rack.boards.lan.link import LanLink, Question
 from rack.boards.lan.questions import (
+    MOST_CONTENT,
     MOST_QUESTION,
     NEEDED,
     Code,
@@ -48,7 +49,7 @@ QUESTIONS_A_CYCLE = 16
 """Questions of each right that a cycle looks at."""
 ANSWERS_A_CYCLE = 4
 """Answers of each right that a cycle sends."""
-BYTES_A_CYCLE = 1 << 17
+BYTES_A_CYCLE = MOST_CONTENT
 """Bytes of content after which a cycle answers no further question to read."""
 CLIENT_S = 2.0
 """Real time without a question of a client after which it counts as gone."""
@@ -66,6 +67,13 @@ class DeskCount:
     dropped: int = 0
 
 
+class Permit(NamedTuple):
+    """Who may ask what, and the names of which findings give the number."""
+
+    rights: Mapping[str, Sequence[Right]]
+    names: Sequence[str]
+
+
 class Asked(NamedTuple):
     """A good question: who asks, with which right, what, and its envelope."""
 
@@ -80,7 +88,7 @@ class Waiting:
     """A request in the operator table, of a client's session, and until when that counts as there, CLOCK_MONOTONIC."""
 
     session: tuple[str, int]
-    claim: Claim
+    claim: RequestClaim
     until_ns: int
 
     @property
@@ -91,16 +99,12 @@ class Waiting:
 
 
 class Desk:
-    """Answers the questions to one rack.
+    """Answers the questions to one rack. An emergency stop from another machine is one of its `findings`."""
 
-    `names` are those by whose numbers `findings` name askers; an emergency stop from afar is one.
-    """
-
-    def __init__(
-        self, segment: Segment, permit: Mapping[str, Sequence[Right]], names: Sequence[str], findings: list[Finding]
-    ) -> None:
-        self._segment, self._permit, self._names, self._findings = segment, permit, names, findings
-        self._lines, self._table, self._grid = UtilityLines(segment), OperatorTable(segment), OwnGrid(segment, 1)
+    def __init__(self, segment: Segment, grid: OwnGrid, permit: Permit, findings: list[Finding]) -> None:
+        self._segment, self._grid, self._findings = segment, grid, findings
+        self._permit, self._names = permit
+        self._lines, self._table = UtilityLines(segment), OperatorTable(segment)
         boxes = enumerate(segment.layout.mailboxes)
         self._boxes = {at: box for at, box in boxes if box.writer == CLOCK and box.name.endswith(".operator")}
         self._hosts = [segment.map.blocks[host.name] + 8 * Block.PID for host in segment.layout.hosts]
@@ -134,6 +138,15 @@ class Desk:
         if self._waiting:
             self._dismiss()
 
+    def resume(self, record: Sequence[int]) -> None:
+        """Count on from the group of its predecessor's last status."""
+        self.count = DeskCount(*map(int, record))
+
+    def fill(self, record: object) -> None:
+        """Write its counts into the group of a status; in lockstep none, since they do not depend on ticks alone."""
+        if not self._grid.is_lockstep:
+            record[...] = (self.count.answered, self.count.refused, self.count.dropped)  # type: ignore[index]
+
     def _checked(self, question: Question, right: Right) -> Asked | None:
         """Return a question with its parts; None if it is malformed, unsigned or oversized."""
         if len(question.payload) > MOST_QUESTION:
@@ -155,6 +168,8 @@ class Desk:
         match asked.what:
             case "stop":
                 return self._stop(asked.asker)
+            case "reset":
+                return Code.AT_THE_RACK, b""
             case "give":
                 return self._give(asked, tick)
             case "withdraw":
@@ -168,7 +183,7 @@ class Desk:
         self.count.refused += not is_granted
         self._sent += len(content)
         hosts = sum(self._segment.is_locked(address) << at for at, address in enumerate(self._hosts[:64]))
-        payload = DeskAnswer(code, time.monotonic_ns(), time.time_ns(), hosts, content).packed()
+        payload = DeskAnswer(code, tick, time.monotonic_ns(), time.time_ns(), hosts, content).packed()
         head = asked.head
         grid = self._grid
         stamped = Envelope(

@@ -35,6 +35,10 @@ class Endpoint(NamedTuple):
                 raise ValueError(f"'{host}' is no address; {PERMITTED}") from None
         return cls(found[1], host, int(found[3]))
 
+    def __str__(self) -> str:
+        """Return it as a text."""
+        return f"{self.protocol}/{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
+
     @property
     def has_tls(self) -> bool:
         """Whether both sides show certificates."""

@@ -135,14 +135,15 @@ class Import:
     def exchange(self, out: Message, tick: int) -> None:
         """Take what has come, and pass the newest good message on."""
         early, self._early = self._early, []
-        newest, basis = False, tick
+        newest: Envelope | None = None
         for came, arrived in chain(early, zip(repeat(tick), self._arrived(), strict=False)):
             head = self._opened(arrived)
             if head is not None and self._is_due(head, arrived, came, tick) and self._is_next(head, arrived.payload):
-                self.count.overtaken += newest
-                newest, basis = True, min(came, self._grid.tick_of(head, self._peer, tick))
-        if not newest:
+                self.count.overtaken += newest is not None
+                newest = head
+        if newest is None:
             return
+        basis = self._grid.tick_of(newest, self._peer, tick)
         if tick - basis > self._max_age:
             self.count.late += 1
             return

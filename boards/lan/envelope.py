@@ -49,10 +49,11 @@ def kind_of(name: str, version: int, dtype: np.dtype) -> int:
 
 
 class Sealer:
-    """Seals and opens envelopes with one secret."""
+    """Seals and opens envelopes with one secret. `flaws`: how often it has found each flaw."""
 
     def __init__(self, secret: bytes = b"", most_bytes: int = 1 << 20) -> None:
         self._secret, self._most = secret, most_bytes
+        self.flaws = dict.fromkeys(Flaw, 0)
 
     def taking(self, most_bytes: int) -> Sealer:
         """Return one with the same secret and another limit."""
@@ -64,20 +65,24 @@ class Sealer:
         return packed + self._seal(key, packed, payload)
 
     def opened(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
-        """Return the head of what has come under a key expression, or what is wrong with it."""
+        """Return the head of what has come under a key expression, or what is wrong with it, which is counted."""
         if len(payload) > self._most:
-            return Flaw.OVERSIZED
+            return self._flawed(Flaw.OVERSIZED)
         if envelope is None or len(envelope) != HEAD_BYTES or envelope[:4] != _MAGIC:
-            return Flaw.MALFORMED
+            return self._flawed(Flaw.MALFORMED)
         packed = envelope[: _HEAD.size]
         if not compare_digest(envelope[_HEAD.size :], self._seal(key, packed, payload)):
-            return Flaw.UNSIGNED
+            return self._flawed(Flaw.UNSIGNED)
         _, flags, *rest = _HEAD.unpack(packed)
         return Envelope._make((*rest, flags))
 
+    def _flawed(self, flaw: Flaw) -> Flaw:
+        self.flaws[flaw] += 1
+        return flaw
+
     def _seal(self, key: str, packed: bytes, payload: bytes | memoryview) -> bytes:
         found = blake2b(packed, digest_size=SEAL_BYTES, key=self._secret)
-        found.update(key.encode())
-        found.update(b"\0")
+        # With its length: what ends the key and what begins the payload cannot change places.
+        found.update(f"{len(key)}:{key}".encode())
         found.update(payload)
         return found.digest()

@@ -16,7 +16,7 @@ class OwnGrid:
     `every`: ticks of the adapter's cycle.
     """
 
-    def __init__(self, segment: Segment, every: int) -> None:
+    def __init__(self, segment: Segment, every: int = 1) -> None:
         self._clock, self._clock_ns = SystemClock(segment), segment.layout.clock_ns
         self._cycle_ns = every * self._clock_ns
         self.is_lockstep = self._clock.is_lockstep

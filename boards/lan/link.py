@@ -25,12 +25,13 @@ RETRY_MS = (50, 200)
 """Shortest and longest time between two attempts to connect."""
 KEEP_ALIVES = 4
 """Signs of life within a lease."""
-HANDSHAKE_MS = 2000
+HANDSHAKE_MS = 3000
 """Longest time to open a connection."""
 MOST_ANSWER = 65_536 + 1024
 """Length of the longest answer to a question: 64 KiB, and what says what they are."""
 ZENOH_BYTES = 1024
 """What zenoh adds to the content of a message, at most: key expression, lengths, options."""
+NO_WAIT = {"messages": ["query"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
 
 
 class Arrived(NamedTuple):
@@ -174,7 +175,8 @@ def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks:
     # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it leaves there.
     for key in ("scouting/multicast", "scouting/gossip", "transport/shared_memory", "adminspace"):
         put(f"{key}/enabled", False)
-    put("listen/endpoints", list(table.listen))
+    timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
+    put("listen/endpoints", [f"{endpoint}{timed}" for endpoint in table.listen])
     put("connect/endpoints", list(table.connect))
     put("connect/timeout_ms", -1)
     put("connect/exit_on_failure", False)
@@ -193,7 +195,9 @@ def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks:
     put("transport/link/tx/lease", round(table.lease_ms))
     put("transport/link/tx/keep_alive", KEEP_ALIVES)
     put("transport/link/tx/queue/size/real_time", 16)
-    # An answer to somebody who does not take it holds its cycle no longer than until the peer counts as lost.
+    # An answer takes over the congestion control of its question: whoever asks must not make the adapter wait.
+    put("qos/network", [NO_WAIT])
+    # What does wait for room, in lockstep, waits no longer than until the peer counts as lost.
     put("transport/link/tx/queue/congestion_control/block/wait_before_close", round(table.lease_ms * 1e3))
     return config
 

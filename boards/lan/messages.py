@@ -43,6 +43,15 @@ CLOCKS = MessageType(
         Field("refused", "u4", "1", "pings and answers refused: malformed, unsigned, or to nothing that was asked"),
     ),
 )
+DESK = MessageType(
+    "lan_desk",
+    1,
+    (
+        Field("answered", "u4", "1", "questions from other machines that were answered; in lockstep always 0"),
+        Field("refused", "u4", "1", "questions refused: not permitted, or not to be done; likewise"),
+        Field("dropped", "u4", "1", "questions dropped: malformed, unsigned or oversized; likewise"),
+    ),
+)
 
 
 def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
@@ -53,4 +62,5 @@ def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
         Field("clocks", CLOCKS, "1", "round trips to compare clocks; none in lockstep"),
         *(Field(f"export_{port}", EXPORT, "1", f"export {port}") for port in exports),
         *(Field(f"import_{port}", IMPORT, "1", f"import {port}") for port in imports),
+        Field("desk", DESK, "1", "questions from other machines"),
     )

@@ -70,8 +70,9 @@ class PeerRack:
             return
         if launch not in self.tokens:
             self.tokens.append(launch)
-        if launch == self.launch and self.is_there:
-            self.confirm_by = -1
+        if self.is_there and self.launch in (NONE, launch):
+            # Without a number it was resumed in lockstep, where launches are not on record.
+            self.launch, self.confirm_by = launch, -1
         else:
             self._enters(launch, tick)
 
@@ -104,6 +105,7 @@ class PeerRack:
         if is_new:
             self.launches += 1
             self._seen.append(launch)
+            self.offset_ns = None
         if not is_first:
             alarm = Alarm.PEER_RESTARTED if is_new else Alarm.PEER_BACK
             self.findings.append(Finding(alarm, self.number, tick - self.since))
@@ -141,7 +143,7 @@ class Peers:
         self._is_lockstep = False
         self.arrivals = 0
 
-    def watch(self, changes: Changes, is_lockstep: bool) -> None:
+    def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
         """Take what comes and goes from now on from this function: rack, launch, whether it has come."""
         self._changes, self._is_lockstep = changes, is_lockstep
 

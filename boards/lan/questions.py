@@ -21,9 +21,15 @@ from rack.backplane.operator_table import Request
 from rack.boards.lan.config import Right
 from rack.boards.lan.keys import ASKED
 
-What = Literal["stop", "give", "withdraw", "read"]
-NEEDED: Mapping[What, Right] = {"stop": "stop", "give": "command", "withdraw": "command", "read": "watch"}
-"""The right that each question needs."""
+What = Literal["stop", "reset", "give", "withdraw", "read"]
+NEEDED: Mapping[What, Right] = {
+    "stop": "stop",
+    "reset": "stop",
+    "give": "command",
+    "withdraw": "command",
+    "read": "watch",
+}
+"""The right that each question needs. Nobody may reset an emergency stop from afar."""
 MOST_STRETCHES = 256
 """Stretches of memory in one question."""
 MOST_CONTENT = 65_000
@@ -31,7 +37,7 @@ MOST_CONTENT = 65_000
 MOST_QUESTION = 1 << 13
 """Bytes of the longest question."""
 _STRETCH = Struct("<QI")
-_ANSWER = Struct("<IIqqQ")
+_ANSWER = Struct("<qqqqQ")
 _REQUEST = Struct("<Iq")
 _TICKET = Struct("<IQ")
 
@@ -54,12 +60,17 @@ class Code(IntEnum):
     PAST = 5  # its tick has passed
     BUSY = 6  # another process is giving a command: ask again
     FULL = 7  # too many commands wait
+    AT_THE_RACK = 8  # it is done there alone
 
 
 class DeskAnswer(NamedTuple):
-    """An answer: both clocks of its machine, in ns, which host boards live, as bits in their order, and its content."""
+    """An answer: the tick at which it was made, both clocks of its machine, in ns, and its content.
+
+    `hosts`: which host boards live, as bits in their order.
+    """
 
     code: Code
+    tick: int
     monotonic_ns: int
     realtime_ns: int
     hosts: int = 0
@@ -67,14 +78,14 @@ class DeskAnswer(NamedTuple):
 
     def packed(self) -> bytes:
         """Return it as bytes."""
-        return _ANSWER.pack(self.code, 0, self.monotonic_ns, self.realtime_ns, self.hosts) + self.content
+        return _ANSWER.pack(*self[:5]) + self.content
 
     @classmethod
     def unpacked(cls, packed: bytes) -> DeskAnswer | None:
         """Return an answer from its bytes; None if that is none."""
         try:
-            code, _, monotonic_ns, realtime_ns, hosts = _ANSWER.unpack_from(packed)
-            return cls(Code(code), monotonic_ns, realtime_ns, hosts, packed[_ANSWER.size :])
+            code, tick, monotonic_ns, realtime_ns, hosts = _ANSWER.unpack_from(packed)
+            return cls(Code(code), tick, monotonic_ns, realtime_ns, hosts, packed[_ANSWER.size :])
         except (Unpackable, ValueError):
             return None
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Field, command, status
-from rack.levels.messages import OPERATED
+from rack.backplane.message import Field, MessageType, command, status
+from rack.levels.messages import OPERATED, Error
 from rack.levels.operator import MAX_JOINTS, Goal
 
 OBJECT_BYTES = 32
@@ -47,6 +47,17 @@ class Response(IntEnum):
     CANCELLED = 6  # before it began
     STOPPED = 7  # after it had begun, by CANCEL or another order
     ENDED = 8  # the arm rests, and its task level ends
+
+
+class Phase(IntEnum):
+    """What a coordinator is about."""
+
+    AWAITING = 0  # the arms' reports, before the first step or after a new launch
+    ASKING = 1
+    DOING = 2
+    CANCELLING = 3  # the answers, to ask anew
+    ENDING = 4
+    OVER = 5
 
 
 ACTION_FIELDS = (
@@ -87,3 +98,34 @@ CELL_REPORT = status(
     Field("halted", "u1", "1", "1: moves were withdrawn, the arm is held until it begins another order"),
     OPERATED,
 )
+
+CELL_REQUEST = MessageType(
+    "cell_request",
+    1,
+    (
+        Field("id", "u4", "1", "serial of the plan wanted; 0: none yet"),
+        Field("program", "u4", "1", "as in the order that it serves"),
+        Field("order", "u4", "1", "that order"),
+        Field("begin", "f8", "s", "simulated time at which it must be possible to begin; 0: at once"),
+        Field("ahead", "f8", "s", "simulated time of the rack that gave the order, in which `by` is, less that here"),
+        Field("revision", "u4", "1", "of the world model then"),
+        Field("start", "f8", "rad", "where the arm rested then", ("joints",)),
+        *ACTION_FIELDS,
+    ),
+)
+"""From an ordered task level's executor to its planner."""
+
+CELL_PROGRESS = MessageType(
+    "cell_progress",
+    1,
+    (
+        Field("phase", "u1", Phase, "of the present step"),
+        Field("step", "u2", "1", "steps done"),
+        Field("attempt", "u2", "1", "times that the present step was asked for before"),
+        Field("error", "u2", Error, "why the program ends early; 0: it does not"),
+        Field("reason", "S120", "ASCII", "the error, readable"),
+        Field("ending", "f8", "s", "simulated time since when the arms are ended; 0: not yet"),
+        Field("moves", "u2", "1", "elemental moves of the steps done"),
+    ),
+)
+"""A coordinator's memory, from which it continues after a restart of its board."""

@@ -15,8 +15,8 @@ from rack.levels.planning.motion_planner import MotionPlanner, in_metres
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.tables import SceneConfig
-from rack.levels.task.grasps import DOWN, goals, grasps, standing
-from rack.levels.task.program import Goto, Home, TaskConfig, Transfer
+from rack.levels.task.grasps import goals, grasps, standing
+from rack.levels.task.program import DOWN, Goto, Home, TaskConfig, Transfer
 from rack.levels.task.rehearsal import Rehearsal
 
 Option = TypeVar("Option")

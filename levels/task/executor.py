@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
+from rack.levels.level import Executor, Input, LevelContext, Ports, Program, Reading
 from rack.levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
 from rack.levels.operator import BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Goal, Operation, Orders
 from rack.levels.tables import read_params
-from rack.levels.task.program import TaskConfig, TaskParams, read_program
+from rack.levels.task.program import ROUNDING_S, AnyAction, TaskConfig, TaskParams, read_program
 from rack.levels.task.window import Detour, ShownWindow
-
-ROUNDING_S = 1e-9
-"""Margin of times against deadlines: ticks times the clock's period are not exact."""
 
 
 class TaskExecutor(Executor):
@@ -33,13 +32,14 @@ class TaskExecutor(Executor):
         Operation.RESUME: (),
         Operation.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
     }
-    params = TaskParams
-    program = TaskConfig
+    params: ClassVar[type[TaskParams]] = TaskParams
+    program: ClassVar[type[Program] | None] = TaskConfig
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._actions = read_program(context.task, context.robot, context.scene).action
-        self._stalled_s = read_params(TaskParams, context.params).stalled_s
+        self._actions = self._first_actions()
+        self._ahead_s = 0.0  # the time of the program's `by`, less simulated time here
+        self._stalled_s = read_params(self.params, context.params).stalled_s
         self._orders = Orders(self.commands)
         self._window = ShownWindow()
         self._detour = Detour(context.robot, self._orders, self._window)
@@ -53,21 +53,30 @@ class TaskExecutor(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read the progress below, and the operator's commands; hand down the next moves."""
         if not self._started:
-            self._recall(read)
+            self._recall(read, write)
         self._orders.take(read.operator, lambda command: self._judge(command, read.last_status.value.order))
-        plan, below = read.plan.value, read.status.value
+        plan, below = self._plan_to_follow(read, write, tick), read.status.value
         if not self._error:
             self._follow(plan, below)
             self._check_times(plan, tick)
-        self._done = self._detour.step(plan, self._done, below)
+        self._done = self._step_aside(plan, below)
         waits = self._reason_to_wait(read.status)
         if self._state(plan) == State.EXECUTING:
-            self._check_progress(read, waits, tick)
+            self._check_progress(plan, read, waits, tick)
         self._hand_down(plan, write.command)
-        self._report(plan, waits, write.status)
+        self._report(plan, waits, write)
         self._answer(below, write)
 
-    def _recall(self, read: Ports) -> None:
+    def _first_actions(self) -> tuple[AnyAction, ...]:
+        """Return the actions with which the level begins: its whole program."""
+        return read_program(self.context.task, self.context.robot, self.context.scene).action
+
+    def _plan_to_follow(self, read: Ports, write: Ports, tick: int) -> Message:
+        """Return the `TASK_PLAN` of the present actions; one of zeros if there is none yet."""
+        plan: Message = read.plan.value
+        return plan
+
+    def _recall(self, read: Ports, write: Ports) -> None:
         """Continue from the last command and status in the mailboxes, after a restart of the board."""
         self._started = True
         last = read.last_status.value
@@ -93,9 +102,13 @@ class TaskExecutor(Executor):
             action = int(plan.moves["action"][self._done])
             self._error, self._reason = Error(below.error), f"action {action}: {below.reason}"
 
+    def _step_aside(self, plan: Message, below: Message) -> int:
+        """Interrupt the program for an operator; return how many moves of the plan are done."""
+        return self._detour.step(plan, self._done, below)
+
     def _check_times(self, plan: Message, tick: int) -> None:
         """Fail when an action is not done by its time."""
-        now_s, done = tick * self.context.tick_s, self._actions_done(plan)
+        now_s, done = tick * self.context.tick_s + self._ahead_s, self._actions_done(plan)
         for k in range(done, len(self._actions)):
             by_s = self._actions[k].by
             if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
@@ -114,16 +127,21 @@ class TaskExecutor(Executor):
         is_held = below.value.state == State.HOLDING and below.value.reason != HELD_FROM_ABOVE
         return str(below.value.reason) if is_held else ""
 
-    def _check_progress(self, read: Ports, waits: str, tick: int) -> None:
+    def _check_progress(self, plan: Message, read: Ports, waits: str, tick: int) -> None:
         """Fail when nothing has moved for too long, unless an operator keeps it from moving."""
-        plan, below = read.plan.value, read.status.value
+        below = read.status.value
         progress = (plan.id, self._done, below.done, below.planned, below.current, below.progress, self._detour.move)
+        progress = (*progress, *self._stage())
         operated = below.operated or self._orders.standing is not Operation.NONE
         if operated or progress != self._progress:
             self._progress, self._moved_at = progress, tick
         elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
             self._error = Error.STALLED
             self._reason = f"nothing has moved for {self._stalled_s:g} s: {waits or _awaited(plan, below)}"
+
+    def _stage(self) -> tuple[int, ...]:
+        """Return what else counts as progress."""
+        return ()
 
     def _actions_done(self, plan: Message) -> int:
         if not plan.count:
@@ -138,9 +156,14 @@ class TaskExecutor(Executor):
         elif detour.move:
             window.show_one(detour.as_move(self._actions_done(plan)), command)
         else:
-            window.show(plan, self._done, command, plan.count if detour.until is None else detour.until)
+            window.show(plan, self._done, command, self._shown_until(plan))
 
-    def _report(self, plan: Message, waits: str, status: Message) -> None:
+    def _shown_until(self, plan: Message) -> int:
+        """Return the first move of the plan that must not begin."""
+        return plan.count if self._detour.until is None else self._detour.until
+
+    def _report(self, plan: Message, waits: str, write: Ports) -> None:
+        status: Message = write.status
         status.echo = plan.id
         status.state = self._state(plan)
         if waits and status.state == State.EXECUTING:

@@ -15,9 +15,8 @@ from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geom_name, geoms_of
-from rack.levels.task.program import Transfer
+from rack.levels.task.program import DOWN, Transfer
 
-DOWN = (0.0, 0.0, -1.0)
 QUARTERS = (0, 1, -1, 2)
 """Quarter turns between object and gripper, in the order of trying."""
 HEIGHT_STEP_M = 0.01

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.errors import Refused
-from rack.levels.level import Input, LevelContext, Planner, Ports
+from rack.levels.level import Input, LevelContext, Planner, Ports, Program
 from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
-from rack.levels.task.program import TaskConfig, TaskParams, read_program
+from rack.levels.task.program import ROUNDING_S, TaskConfig, TaskParams, read_program
 from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times, pipeline_periods
 
+FIRST_PLAN = 1
+"""Serial of the first plan."""
 MAX_REST_M_S = 0.01
 """An object slower than this is at rest: its position can be planned with."""
 
@@ -33,8 +36,8 @@ class TaskPlanner(Planner):
         "world": Input(WORLD_MODEL, "world.model"),
     }
     output = TASK_PLAN
-    params = TaskParams
-    program = TaskConfig
+    params: ClassVar[type[TaskParams]] = TaskParams
+    program: ClassVar[type[Program] | None] = TaskConfig
 
     @classmethod
     def preload(cls) -> None:
@@ -48,8 +51,9 @@ class TaskPlanner(Planner):
         # OMPL takes time and memory to import: only racks that plan motions pay for it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
-        self._program = read_program(context.task, context.robot, context.scene)
-        self._needs = read_params(TaskParams, context.params)
+        self._program, self._id = self._first_program(), FIRST_PLAN
+        self._ahead_s = 0.0  # the time of the program's `by`, less simulated time here
+        self._needs = read_params(self.params, context.params)
         self._periods = pipeline_periods(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
@@ -57,10 +61,14 @@ class TaskPlanner(Planner):
         self._visible_at = 0  # tick from which it is visible
         self._since: int | None = None  # tick of the first cycle
 
+    def _first_program(self) -> TaskConfig:
+        """Return the program to plan first."""
+        return read_program(self.context.task, self.context.robot, self.context.scene)
+
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether the program is still to be planned and the world is known and at rest."""
         self._since = tick if self._since is None else self._since
-        followed = read.status.is_there and read.status.value.echo
+        followed = read.status.value.echo == self._id
         if not self._program.action or followed or self._is_on_its_way(read, tick, self._since):
             return False
         if self._plan is not None:
@@ -78,7 +86,7 @@ class TaskPlanner(Planner):
             write.copy_from(self._plan)
             return
         write.clear()
-        write.id = 1
+        write.id = self._id
         try:
             self._decompose(read, write, tick)
         except Refused as refused:
@@ -96,7 +104,7 @@ class TaskPlanner(Planner):
             # Once visible, the status acknowledges it a cycle later.
             return tick <= self._visible_at + self.context.every
         # A plan published just before a restart of this planner becomes visible later.
-        return read.made.is_there or 0 < since <= tick < since + self._slice
+        return read.made.value.id == self._id or 0 < since <= tick < since + self._slice
 
     def _decompose(self, read: Ports, write: Message, tick: int) -> None:
         from rack.levels.task.actions import rehearse
@@ -107,13 +115,15 @@ class TaskPlanner(Planner):
         moves = self._with_times(rehearse(self._program, self.context.scene, start).moves)
         if len(moves) > MOVES:
             raise Refused(Error.LIMIT, f"the program has {len(moves)} elemental moves; at most {MOVES} are valid")
-        # The plan is ready within its cycles, is read and handed down at once, and is visible below a cycle later.
-        visible_s = (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
-        finish_s = finish_times(moves, visible_s, self._periods, self._needs)
-        self._promise(moves, finish_s, write)
+        self._promise(moves, self._visible_s(tick), write)
         for k, (move, _) in enumerate(moves):
             move.write_to(write.moves[k])
         write.count = len(moves)
+
+    def _visible_s(self, tick: int) -> float:
+        """Return when the first moves of a plan begun at `tick` become visible below, s of simulated time here."""
+        # It is ready within its cycles, is read and handed down at once, and is visible below a cycle later.
+        return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
     def _with_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
         """Set the time by which the last move of each action must be done below, for this level to report in time."""
@@ -121,14 +131,15 @@ class TaskPlanner(Planner):
         for k, (move, duration_s) in enumerate(moves):
             by_s = self._program.action[move.action].by
             if by_s is not None and (k + 1 == len(moves) or moves[k + 1].move.action != move.action):
-                timed[k] = Rehearsed(move._replace(by_s=by_s - self.context.period_s), duration_s)
+                timed[k] = Rehearsed(move._replace(by_s=by_s - self._ahead_s - self.context.period_s), duration_s)
         return timed
 
-    def _promise(self, moves: Sequence[Rehearsed], finish_s: Sequence[float], write: Message) -> None:
+    def _promise(self, moves: Sequence[Rehearsed], visible_s: float, write: Message) -> None:
         """Raise `Refused` with the earliest possible time if an action cannot be done by its time."""
-        for (move, _), earliest_s in zip(moves, finish_s, strict=True):
-            action = self._program.action[move.action]
-            if move.by_s and action.by is not None and earliest_s > action.by:
+        finish_s = finish_times(moves, visible_s, self._periods, self._needs)
+        for (move, _), finished_s in zip(moves, finish_s, strict=True):
+            action, earliest_s = self._program.action[move.action], finished_s + self._ahead_s
+            if move.by_s and action.by is not None and earliest_s > action.by + ROUNDING_S:
                 write.earliest = earliest_s
                 text = f"action {move.action}, {action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"
                 raise Refused(Error.TOO_LATE, text)

@@ -12,6 +12,10 @@ from rack.levels.level import Program
 from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
 
 Vector = tuple[Finite, Finite, Finite]
+ROUNDING_S = 1e-9
+"""Margin of times against deadlines: ticks times the clock's period are not exact."""
+DOWN = (0.0, 0.0, -1.0)
+"""Direction of the tool's z axis when none is given."""
 
 
 class Action(Table):
@@ -68,10 +72,13 @@ class Home(Action):
         return "home"
 
 
+AnyAction = Transfer | Goto | Home
+
+
 class TaskConfig(Program):
     """A program: actions in their order."""
 
-    action: tuple[Annotated[Transfer | Goto | Home, Field(discriminator="do")], ...] = Field(
+    action: tuple[Annotated[AnyAction, Field(discriminator="do")], ...] = Field(
         (), description="actions, done in their order"
     )
 

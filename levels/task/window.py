@@ -49,6 +49,16 @@ class ShownWindow:
         """Return how many of the plan's moves the level below reports done."""
         return int(below.done) - self.first + 1
 
+    def breaking_off(self, plan: Message, done: int, below: Message) -> tuple[int, bool]:
+        """Return the first move that must not begin so that the plan is broken off, and whether the arm may rest now.
+
+        It may during a free motion and right after one; else the work on an object comes first.
+        """
+        is_begun = below.current == self.first + done
+        if not is_free(plan, done) and (is_begun or not is_free(plan, done - 1)):
+            return next_free(plan, done), False
+        return done, True
+
     def show(self, plan: Message, done: int, command: Message, until: int) -> None:
         """Show the moves from the first one that is not done up to `until`; after the last, the window stays.
 
@@ -142,12 +152,9 @@ class Detour:
 
     def _leave(self, plan: Message, done: int, below: Message) -> int:
         """Interrupt the program where possible; until then show only the moves that must be done first."""
-        after_free = is_free(plan, done - 1)
-        is_begun = below.current == self._window.first + done
-        if not is_free(plan, done) and (is_begun or not after_free):
-            self.until = next_free(plan, done)
+        self.until, self.holds = self._window.breaking_off(plan, done, below)
+        if not self.holds:
             return done
-        self.until, self.holds = done, True
         # At rest, the program can be interrupted once the level below has received the window without further moves.
         if below.resting and below.operator >= self._orders.basis:
             self.move, self.holds = self._window.jump(), False

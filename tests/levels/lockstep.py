@@ -13,7 +13,7 @@ from typing import Any
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
-from rack.levels.level import Demand, Executor, Input, LevelContext, Output, Pace, Planner, Ports
+from rack.levels.level import Demand, Executor, Input, LevelContext, MadePorts, Output, Pace, Planner, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -45,7 +45,7 @@ class Task:
         self.level, self.spec, self.due = level, spec, 0
         # A port that reads many has an input for each board, by (port, board).
         self._inputs: dict[str | tuple[str, str], Box] = {}
-        for port, input_ in level.inputs.items():
+        for port, input_ in {**level.inputs, **made_ports(spec, level).inputs}.items():
             names = sources(input_, spec)
             self._inputs |= {(port, name.partition(".")[0]) if input_.many else port: boxes[name] for name in names}
         self._values = {port: Message(box.dtype) for port, box in self._inputs.items()}
@@ -86,6 +86,11 @@ class Task:
         for box in self._outputs.values():
             box.lost = False
 
+    def forget(self, sizes_: Mapping[str, int]) -> None:
+        """Read nothing of what it wrote itself."""
+        own = [port for port, box in self._inputs.items() if box in self._outputs.values()]
+        self._inputs |= {port: Box(self._inputs[port].kind, sizes_) for port in own}
+
     def _read(self, port: str | tuple[str, str], tick: int) -> Reading:
         box = self._inputs[port]
         serial, data = box.at(tick)
@@ -98,7 +103,7 @@ class Task:
         return Reading(value, Verdict.NEW, is_lost)
 
     def _publish(self, tick: int, visible_at: int) -> None:
-        kinds = self.level.outputs if isinstance(self.level, Executor) else {}
+        kinds = outputs_of(self.spec) if isinstance(self.level, Executor) else {}
         for port, box in self._outputs.items():
             kind = kinds.get(port)
             if not isinstance(kind, Output) or kind.is_due(tick, self.spec.every, 0):
@@ -127,7 +132,7 @@ class Lockstep:
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
-            for port, kind in board.executor.outputs.items():
+            for port, kind in outputs_of(board).items():
                 output = kind if isinstance(kind, Output) else Output(kind)
                 self.boxes[f"{board.name}.{port}"] = Box(output.type, self.sizes, output.cycles * board.every)
             if board.planner is not None:
@@ -155,7 +160,7 @@ class Lockstep:
 
     def _start(self, board: BoardSpec) -> dict[str, Task]:
         context = self._contexts[board.name]
-        outputs = {port: self.boxes[f"{board.name}.{port}"] for port in board.executor.outputs}
+        outputs = {port: self.boxes[f"{board.name}.{port}"] for port in outputs_of(board)}
         started = {board.name: Task(board.executor(context), board, self.boxes, outputs)}
         if board.planner is not None:
             plan = {"plan": self.boxes[f"{board.name}.plan"]}
@@ -172,6 +177,11 @@ class Lockstep:
         """Kill a task now and restart it `ticks` later; without `finished`, its present plan is never made."""
         self.tasks[name].lose(self.tick, finished)
         self.after(ticks, lambda: self.restart(name))
+
+    def forget(self, name: str) -> None:
+        """Replace a task by one that finds its own mailboxes empty, as after a new launch of its rack."""
+        self.restart(name)
+        self.tasks[name].forget(self.sizes)
 
     def disturb(self, mailbox: str, disturbance: Disturbance, ticks: int) -> None:
         """Let a faulty writer write `mailbox` for `ticks`."""
@@ -228,6 +238,16 @@ class Lockstep:
 def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
     """Return neighbours as a tuple."""
     return (boards,) if isinstance(boards, str) else boards
+
+
+def made_ports(board: BoardSpec, level: Executor | Planner) -> MadePorts:
+    """Return the ports that the parameters of a board make; a planner has none."""
+    return board.executor.made_ports(board.params, {}) if isinstance(level, Executor) else MadePorts()
+
+
+def outputs_of(board: BoardSpec) -> dict[str, MessageType | Output]:
+    """Return the outputs of a board's executor by port."""
+    return {**board.executor.outputs, **board.executor.made_ports(board.params, {}).outputs}
 
 
 def sources(port: Input, board: BoardSpec) -> list[str]:

@@ -56,4 +56,4 @@ def test_a_window_without_a_screen_says_what_to_do_elsewhere(monkeypatch: pytest
 
 def test_a_folder_without_a_recording_is_no_run_to_replay(tmp_path: Path) -> None:
     with pytest.raises(Failure, match=r"it has no run\.rrd"):
-        replay(tmp_path)
+        replay([tmp_path])

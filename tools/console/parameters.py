@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from rack.tools.console.address import CERTIFICATES
 from rack.tools.console.answer import Failure
 
 
@@ -35,10 +36,18 @@ def check_timeout(timeout: float | None, wait: bool) -> None:
 
 
 def named(rack: str | None) -> str | None:
-    """Return the name of a rack. Raises `Failure` when it is empty."""
+    """Return the name of a rack, or HOST/RACK. Raises `Failure` when it is empty."""
     if rack == "":
         raise Failure('RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2)
     return rack
+
+
+def named_here(rack: str | None) -> str | None:
+    """Return the name of a rack on this machine. Raises `Failure` for one on another, where this command is needed."""
+    if rack is not None and "/" in rack:
+        from_afar = "permitted from afar: list --lan, status, top, command, estop"
+        raise Failure(f"RACK = {rack}: this command works on the rack's own machine alone; {from_afar}", 2)
+    return named(rack)
 
 
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout, and nothing else")]
@@ -48,7 +57,35 @@ ConfigName = Annotated[
 RackName = Annotated[
     str,
     typer.Argument(
-        metavar="RACK", help="running rack by name, as 'rack list' shows it", autocompletion=rack_names, callback=named
+        metavar="RACK",
+        help="running rack by name, as 'rack list' shows it",
+        autocompletion=rack_names,
+        callback=named_here,
+    ),
+]
+"""A rack on this machine."""
+AnyRackName = Annotated[
+    str,
+    typer.Argument(
+        metavar="RACK",
+        help="running rack by name, as 'rack list' shows it; on another machine: HOST[:PORT]/RACK",
+        autocompletion=rack_names,
+        callback=named,
+    ),
+]
+"""A rack on this machine or another one."""
+Certificates = Annotated[
+    str,
+    typer.Option(
+        metavar="DIR",
+        envvar=CERTIFICATES,
+        help="for HOST/RACK: folder with certificates and secret; see rack lan certificates --help",
+    ),
+]
+AskAs = Annotated[
+    str,
+    typer.Option(
+        "--as", metavar="NAME", help="for HOST/RACK: name under which to ask, as in adapter.lan.permit of that rack"
     ),
 ]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]

@@ -86,6 +86,8 @@ class MirroredRing:
 class Mirror(Segment):
     """A mirror; `is_there` says whether the rack answered last time. Its `rack` is the name by which users know it."""
 
+    is_mirror = True
+
     def __init__(self, rack: str, fetch: Fetch) -> None:
         """Fetch layout and config. Raises `SegmentError` when the other program has another version."""
         self._fetch = fetch
@@ -155,6 +157,8 @@ class Mirror(Segment):
         self._hosts = answer.hosts
         self.realtime_offset_ns = answer.realtime_ns - answer.monotonic_ns
         """CLOCK_REALTIME of its machine less CLOCK_MONOTONIC there."""
+        self.realtime_ns = answer.realtime_ns
+        """CLOCK_REALTIME of its machine when it answered."""
         self.monotonic_offset_ns = answer.monotonic_ns - time.monotonic_ns()
         """CLOCK_MONOTONIC of its machine less that of this one, to within the way of an answer."""
 

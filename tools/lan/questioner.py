@@ -10,36 +10,56 @@ import ipaddress
 import os
 import secrets
 import socket
+import ssl
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
-try:
-    import zenoh
-except ImportError:
-    raise ImportError("HOST/RACK needs eclipse-zenoh; to install it: pip install nasrem-rack[lan]") from None
+import zenoh
 
 from rack.backplane.segment import VERSION
 from rack.boards.lan.config import LanTable
+from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE
 from rack.boards.lan.link import LanLink
 from rack.boards.lan.questions import NEEDED, Code, DeskAnswer, What, answer_key, question_key
 from rack.levels.errors import LevelError
+from rack.tools.console.address import AT_THE_RACK, Asker, HostAddress
 from rack.tools.console.answer import Failure
-from rack.tools.lan.address import Asker, HostAddress
 
 CONNECT_S = 3.0
 """Longest wait for a connection, and for the racks at its other end to show themselves."""
+OTHERS_S = 0.3
+"""Longest wait for further racks at the other end of a connection, once one has shown itself."""
 ANSWER_S = 1.0
 """Longest wait for one answer; after it the question is asked again."""
 PATIENCE_S = 4.0
 """Time without an answer after which a rack counts as gone."""
 PAUSE_S = 0.02
 """Time until a question is asked again that was dropped."""
+REFUSAL_S = 0.2
+"""Longest wait for the refusal of a certificate."""
+DENIED = 10
+"""Times that a question comes back at once without an answer until it counts as not permitted."""
 MOST_BYTES = 1 << 17
+
+
+class FarLaunch(NamedTuple):
+    """One launch of a rack: a restarted rack is another one."""
+
+    rack: str
+    launch: int
+
+
+class _Question(NamedTuple):
+    number: int
+    key: str
+    replies: Any
 
 
 class Questioner:
@@ -78,36 +98,41 @@ class Questioner:
                 del self._launches[rack]
             self._changed.notify_all()
 
-    def launch(self, rack: str) -> int:
+    def launch(self, rack: str) -> FarLaunch:
         """Return the launch of a rack that is there. Raises `Failure` when it is not: it names those that are."""
         with self._changed:
-            self._changed.wait_for(lambda: rack in self._launches, CONNECT_S)
+            self._changed.wait_for(lambda: self._launches, CONNECT_S)
+            self._changed.wait_for(lambda: rack in self._launches, OTHERS_S)
             if rack in self._launches:
-                return self._launches[rack]
-            there = ", ".join(sorted(self._launches)) or "none that show themselves to "
-            there += f"'{self._asker.name}'" if not self._launches else ""
-        raise Failure(f"no rack '{rack}' at {self._at}; racks there: {there}")
+                return FarLaunch(rack, self._launches[rack])
+            there = ", ".join(sorted(self._launches))
+        raise Failure(f"no rack '{rack}' at {self._at}; racks there: {there or self._nobody()}")
 
-    def racks(self) -> list[str]:
-        """Return the racks there, once one has shown itself."""
+    def launches(self) -> list[FarLaunch]:
+        """Return the racks there, once one has shown itself. Raises `Failure` when none does."""
         with self._changed:
-            self._changed.wait_for(lambda: bool(self._launches), CONNECT_S)
-            return sorted(self._launches)
+            if not self._changed.wait_for(lambda: bool(self._launches), CONNECT_S):
+                raise Failure(f"{self._at}: racks there: {self._nobody()}")
+            return [FarLaunch(*found) for found in sorted(self._launches.items())]
+
+    def _nobody(self) -> str:
+        hint = "" if self._asker.certificates else "; one with TLS needs --certificates"
+        return f"none that knows '{self._asker.name}'{hint}"
 
     def is_there(self, rack: str, launch: int) -> bool:
         """Say whether a launch has not ended yet, as far as is known."""
         return self._launches.get(rack) == launch
 
-    def ask(self, rack: str, launch: int, what: What, payloads: list[bytes]) -> Iterator[DeskAnswer]:
-        """Yield the answers to questions of one kind, in their order. Raises `Failure` when there is none.
+    def ask(self, asked: FarLaunch, what: What, payloads: Sequence[bytes]) -> Iterator[DeskAnswer]:
+        """Yield the answers to questions of one kind, in their order. Raises `Failure` when one has none, or a refusal.
 
-        All are on their way at once; one that gets no answer is asked again.
+        All are on their way at once; one that comes back without an answer is asked again.
         """
-        pending = [self._question(rack, what, payload) for payload in payloads]
+        pending = [self._question(asked.rack, what, payload) for payload in payloads]
         for payload, question in zip(payloads, pending, strict=True):
-            yield self._granted(rack, what, self._answer(rack, launch, what, payload, question))
+            yield self._granted(asked.rack, what, self._answer(asked, what, payload, question))
 
-    def _question(self, rack: str, what: What, payload: bytes) -> tuple[int, str, Any]:
+    def _question(self, rack: str, what: What, payload: bytes) -> _Question:
         self._number += 1
         key = question_key(rack, what, self._asker.name)
         head = Envelope(VERSION, self._session, self._number, 0, 0, 0, 0)
@@ -119,57 +144,71 @@ class Questioner:
             payload=payload,
             attachment=self._link.sealer.seal(key, head, payload),
         )
-        return self._number, key, replies
+        return _Question(self._number, key, replies)
 
-    def _answer(
-        self, rack: str, launch: int, what: What, payload: bytes, question: tuple[int, str, Any]
-    ) -> DeskAnswer | None:
-        """Return the answer to a question; None if there is none within the patience."""
-        deadline = time.monotonic() + PATIENCE_S
+    def _answer(self, asked: FarLaunch, what: What, payload: bytes, question: _Question) -> DeskAnswer:
+        """Return the answer to a question. Raises `Failure` when there is none within the patience."""
+        deadline, returned, timed_out = time.monotonic() + PATIENCE_S, 0, False
         while True:
-            number, key, replies = question
-            for reply in replies:
-                if (answer := self._opened(number, key, launch, reply)) is not None and answer.code is not Code.BUSY:
+            began = time.monotonic()
+            for reply in question.replies:
+                answer = self._opened(question, asked.launch, reply)
+                if answer is not None and answer.code is not Code.BUSY:
                     return answer
-            if time.monotonic() > deadline or not self.is_there(rack, launch):
-                return None
+            timed_out = timed_out or time.monotonic() - began > ANSWER_S / 2
+            returned += 1
+            if not self.is_there(*asked):
+                raise Failure(f"rack '{asked.rack}' at {self._at} has ended, or is out of reach")
+            if returned >= DENIED and not timed_out:
+                raise Failure(f"rack '{asked.rack}' {self._denied(what)}")
+            if time.monotonic() > deadline:
+                why = "its adapter does not cycle; does `rack step` hold it?"
+                raise Failure(f"rack '{asked.rack}' at {self._at} has not answered for {PATIENCE_S:g} s: {why}")
             self._until.wait(PAUSE_S)
-            question = self._question(rack, what, payload)
+            question = self._question(asked.rack, what, payload)
 
-    def _opened(self, number: int, key: str, launch: int, reply: Any) -> DeskAnswer | None:
+    def _opened(self, question: _Question, launch: int, reply: Any) -> DeskAnswer | None:
         if (sample := reply.ok) is None:
             return None
         payload = sample.payload.to_bytes()
         envelope = None if sample.attachment is None else sample.attachment.to_bytes()
-        head = self._link.sealer.opened(answer_key(key), envelope, payload)
-        if isinstance(head, Flaw) or (head.number, head.serial, head.launch) != (self._session, number, launch):
+        head = self._link.sealer.opened(answer_key(question.key), envelope, payload)
+        wanted = self._session, question.number, launch
+        if isinstance(head, Flaw) or (head.number, head.serial, head.launch) != wanted:
             return None
         return DeskAnswer.unpacked(payload)
 
-    def _granted(self, rack: str, what: What, answer: DeskAnswer | None) -> DeskAnswer:
-        right, name = NEEDED[what], self._asker.name
-        if answer is None:
-            why = f"it does not permit '{name}' to {right} (its config: adapter.lan.permit), or its clock stands still"
-            raise Failure(f"rack '{rack}' at {self._at} does not answer: {why}")
+    def _denied(self, what: What) -> str:
+        return f"does not permit '{self._asker.name}' to {NEEDED[what]}; its config: adapter.lan.permit"
+
+    def _granted(self, rack: str, what: What, answer: DeskAnswer) -> DeskAnswer:
         if answer.code is Code.GRANTED:
             return answer
         reasons = {
-            Code.NOT_PERMITTED: f"does not permit '{name}' to {right}; its config: adapter.lan.permit",
+            Code.NOT_PERMITTED: self._denied(what),
             Code.OTHER_VERSION: f"is of another version; this program asks racks of version {VERSION}",
             Code.OUTSIDE: "has no such memory",
             Code.NOT_VALID: "knows no such command",
             Code.PAST: "has passed that tick",
+            Code.AT_THE_RACK: AT_THE_RACK.format(rack),
             Code.FULL: "has too many commands waiting; permitted: once one of them is given",
         }
         raise Failure(f"rack '{rack}' {reasons[answer.code]}")
 
 
 def _check_reach(at: HostAddress, asker: Asker) -> None:
-    """Raise `Failure` when nobody listens there, or it is too far to go without certificates."""
+    """Raise `Failure` when nobody listens there, it refuses this user's certificate, or there is none to show."""
     host = at.host.strip("[]")
     try:
-        with socket.create_connection((host, at.port), CONNECT_S) as found:
-            address = ipaddress.ip_address(found.getpeername()[0].partition("%")[0])
+        with socket.create_connection((host, at.port), CONNECT_S) as connection:
+            address = ipaddress.ip_address(connection.getpeername()[0].partition("%")[0])
+            if asker.certificates:
+                _shake_hands(connection, host, asker)
+    except ssl.SSLCertVerificationError as error:
+        raise Failure(f"{at}: its certificate is refused here: {error.verify_message}") from None
+    except (ssl.SSLError, ConnectionResetError) as error:
+        why = (getattr(error, "reason", None) or "connection closed").replace("_", " ").lower()
+        raise Failure(f"{at}: TLS refused: {why}") from None
     except TimeoutError:
         raise Failure(f"{at}: no answer at port {at.port} within {CONNECT_S:g} s") from None
     except OSError as error:
@@ -177,3 +216,17 @@ def _check_reach(at: HostAddress, asker: Asker) -> None:
         raise Failure(f"{at}: cannot connect to port {at.port}: {why or error}") from None
     if not asker.certificates and not address.is_loopback:
         raise Failure(f"{at}: not this machine, so it needs certificates; see --certificates", 2)
+
+
+def _shake_hands(connection: socket.socket, host: str, asker: Asker) -> None:
+    """Show the certificate and look at the other one, as the session will: it would only try again and again."""
+    credentials = Credentials(Path(asker.certificates), asker.name)
+    if (flaw := next(credentials.flaws(), None)) is not None:
+        raise Failure(str(flaw))
+    context = ssl.create_default_context(cafile=credentials.authority)
+    context.load_cert_chain(credentials.certificate, credentials.key)
+    with context.wrap_socket(connection, server_hostname=host) as secure:
+        # The other side judges our certificate after its own part is done: a refusal comes as the first thing to read.
+        secure.settimeout(REFUSAL_S)
+        with suppress(TimeoutError):
+            secure.recv(1)

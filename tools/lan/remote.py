@@ -18,8 +18,8 @@ from rack.boards.lan.questions import (
     packed_request,
     packed_stretches,
 )
+from rack.tools.console.address import Asker, RackAddress
 from rack.tools.console.answer import Failure
-from rack.tools.lan.address import Asker, RackAddress
 from rack.tools.lan.mirror import Mirror
 from rack.tools.lan.questioner import Questioner
 
@@ -35,7 +35,7 @@ class RemoteRack:
     """
 
     def __init__(self, address: RackAddress, asker: Asker | None = None) -> None:
-        self.address, self._asker = address, asker or Asker()
+        self.address, self._asker = address, asker or Asker.default()
         self._racks = Questioner(address.at, self._asker)
         try:
             self._launch = self._racks.launch(address.rack)
@@ -65,13 +65,17 @@ class RemoteRack:
                 segment.is_there = False
         return segment.is_there
 
+    def follow(self, mailbox: str) -> None:
+        """Fetch every message of a mailbox from now on, as far as its slots reach back."""
+        self.segment.follow(mailbox)
+
     def _fetch(self, stretches: Sequence[Stretch]) -> tuple[list[bytes], DeskAnswer]:
         found: list[bytes] = []
         questions = list(_questions(stretches))
         for at in range(0, len(questions), AT_ONCE):
             group = questions[at : at + AT_ONCE]
             payloads = [packed_stretches(part) for part in group]
-            answers = self._racks.ask(self.address.rack, self._launch, "read", payloads)
+            answers = self._racks.ask(self._launch, "read", payloads)
             for part, answer in zip(group, answers, strict=True):
                 found += _parts(answer.content, part)
         return found, answer
@@ -80,7 +84,7 @@ class RemoteRack:
     def claim(self, request: Request) -> Iterator[RequestEntry]:
         """Give a request to the rack, and withdraw it at the end of the `with` block unless it has been issued."""
         self._check_right("command")
-        (answer,) = self._racks.ask(self.address.rack, self._launch, "give", [packed_request(request)])
+        (answer,) = self._racks.ask(self._launch, "give", [packed_request(request)])
         ticket = Ticket.unpacked(answer.content)
         if ticket is None:
             raise Failure(f"rack '{self.address}': its answer to the command is malformed")
@@ -90,7 +94,7 @@ class RemoteRack:
             yield entry
         finally:
             if entry[RequestWord.TICKET] == ticket.number and entry.stage == RequestStage.WAITING:
-                list(self._racks.ask(self.address.rack, self._launch, "withdraw", [ticket.packed()]))
+                list(self._racks.ask(self._launch, "withdraw", [ticket.packed()]))
 
     def _check_right(self, right: str) -> None:
         permit = tomllib.loads(self.segment.config)["adapter"]["lan"].get("permit", {})
@@ -100,10 +104,11 @@ class RemoteRack:
             raise Failure(f"rack '{self.address.rack}' {why}")
 
 
-def stop(address: RackAddress, asker: Asker) -> None:
-    """Set the emergency stop of a rack. Raises `Failure`."""
+def stop(address: RackAddress, asker: Asker) -> int:
+    """Set the emergency stop of a rack; return the tick at which that was done. Raises `Failure`."""
     with Questioner(address.at, asker) as racks:
-        list(racks.ask(address.rack, racks.launch(address.rack), "stop", [b""]))
+        (answer,) = racks.ask(racks.launch(address.rack), "stop", [b""])
+        return answer.tick
 
 
 def _questions(stretches: Sequence[Stretch]) -> Iterator[list[Stretch]]:

@@ -25,10 +25,10 @@ from rack.levels.operator import Answer, Operation
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import table
 from rack.tools.runs.holds import resume_command
+from rack.tools.runs.watched import WatchedRack
 
 REPLY_CYCLES = 4
 """Cycles of a level within which it replies: one to read, one to become visible, and two that may be missed."""
-LOOK_S = 0.001
 SILENT_S = 5.0
 """Time without a tick after which a wait is given up."""
 NOTE_S = 1.5
@@ -84,12 +84,11 @@ class Reply:
 
 
 class LiveDesk:
-    """The desk of one rack. Raises `SegmentError` when there is no such rack."""
+    """The desk of one rack."""
 
-    def __init__(self, rack: str) -> None:
-        self._segment = Segment.attach(rack)
+    def __init__(self, rack: WatchedRack) -> None:
+        self._rack, self._segment = rack, rack.segment
         self._config = loads(self._segment.config)
-        self._table = OperatorTable(self._segment)
 
     def levels(self) -> list[dict[str, str]]:
         """Return the commands that each level takes, and the one in force, as plain data."""
@@ -116,21 +115,23 @@ class LiveDesk:
         if 0 <= wanted.tick <= tick:
             key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
             raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
-        if _Patience(segment, "").is_in_vain:
+        if _Patience(self._rack, "").is_in_vain:
             raise Failure(f"rack '{segment.rack}': its run is over")
         if segment.words[System.HELD]:
             # Without a client: the user steps the rack afterwards.
-            entry = self._table.add(wanted)
+            entry = OperatorTable(segment).add(wanted)
             return Reply(0, command.level, describe(message_of(entry, segment.layout)), -1, "waiting")
+        if (answering := _answering(segment, command.level)) is not None:
+            self._rack.follow(answering.name)
         # However the wait ends, leaving the claim withdraws a request that has not been given.
-        with self._table.claim(wanted) as entry:
+        with self._rack.claim(wanted) as entry:
             ticket, text = entry[RequestWord.TICKET], describe(message_of(entry, segment.layout))
             reply = self._await_giving(entry, ticket, command.level, text)
         return self._await_reply(reply, wait, timeout_s)
 
     def _await_giving(self, entry: RequestEntry, ticket: int, level: str, text: str) -> Reply:
         about = f"'{level}', {text}"
-        patience = _Patience(self._segment, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}")
+        patience = _Patience(self._rack, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}")
         while entry[RequestWord.TICKET] == ticket:
             if entry.stage == RequestStage.GIVEN:
                 return Reply(entry[RequestWord.SERIAL], level, text, entry[RequestWord.GIVEN_TICK])
@@ -148,9 +149,7 @@ class LiveDesk:
         replies = Replies(self._segment, status, reply)
         last = reply.given + REPLY_CYCLES * status.every
         about = f"command {reply.serial}: "
-        patience = _Patience(
-            self._segment, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks"
-        )
+        patience = _Patience(self._rack, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks")
         while True:
             # Before the look: a reply written just before the run ended still counts.
             in_vain, tick = patience.is_in_vain, self._segment.words[System.TICK]
@@ -218,14 +217,14 @@ class Replies:
 class _Patience:
     """Waits as long as the rack's clock ticks; explains a long wait on stderr, once."""
 
-    def __init__(self, segment: Segment, what: str) -> None:
-        self._segment, self._words, self._what = segment, segment.words, what
+    def __init__(self, rack: WatchedRack, what: str) -> None:
+        self._rack, self._words, self._what = rack, rack.segment.words, what
         self._tick, self._changed = self._words[System.TICK], time.monotonic()
         self._note_at: float | None = self._changed + NOTE_S
 
     def look_again(self) -> bool:
         """Wait a moment; return False when the clock has not ticked for too long."""
-        time.sleep(LOOK_S)
+        self._rack.refresh()
         now, tick = time.monotonic(), self._words[System.TICK]
         if tick != self._tick:
             self._tick, self._changed = tick, now
@@ -237,4 +236,4 @@ class _Patience:
     @property
     def is_in_vain(self) -> bool:
         """Whether the run is over."""
-        return self._segment.run_is_over
+        return self._rack.segment.run_is_over

@@ -21,7 +21,7 @@ from rack.boards.exchange import PortAge
 from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
 from rack.tools.runs.host_side import EntryRow, HostRow
-from rack.tools.runs.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
+from rack.tools.runs.snapshot import DEAD, GONE, LOST, Snapshot, TaskProgress, TaskRow
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -168,6 +168,8 @@ def line_of(snapshot: Snapshot) -> str:
     missed = sum(row.missed for row in snapshot.tasks)
     skipped = sum(row.skipped for row in snapshot.tasks)
     line = f"{snapshot.rack} {snapshot.time_s:8.2f} s  tick {snapshot.tick}  missed {missed}  skipped {skipped}"
+    if snapshot.run in (DEAD, GONE):
+        line += f"  {snapshot.run}"
     at = snapshot.progress
     if at is not None:
         line += f"  task {at.state}, action {at.actions_done}/{at.actions}, move {at.moves_done}/{at.moves}"
@@ -180,6 +182,8 @@ def _head(snapshot: Snapshot) -> Text:
     line = Text(f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}")
     if snapshot.run == DEAD:
         line.append("; its launcher is gone: 'rack clean' removes it", style="bold red")
+    if snapshot.run == GONE:
+        line.append("; it does not answer any more", style="bold red")
     if snapshot.clock_skipped:
         line.append(f", clock skipped {snapshot.clock_skipped} ticks", style="yellow")
     for name in [*snapshot.lines, *_demanded(snapshot)]:

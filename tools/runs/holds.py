@@ -88,7 +88,9 @@ class Holds:
     def _stopped(self) -> Iterator[Hold]:
         if self._lines.emergency_stop:
             since = self._segment.block(self._arm)[Block.LEVEL_SINCE] if self._arm is not None else 0
-            yield self._hold("arm", since, "braked: emergency stop", f"rack estop {self._segment.rack} --reset")
+            where = ", on its own machine" if self._segment.is_mirror else ""
+            release = f"rack estop {self._segment.layout.rack} --reset{where}"
+            yield self._hold("arm", since, "braked: emergency stop", release)
 
     def _awaiting(self) -> Iterator[Hold]:
         for board, why in awaited(self._segment):

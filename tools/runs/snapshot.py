@@ -24,6 +24,8 @@ LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
 DEAD = "dead"
 """State of a run whose launcher is gone: 'rack clean' removes it."""
+GONE = "gone"
+"""State of a run on another machine that does not answer any more."""
 HELD = "HELD: 'rack step {}' lets it go on"
 """Line of a rack in lockstep that is single-stepped."""
 TASK_STATUS = "task_status"
@@ -120,10 +122,11 @@ class RackMonitor:
     def look(self) -> Snapshot:
         """Return the rack as it is now."""
         words, layout = self._segment.words, self._segment.layout
+        lost = GONE if self._segment.is_mirror else DEAD
         tick = words[System.TICK]
         return Snapshot(
             rack=layout.rack,
-            run=Run(words[System.STATE]).name.lower() if self._segment.launcher_is_alive else DEAD,
+            run=Run(words[System.STATE]).name.lower() if self._segment.launcher_is_alive else lost,
             tick=tick,
             time_s=tick * layout.clock_ns * 1e-9,
             clock_skipped=words[System.CLOCK_SKIPPED],

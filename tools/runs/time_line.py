@@ -77,7 +77,7 @@ class Shift:
 
 
 @dataclass(frozen=True)
-class Placed:
+class RackPlace:
     """A recorded rack on the time line: by what shifts its clock leads to the first rack's; in lockstep by none."""
 
     own: RackGrid
@@ -116,7 +116,7 @@ class Placed:
         return self.stamps_ns(stamps_ns) + launch.wall_offset_ns
 
 
-def on_one_time_line(recordings: Sequence[Recording]) -> list[Placed]:
+def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
     """Return where the racks of these recordings are on the time line of the first one.
 
     Raises `Failure` if they did not run together, or nothing leads from one to another.
@@ -124,7 +124,7 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[Placed]:
     grids = [RackGrid(recording) for recording in recordings]
     for at, grid in enumerate(grids):
         _check_company(grid, grids[:at])
-    placed = {0: Placed(grids[0], grids[0])}
+    placed = {0: RackPlace(grids[0], grids[0])}
     while len(placed) < len(grids):
         near = [(a, b) for a in placed for b in range(len(grids)) if b not in placed]
         ways = ((a, b, way) for a, b in near if (way := _way(grids[b], grids[a])) is not None)
@@ -136,7 +136,7 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[Placed]:
                 2,
             )
         a, b, shifts = found
-        placed[b] = Placed(grids[b], grids[0], (*shifts, *placed[a].shifts))
+        placed[b] = RackPlace(grids[b], grids[0], (*shifts, *placed[a].shifts))
     return [placed[at] for at in range(len(grids))]
 
 
@@ -188,7 +188,7 @@ def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
     by_ns = np.rint(read(mailbox, "offset")[known] * 1e9).astype(np.int64)
     at_ns = of.stamp_ns(ticks) + by_ns
     seen_ns = np.rint(ticks * of.clock_ns + read(mailbox, "ahead")[known] * 1e9)
-    apart_ns = np.maximum(peer.time_ns(at_ns), 0) - seen_ns
+    apart_ns = peer.time_ns(at_ns) - seen_ns
     # Of a peer that had not begun yet, nothing says which launch it was.
     is_this = (np.abs(apart_ns) <= TOLERANCE_NS) & (seen_ns > 0)
     if not is_this.any():

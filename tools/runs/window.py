@@ -24,7 +24,7 @@ class ViewerWindow:
     """
 
     def __init__(self, *sources: str, headless: bool = False, port: int | None = None) -> None:
-        if not (headless or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))):
+        if not (headless or has_screen()):
             raise Failure(
                 f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; on a machine with one: rerun {' '.join(sources)}"
             )
@@ -82,6 +82,11 @@ class ViewerWindow:
             os.killpg(self._process.pid, signal.SIGTERM)
             self._process.wait()
         self._said.close()
+
+
+def has_screen() -> bool:
+    """Return whether a window can be opened."""
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def executable() -> str:

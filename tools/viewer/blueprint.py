@@ -18,8 +18,8 @@ from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
 from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
 from rack.tools.viewer.events import EVENTS, RECORDER
-from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, LOG, ROW, positions
-from rack.tools.viewer.stream import SIM_TIME, Stream, path
+from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
+from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
 from rack.tools.viewer.style import lanes_view
 from rack.tools.viewer.timing import BOARDS
 
@@ -52,7 +52,7 @@ def together(racks: Mapping[str, RackViews]) -> rrb.Container:
     """
     scenes = rrb.Horizontal(*(views.scene(name) for name, views in racks.items()))
     doing = rrb.Vertical(*(views.doing(name) for name, views in racks.items()))
-    columns = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["entitypath", "loglevel", "body"])
+    columns = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
     logs = [views.all(LOG) for views in racks.values()]
     log = rrb.TextLogView(origin="/", contents=[f"{path(LOG)}/**", *logs], name="log of all", columns=columns)
     below = rrb.Horizontal(doing, log, column_shares=[3, 2])

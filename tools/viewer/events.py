@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from rack.tools.viewer.levels import LOG, Hierarchy
+from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.stream import Stream
 from rack.tools.viewer.style import EVENT_COLOURS, style_lane, write_span
 
@@ -61,8 +61,8 @@ class Events:
             return
         board, code = event.get("board") or RACK, event.get("code", "")
         tick, stamp_ns = max(0, event["tick"]), self._stream.times.monotonic(event["time_ns"])
-        line = rr.TextLog(f"{kind}: {board}: {event['text']}", level=LEVELS.get(kind, "INFO"))
-        self._stream.at(tick, stamp_ns, (LOG, "events"), line)
+        text = f"{kind}: {board}: {event['text']}"
+        self._stream.say(tick, stamp_ns, "events", text, LEVELS.get(kind, "INFO"))
         if kind not in UNSHOWN:
             self._show(tick, stamp_ns, board, kind, code)
         if kind == "died":
@@ -95,8 +95,8 @@ class Losses:
         stamp_ns = int(self._stream.times.stamps_of(np.array([tick]))[0])
         for ring, count in lost.items():
             if count > self._logged.get(ring, 0):
-                line = rr.TextLog(f"recorder: {count - self._logged.get(ring, 0)} rows of {ring} lost", level="ERROR")
-                self._stream.at(tick, stamp_ns, (LOG, "recorder"), line)
+                text = f"recorder: {count - self._logged.get(ring, 0)} rows of {ring} lost"
+                self._stream.say(tick, stamp_ns, "recorder", text, "ERROR")
         self._logged = dict(lost)
         self._stream.at(tick, stamp_ns, (RECORDER, "rows_lost"), rr.Scalars(sum(lost.values())))
 

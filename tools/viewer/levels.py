@@ -16,7 +16,7 @@ from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Changes, RowBlock, Stream
 from rack.tools.viewer.style import STATES, style_lane, write_spans
 
-LEVELS, LOG = "levels", "log"
+LEVELS = "levels"
 HIERARCHY = "hierarchy"
 ROW, COLUMN = 45.0, 110.0
 """Distance between nodes, in the graph's units; a letter is about 7 wide."""
@@ -42,9 +42,11 @@ class Activity:
     """Writes the state in a level's statuses, and each error once."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._stream, self._board = stream, mailbox.name.partition(".")[0]
-        self._states, self._errors = ValueLane(stream, self._board, "state"), Changes()
-        style_lane(stream, (LEVELS, self._board, "state"), STATES)
+        self._stream, (self._board, _, port) = stream, mailbox.name.partition(".")
+        # An adapter also writes the statuses of other racks' levels.
+        lane = "state" if port == "status" else port
+        self._states, self._errors = ValueLane(stream, self._board, lane), Changes()
+        style_lane(stream, (LEVELS, self._board, lane), STATES)
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
@@ -53,8 +55,8 @@ class Activity:
         for row in self._errors.rows(messages["error"]):
             if messages["error"][row]:
                 reason = messages["reason"][row].decode("ascii", "replace")
-                line = rr.TextLog(f"{self._board}: {reason or 'error ' + str(messages['error'][row])}", level="ERROR")
-                self._stream.at(int(block.ticks[row]), int(block.stamps_ns[row]), (LOG, "levels"), line)
+                text = f"{self._board}: {reason or 'error ' + str(messages['error'][row])}"
+                self._stream.say(int(block.ticks[row]), int(block.stamps_ns[row]), "levels", text, "ERROR")
 
 
 class Commanded:
@@ -83,8 +85,8 @@ class FiredRows:
         for at in self._changes.rows(rows):
             table, row, fired, state = (part.decode() if isinstance(part, bytes) else part for part in rows[at].item())
             text = f"{self._board}: row {row} '{fired}', now in '{state}', table {table}"
-            line = rr.TextLog(text, level="INFO" if row else "ERROR")
-            self._stream.at(int(block.ticks[at]), int(block.stamps_ns[at]), (LOG, "rows"), line)
+            level = "INFO" if row else "ERROR"
+            self._stream.say(int(block.ticks[at]), int(block.stamps_ns[at]), "rows", text, level)
 
 
 class Moves:

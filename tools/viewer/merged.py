@@ -6,19 +6,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import rerun as rr
 
 from rack.tools.runs.recording import Recording
-from rack.tools.runs.time_line import Placed
+from rack.tools.runs.time_line import RackPlace
 from rack.tools.viewer.blueprint import RackViews, blueprint, together
-from rack.tools.viewer.levels import LOG
 from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Stream, Timelines, new_recording
 
-NOTES = (LOG, "time line")
 
-
-def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
+def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
     """Write one recording of all these racks; `show` gets the part that is done, 0 to 1.
 
     The notes on the times of racks are in its log. Of a single rack it is that rack's run.rrd.
@@ -47,9 +43,9 @@ def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], N
     recording.disconnect()
 
 
-def _note(stream: Stream, placed: Sequence[Placed]) -> None:
+def _note(stream: Stream, placed: Sequence[RackPlace]) -> None:
     for place in placed[1:]:
-        stream.at(0, place.line.epoch_ns, NOTES, rr.TextLog(place.note, level="INFO"))
+        stream.say(0, place.line.epoch_ns, "time line", place.note, "INFO")
 
 
 def _blocks(recording: Recording, last: int, block: int) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:

@@ -7,7 +7,7 @@ import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
 from rack.levels.timing.trace_times import execution_ns, is_missed, lateness_ns, newest_visible, response_ns
-from rack.tools.viewer.levels import LEVELS, LOG
+from rack.tools.viewer.levels import LEVELS
 from rack.tools.viewer.stream import Ints, RowBlock, Stream
 from rack.tools.viewer.style import LIMIT, PHASES, of_joint, style_lane, write_spans
 
@@ -106,8 +106,7 @@ class Misses:
 
     def _log(self, ticks: np.ndarray, stamp_ns: int) -> None:
         which = f"tick {ticks[0]}" if len(ticks) == 1 else f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
-        line = rr.TextLog(f"missed: {self._task}: {which}", level="WARN")
-        self._stream.at(int(ticks[0]), stamp_ns, (LOG, "misses"), line)
+        self._stream.say(int(ticks[0]), stamp_ns, "misses", f"missed: {self._task}: {which}", "WARN")
 
 
 class Age:

@@ -36,7 +36,7 @@ period_ms = 2.5
 
 [board.pulse]
 slot = 2
-rate_hz = 100
+rate_hz = 50
 executor = "lan_levels:Pulse"
 """
 ECHO = """

@@ -41,7 +41,7 @@ class Window:
         self.before(stretches)
         self.bytes += sum(stretch.size for stretch in stretches)
         found = [bytes(self.segment.view(*stretch)) for stretch in stretches]
-        return found, DeskAnswer(Code.GRANTED, time.monotonic_ns(), time.time_ns())
+        return found, DeskAnswer(Code.GRANTED, 0, time.monotonic_ns(), time.time_ns())
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +87,9 @@ def test_every_stretch_fetched_is_equal_byte_for_byte(ran: Segment) -> None:
 def test_a_monitor_sees_the_same_in_the_mirror(ran: Segment) -> None:
     mirror = mirrored(Window(ran))
     here, there = asdict(RackMonitor(mirror).look()), asdict(RackMonitor(ran).look())
-    # The launcher, this process, lives; the rack whose memory it was answers.
     assert here == there
     mirror.is_there = False
-    assert RackMonitor(mirror).look().run == "dead"
+    assert RackMonitor(mirror).look().run == "gone"
 
 
 def test_a_second_refresh_fetches_what_is_new_alone(ran: Segment) -> None:
@@ -194,7 +193,7 @@ def test_a_head_that_lies_is_refused(ran: Segment, word: Head, value: int) -> No
 def test_the_clocks_of_the_other_machine_are_known(ran: Segment) -> None:
     def elsewhere(stretches: Sequence[Stretch]) -> tuple[list[bytes], DeskAnswer]:
         found, _ = Window(ran)(stretches)
-        return found, DeskAnswer(Code.GRANTED, time.monotonic_ns() + 5_000_000_000, 7_000_000_000)
+        return found, DeskAnswer(Code.GRANTED, 0, time.monotonic_ns() + 5_000_000_000, 7_000_000_000)
 
     mirror = Mirror("far/rack", elsewhere)
     assert mirror.monotonic_offset_ns == pytest.approx(5e9, abs=1e9)

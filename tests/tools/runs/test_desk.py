@@ -20,6 +20,7 @@ from rack.tools.command import goal_of
 from rack.tools.console.answer import Failure
 from rack.tools.runs import desk
 from rack.tools.runs.desk import LiveDesk, Replies
+from rack.tools.runs.watched import LocalRack
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
@@ -82,7 +83,7 @@ def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     monkeypatch.setattr(Replies, "look", lambda replies: replace(replies.reply, fate="taken", taken_up=0))
     still = f", not done; in force until: rack command {running} upper resume$"
     with pytest.raises(Failure, match=f"^timed out after 0 s: command .*{still}"):
-        LiveDesk(running).give({"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0)
+        LiveDesk(LocalRack(running)).give({"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0)
     assert rack("command", running, "upper", "resume").returncode == 0
 
 
@@ -178,7 +179,7 @@ def test_a_clock_without_ticks_is_not_waited_for(
     # Launched and not started: there is a rack, and no clock yet.
     with Rack(load(path, [f"name={rack_name}"])):
         with pytest.raises(Failure, match="has not ticked for"):
-            LiveDesk(rack_name).give({"level": "upper", "what": "hold"}, wait=False)
+            LiveDesk(LocalRack(rack_name)).give({"level": "upper", "what": "hold"}, wait=False)
         assert OperatorTable(Segment.attach(rack_name)).waiting() == []
 
 

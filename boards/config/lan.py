@@ -1,0 +1,149 @@
+"""Mistakes in `[adapter.lan]` that concern what is exchanged, and the places of all mistakes of its board.
+
+The table makes a board, `lan`, which is checked like any other. A user knows it as `adapter.lan`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from rack.backplane.clock.system_clock import ticks_of
+from rack.backplane.errors import ClockError
+from rack.boards.adapters.adapter import STATUS
+from rack.boards.config.schema import LAN, LAN_ADAPTER, RackConfig
+from rack.boards.errors import Mistake
+from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
+from rack.levels.peer import peer_port
+
+if TYPE_CHECKING:
+    from rack.boards.config.layout import Wiring
+    from rack.boards.config.schema import LanConfig
+
+PLACE = "adapter.lan"
+ITSELF = f"board.{LAN}"
+INSTALL = "an exchange with other racks needs eclipse-zenoh: pip install 'nasrem-rack[lan]'"
+SLOWER = "over a network goes what the task and elemental-move levels exchange"
+_OWN = re.compile(rf"\bboard\.{LAN}(\.params)?(?=[.\[]|\b)")
+_MAILBOX = f"mailbox {LAN}."
+
+
+def lan_mistakes(config: RackConfig) -> Iterator[Mistake]:
+    """Yield the mistakes that show without the ports of the boards."""
+    table = config.adapter.lan
+    for name, board in config.board.items():
+        if board.executor == LAN_ADAPTER and (table is None or name != LAN):
+            yield Mistake(f"board.{name}.executor", board.executor, f"permitted: [{PLACE}], which makes its board")
+    if table is None:
+        return
+    if is_taken(config):
+        yield Mistake(ITSELF, None, f"[{PLACE}] makes the board of this name; rename the board, or leave one out")
+        return
+    yield from _names(table, config.name)
+    for key, entries in (("export", table.exports), ("import", table.imports)):
+        for port, entry in entries.items():
+            yield from _rate(f"{PLACE}.{key}.{port}", entry, table)
+    if config.clock.mode == "realtime":
+        yield from _priority(config, table)
+        if config.protocol.strict:
+            why = "what other racks send makes a run depend on timing, refused by protocol.strict = true"
+            yield Mistake(PLACE, None, f'{why}; permitted: clock.mode = "lockstep"')
+
+
+def is_taken(config: RackConfig) -> bool:
+    """Say whether another board has the name of the adapter's."""
+    return config.adapter.lan is not None and config.board[LAN] != config.adapter.lan.board()
+
+
+def _names(table: LanTable, rack: str) -> Iterator[Mistake]:
+    """Check names of racks and ports: none twice, none of this rack, none that the adapter itself needs."""
+    taken = {STATUS: "its status", **{peer_port(other): f"what it knows of rack '{other}'" for other in table.racks}}
+    for port, entry in table.imports.items():
+        place = f"{PLACE}.import.{port}"
+        if port in taken:
+            yield Mistake(place, None, f"the adapter writes {taken[port]} under this name; rename the port")
+        if entry.rack == rack:
+            yield Mistake(f"{place}.from", entry.source, "a mailbox of this rack itself: levels here read it directly")
+    for key, entries in (("export", table.exports), ("import", table.imports)):
+        for source, count in Counter(entry.source for entry in entries.values()).items():
+            if count > 1:
+                ports = ", ".join(port for port, entry in entries.items() if entry.source == source)
+                yield Mistake(f"{PLACE}.{key}", source, f"listed {count} times: {ports}; any number of levels may read")
+    if rack in table.peers:
+        yield Mistake(f"{PLACE}.peers", rack, "the name of this rack itself")
+    for port, count in Counter(map(peer_port, table.racks)).items():
+        if count > 1:
+            alike = [other for other in table.racks if peer_port(other) == port]
+            why = f"these names differ in '-' and '_' alone, so their mailboxes {LAN}.{port} are one; rename a rack"
+            yield Mistake(f"{PLACE}.peers", alike, why)
+
+
+def _rate(place: str, entry: ExportConfig | ImportConfig, table: LanConfig) -> Iterator[Mistake]:
+    cycle_ns = round(1e9 / table.rate_hz)
+    try:
+        every = ticks_of(entry.rate_hz, cycle_ns, "exchange", ("of the adapter", "cycle"))
+    except ClockError as error:
+        yield Mistake(f"{place}.rate_hz", entry.rate_hz, str(error))
+        return
+    if isinstance(entry, ImportConfig):
+        least_ms = (every + 1) * cycle_ns * 1e-6
+        if entry.max_age_ms < least_ms:
+            why = f"between two exchanges it gets as old as one of them and a cycle of the adapter, {least_ms:g} ms"
+            yield Mistake(f"{place}.max_age_ms", entry.max_age_ms, f"{why}; permitted: no less")
+
+
+def _priority(config: RackConfig, table: LanConfig) -> Iterator[Mistake]:
+    """Require a priority above the neighbours', if there are real-time ones: else others lose sight of this rack."""
+    others = [place for place in config.tasks() if place.core == table.core and place.board != LAN]
+    above = [f"{place.name} {place.priority}" for place in others if place.priority >= max(1, table.priority)]
+    if above:
+        why = f"must be above that of the other boards on core {table.core}, {', '.join(above)}"
+        yield Mistake(f"{PLACE}.priority", table.priority, f"{why}: else they keep it from its signs of life")
+
+
+def entry_mistakes(wiring: Wiring, has_clock: bool) -> Iterator[Mistake]:
+    """Yield the mistakes in what the entries name: mailboxes of this rack, and message types."""
+    config = wiring.config
+    table = config.adapter.lan
+    for port, export in table.exports.items() if table is not None else ():
+        for why in _export(wiring, export.source, has_clock):
+            yield Mistake(f"{PLACE}.export.{port}.from", export.source, why)
+    for port, entry in table.imports.items() if table is not None else ():
+        try:
+            entry.message_type()
+        except LookupError as error:
+            yield Mistake(f"{PLACE}.import.{port}.type", entry.type, str(error))
+
+
+def _export(wiring: Wiring, source: str, has_clock: bool) -> Iterator[str]:
+    """Yield why a mailbox cannot be exported. A queue is found with the other queues."""
+    config, board = wiring.config, source.partition(".")[0]
+    if board == LAN:
+        yield "written by the adapter itself; permitted: mailboxes that levels write"
+    elif source in wiring.operated:
+        yield "what an operator commands stays in its rack; permitted: mailboxes that levels write"
+    elif not wiring.is_known(source):
+        yield f"no such mailbox; mailboxes: {wiring.names()}"
+    elif source in wiring.writers and has_clock and board in config.board:
+        every = config.every(board) * wiring.writers[source][1].cycles
+        rate_hz = 1e9 / (every * config.clock_ns)
+        if rate_hz > FASTEST_HZ * (1 + 1e-9):
+            why = f"written at {rate_hz:g} Hz, and a loop that fast must not wait for a network"
+            yield f"{why}; permitted: up to {FASTEST_HZ:g} Hz: {SLOWER}"
+
+
+def at_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
+    """Return a mistake of the adapter's board with the place that its user knows."""
+    table = config.adapter.lan
+    if table is None or mistake.place == ITSELF:
+        return mistake
+    if mistake.place == f"{ITSELF}.executor":
+        return Mistake(PLACE, None, mistake.why if find_spec("zenoh") else INSTALL)
+    port = mistake.place.removeprefix(_MAILBOX)
+    if port != mistake.place and port in table.imports:
+        return Mistake(f"{PLACE}.import.{port}.type", table.imports[port].type, mistake.why)
+    return replace(mistake, place=_OWN.sub(PLACE, mistake.place), why=_OWN.sub(PLACE, mistake.why))

@@ -1,0 +1,88 @@
+"""A rack's link at work, for tests: `python -m tests.boards.lan.home RACK TABLE`, TABLE being JSON.
+
+It takes what comes every 5 ms, as an adapter does in its cycles, and sends a message for each export. To each line on
+stdin it answers with one of JSON: what has come so far. It ends with its stdin.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from typing import Any
+
+from rack.boards.lan.config import LanTable
+from rack.boards.lan.envelope import Envelope, Flaw
+from rack.boards.lan.keys import ask_keys, out_key
+from rack.boards.lan.link import LanLink
+
+HEAD = Envelope(1, 2, 3, 4, 5, 6, 7)
+PERIOD_S = 0.005
+LAUNCH = 7
+
+
+class Home:
+    """The link, and the counts of what has come: by key, all and what was good; questions; tokens."""
+
+    def __init__(self, rack: str, table: LanTable) -> None:
+        began = time.monotonic()
+        self._link = link = LanLink(rack, table)
+        self._opened_s = time.monotonic() - began
+        self._arrived = [link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()]
+        self._questions = link.answer(ask_keys(rack))
+        self._exports = [(key, link.publish(key)) for key in (out_key(rack, e.source) for e in table.exports.values())]
+        self._changes = link.watch_alive()
+        link.declare_alive(LAUNCH)
+        self._came, self._good, self._asked = Counter[str](), Counter[str](), Counter[str]()
+        self._tokens: list[str] = []
+        self._sizes = defaultdict[str, set[int]](set)
+
+    def cycle(self) -> None:
+        """Take what has come, and send."""
+        sealer = self._link.sealer
+        for take in self._arrived:
+            for key, envelope, payload in take():
+                self._came[key] += 1
+                self._sizes[key].add(len(payload))
+                self._good[key] += not isinstance(sealer.opened(key, envelope, payload), Flaw)
+        for question in self._questions():
+            self._asked[question.key] += 1
+            question.reply(b"answer", sealer.seal(question.key, HEAD, b"answer"))
+        for key, put in self._exports:
+            put(b"content", sealer.seal(key, HEAD, b"content"))
+        self._tokens += [f"{rack} {'came' if is_there else 'went'}" for rack, _, is_there in self._changes()]
+
+    def state(self) -> dict[str, Any]:
+        """Return what has come so far."""
+        flaws = {flaw.name: count for flaw, count in self._link.sealer.flaws.items()}
+        sizes = {key: sorted(found) for key, found in self._sizes.items()}
+        counts = {"came": self._came, "good": self._good, "asked": self._asked, "sizes": sizes}
+        own = {"connected": bool(self._link.session.info.peers_zid()), "opened_s": self._opened_s}
+        return {**counts, "flaws": flaws, "tokens": self._tokens, **own}
+
+
+def serve(cycle: Callable[[], None], state: Callable[[], dict[str, Any]], period_s: float) -> None:
+    """Cycle until stdin ends; answer each line there with the state, as JSON."""
+    due = time.monotonic()
+    while True:
+        if not select.select([sys.stdin], [], [], max(0.0, due - time.monotonic()))[0]:
+            cycle()
+            due = time.monotonic() + period_s
+        elif sys.stdin.readline():
+            sys.stdout.write(json.dumps(state()) + "\n")
+            sys.stdout.flush()
+        else:
+            return
+
+
+def main(rack: str, table: str) -> None:
+    """Be at home."""
+    home = Home(rack, LanTable.model_validate(json.loads(table)))
+    serve(home.cycle, home.state, PERIOD_S)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,92 @@
+"""Access control: which messages under which keys the rules allow, and to whom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from rack.boards.lan.access import TOKEN, WATCH_TOKENS, access_control
+from rack.boards.lan.config import LanTable
+
+TLS, TCP = "tls/10.0.0.1:7447", "tcp/127.0.0.1:7447"
+ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
+
+
+def rules(endpoint: str, asks: bool = False, **table: Any) -> Iterator[tuple[str, str, str, str]]:
+    """Yield flow, message, key and common name (* for anyone) of all that is allowed."""
+    found = access_control("home", LanTable.model_validate({"listen": (endpoint,), **table}), asks)
+    assert (found["enabled"], found["default_permission"]) == (True, "deny")
+    subjects = {subject["id"]: subject.get("cert_common_names", ["*"]) for subject in found["subjects"]}
+    by_id = {rule["id"]: rule for rule in found["rules"]}
+    assert len(by_id) == len(found["rules"])
+    for policy in found["policies"]:
+        for rule in map(by_id.__getitem__, policy["rules"]):
+            assert rule["permission"] == "allow"
+            for subject in policy["subjects"]:
+                for flow in rule["flows"]:
+                    for message in rule["messages"]:
+                        for key in rule["key_exprs"]:
+                            for name in subjects[subject]:
+                                yield flow, message, key, name
+
+
+def test_without_others_nothing_is_allowed_but_to_see_that_it_is_there() -> None:
+    assert list(rules(TLS)) == []
+    assert {message for _, message, *_ in rules(TCP)} == {*WATCH_TOKENS, *TOKEN}
+
+
+def test_over_tls_every_rule_is_for_one_certificate() -> None:
+    tables = {"export": {"pulse": {"from": "pulse.status"}}, "permit": {"anyone": ["watch"]}}
+    names = {name for *_, name in rules(TLS, peers=("friend",), **tables)}
+    assert names == {"friend", "anyone"}
+
+
+def test_puts_come_from_a_rack_itself_and_only_what_is_imported() -> None:
+    imports = {"own": {"from": "friend/pulse.status", **ENTRY}}
+    found = {
+        (key, name)
+        for flow, message, key, name in rules(TLS, **{"import": imports}, peers=("other",))
+        if (flow, message) == ("ingress", "put")
+    }
+    keys = ("step", "ping/home", "pong/home")
+    expected = {(f"rack/{name}/{key}", name) for name in ("friend", "other") for key in keys}
+    assert found == {*expected, ("rack/friend/out/pulse/status", "friend")}
+
+
+def test_what_goes_out_is_this_racks_own() -> None:
+    exports = {"pulse": {"from": "pulse.status"}}
+    out = [
+        key
+        for flow, message, key, _ in rules(TLS, export=exports, peers=("friend",))
+        if flow == "egress" and message in ("put", "liveliness_token", "reply", "declare_queryable")
+    ]
+    assert out
+    assert all(key.startswith("rack/home/") for key in out)
+    assert "rack/home/out/pulse/status" in out
+
+
+@pytest.mark.parametrize(("right", "asked"), [("watch", "read"), ("command", "command"), ("stop", "stop")])
+def test_a_right_permits_one_kind_of_question(right: str, asked: str) -> None:
+    found = list(rules(TLS, permit={"viewer": [right]}))
+    assert [key for _, message, key, _ in found if message == "query"] == [f"rack/home/ask/{asked}/viewer/**"]
+    assert not [key for _, message, key, _ in found if message in ("put", "declare_subscriber")]
+
+
+def test_no_message_deletes() -> None:
+    assert not [1 for _, message, *_ in rules(TCP, asks=True, peers=("friend",)) if message == "delete"]
+
+
+def test_without_tls_rules_hold_for_anyone_but_by_the_same_keys() -> None:
+    tables: dict[str, Any] = {"export": {"pulse": {"from": "pulse.status"}}, "permit": {"viewer": ["watch"]}}
+    known, unknown = ({rule[:3] for rule in rules(at, **tables, peers=("friend",))} for at in (TLS, TCP))
+    assert known == unknown
+    assert {name for *_, name in rules(TCP, **tables, peers=("friend",))} == {"*"}
+
+
+def test_who_asks_is_answered_and_sends_nothing() -> None:
+    found = list(rules(TLS, asks=True))
+    assert ("egress", "query", "rack/*/ask/*/home/**", "*") in found
+    assert ("ingress", "reply", "rack/*/ask/*/home/**", "*") in found
+    assert not [key for _, message, key, _ in found if message in ("put", "declare_subscriber")]

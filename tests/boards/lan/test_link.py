@@ -1,0 +1,115 @@
+"""The link as a process: what it opens, and what it bears. Real sessions."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.lan.keys import out_key
+from rack.tools.runs.window import free_port
+from tests.boards.lan.test_strangers import OWN, Program, Site, at_home, friend, running
+from tests.processes import wait_until
+
+LISTENS = "0A"
+"""State of a listening socket in /proc/net/tcp."""
+ZENOH_WAITS_S = 0.5
+"""Its `scouting/delay`."""
+PULSE = out_key("friend", "pulse.status")
+
+
+def sockets(pid: int) -> Iterator[tuple[str, str]]:
+    """Yield protocol and state of each socket of a process."""
+    own = set()
+    for fd in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError):
+            own.add(str(fd.readlink()))
+    for protocol in ("tcp", "tcp6", "udp", "udp6", "raw", "raw6"):
+        for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
+            state, inode = line.split()[3], line.split()[9]
+            if f"socket:[{inode}]" in own:
+                yield protocol, state
+
+
+@contextmanager
+def home(**table: Any) -> Iterator[Program]:
+    """Run a link until the end of the block."""
+    with running("home", "home", json.dumps(table)) as program:
+        yield program
+
+
+@pytest.mark.parametrize("table", [{}, {"peers": ["friend"]}], ids=["alone", "with a peer"])
+def test_nothing_listens_unless_the_config_says_so(table: dict[str, Any]) -> None:
+    with home(**table) as program:
+        assert program.state()["came"] == {}
+        assert list(sockets(program.pid)) == []
+
+
+def test_it_listens_where_the_config_says_and_sends_no_datagram() -> None:
+    with home(listen=[f"tcp/127.0.0.1:{free_port()}"]) as program:
+        assert program.state()["came"] == {}
+        assert list(sockets(program.pid)) == [("tcp", LISTENS)]
+
+
+def test_a_link_that_connects_does_not_listen() -> None:
+    port = free_port()
+    with home(listen=[f"tcp/127.0.0.1:{port}"]), home(connect=[f"tcp/127.0.0.1:{port}"]) as program:
+        wait_until(lambda: program.state()["connected"])
+        assert {protocol for protocol, _ in sockets(program.pid)} == {"tcp"}
+        assert LISTENS not in {state for _, state in sockets(program.pid)}
+
+
+def test_opening_waits_for_no_peer() -> None:
+    """A restarted board would come back late: zenoh by itself waits for a peer that is not there."""
+
+    def opened_s() -> float:
+        with home(connect=[f"tcp/127.0.0.1:{free_port()}"]) as program:
+            return float(program.state()["opened_s"])
+
+    assert any(opened_s() < ZENOH_WAITS_S for _ in range(3))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """A rack over TLS at home."""
+    with at_home(tmp_path_factory.mktemp("site")) as site:
+        yield site
+
+
+def crowd(site: Site, stack: ExitStack) -> None:
+    """Open connections that say nothing, and let as many fail their handshake."""
+    for _ in range(100):
+        stack.enter_context(socket.create_connection(("127.0.0.1", site.port)))
+        with socket.create_connection(("127.0.0.1", site.port)) as stranger:
+            stranger.sendall(b"GET / HTTP/1.1\r\n\r\n" + bytes(1000))
+
+
+def test_a_crowd_at_the_door_does_not_disturb_who_is_in(site: Site) -> None:
+    with ExitStack() as stack, running("strangers", json.dumps({"friend": friend(site)})) as others:
+        wait_until(lambda: others.state()["friend"]["heard"] and "friend came" in site.home.state()["tokens"])
+        before = site.home.state()["tokens"]
+        crowd(site, stack)
+        good, heard = site.home.state()["good"][PULSE], others.state()["friend"]["heard"][OWN]
+        wait_until(lambda: site.home.state()["good"][PULSE] > good + 10)
+        wait_until(lambda: others.state()["friend"]["heard"][OWN] > heard + 10)
+        assert site.home.state()["tokens"] == before
+
+
+def test_with_a_crowd_at_the_door_a_rack_still_goes_out_to_its_friends(site: Site) -> None:
+    """The door itself opens late: zenoh takes no connection for 0.1 s after each failed handshake."""
+    listening = {f"{way}/endpoints": [] for way in ("listen", "connect")}
+    listening["listen/endpoints"] = [f"tls/127.0.0.1:{site.friends_port}"]
+    outside = friend(site)
+    outside["settings"] |= listening
+    with ExitStack() as stack:
+        crowd(site, stack)
+        came, good = site.home.state()["tokens"].count("friend came"), site.home.state()["good"].get(PULSE, 0)
+        others = stack.enter_context(running("strangers", json.dumps({"friend": outside})))
+        wait_until(lambda: others.state()["friend"]["heard"])
+        wait_until(lambda: site.home.state()["good"].get(PULSE, 0) > good + 10)
+        assert site.home.state()["tokens"].count("friend came") > came

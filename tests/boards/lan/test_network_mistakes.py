@@ -1,0 +1,135 @@
+"""Mistakes in `[adapter.lan]` that concern security: one line each, before any process starts."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import load, loads, resolve, wire
+from rack.boards.config.files import CONFIGS
+from rack.boards.errors import ConfigError
+from rack.tools.lan.certificates import make_credentials
+from tests.boards.lan.racks import rack_text
+
+TLS = "tls/127.0.0.1:7447"
+SHAPE = "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535"
+
+
+def mistakes(folder: Path, listen: str = "", lan: str = "", connect: tuple[str, ...] = ()) -> list[str]:
+    """Return the mistakes of a rack with this endpoint and further lines of `[adapter.lan]`."""
+    path = folder / "rack.toml"
+    path.write_text(rack_text("cell", listen, connect, peers=["puma"], lan=lan))
+    try:
+        resolve(load(path))
+    except ConfigError as error:
+        return str(error).splitlines()
+    return []
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp/127.0.0.1:1", "tcp/127.9.9.9:65535", "tcp/localhost:7447", "tcp/[::1]:7447"],
+)
+def test_loopback_needs_no_tls(tmp_path: Path, endpoint: str) -> None:
+    assert mistakes(tmp_path, endpoint) == mistakes(tmp_path, connect=(endpoint,)) == []
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp/10.0.0.1:7447", "tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/cell.local:7447", "tcp/localhost.cell:7447"],
+)
+def test_beyond_loopback_tcp_is_refused_unless_asked_for_by_name(tmp_path: Path, endpoint: str) -> None:
+    why = (
+        "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an address of loopback, or by "
+        "name, adapter.lan.insecure = true"
+    )
+    assert mistakes(tmp_path, endpoint) == [f'adapter.lan.listen[0] = "{endpoint}": {why}']
+    assert mistakes(tmp_path, connect=(endpoint,)) == [f'adapter.lan.connect[0] = "{endpoint}": {why}']
+    assert mistakes(tmp_path, endpoint, "insecure = true") == []
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/127.0.0.1:0",
+        "tcp/127.0.0.1:65536",
+        "tcp/127.0.0.1",
+        "tcp/:7447",
+        "127.0.0.1:7447",
+        "udp/127.0.0.1:7447",
+        "tcp/127.0.0.1:7447#iface=eth0",
+        "tcp/127.0.0.1:7447?rel=0",
+        "tcp/a b:7447",
+        "tcp/127.0.0.1:٧٤٤٧",
+        "",
+    ],
+)
+def test_a_malformed_endpoint_is_one_line(tmp_path: Path, endpoint: str) -> None:
+    (line,) = mistakes(tmp_path, connect=(endpoint,))
+    assert line.startswith(f'adapter.lan.connect[0] = "{endpoint}": {SHAPE}')
+
+
+@pytest.mark.parametrize("host", ["127.1", "300.0.0.1", "2130706433", "[1::2::3]"])
+def test_what_looks_like_an_address_must_be_one(tmp_path: Path, host: str) -> None:
+    (line,) = mistakes(tmp_path, f"tcp/{host}:7447")
+    assert f"'{host.strip('[]')}' is no address" in line
+
+
+def test_tls_needs_certificates(tmp_path: Path) -> None:
+    (line,) = mistakes(tmp_path, TLS)
+    assert line == "adapter.lan.certificates: missing; TLS needs them: see rack lan certificates --help"
+
+
+def test_flaws_of_all_files_come_with_the_other_mistakes(tmp_path: Path) -> None:
+    (tmp_path / "certs").mkdir()
+    lines = mistakes(tmp_path, TLS, 'certificates = "certs"', connect=("tcp/127.0.0.1:7448",))
+    assert lines[0].startswith('adapter.lan.connect[0] = "tcp/127.0.0.1:7448": without TLS, which others have')
+    files = ("authority.pem", "cell.pem", "cell-key.pem", "secret")
+    why = f"missing; see rack lan certificates --help; in {tmp_path}/certs"
+    assert lines[1:] == [f"adapter.lan.certificates: {name}: {why}" for name in files]
+
+
+def test_certificates_are_found_next_to_the_config_from_anywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
+    monkeypatch.chdir("/")
+    assert mistakes(tmp_path, TLS, 'certificates = "certs"') == []
+    config = load(tmp_path / "rack.toml")
+    assert loads(config.text()) == config
+    os.chdir(tmp_path)
+    (line,) = mistakes(tmp_path, TLS.replace("127.0.0.1", "127.0.0.2"), 'certificates = "certs"')
+    assert "cell.pem: not for address 127.0.0.2; for 127.0.0.1" in line
+
+
+def test_a_recorded_config_can_be_wired_where_its_certificates_are_not(tmp_path: Path) -> None:
+    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
+    assert mistakes(tmp_path, TLS, 'certificates = "certs"') == []
+    text = load(tmp_path / "rack.toml").text()
+    (tmp_path / "certs/secret").unlink()
+    assert wire(loads(text)).task("lan").every > 0
+    with pytest.raises(ConfigError, match="secret"):
+        resolve(loads(text))
+
+
+def test_nobody_could_import_over_tls_without_being_named(tmp_path: Path) -> None:
+    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
+    path = tmp_path / "rack.toml"
+    path.write_text(rack_text("cell", TLS, (), lan='certificates = "certs"'))
+    with pytest.raises(ConfigError, match=r"adapter\.lan\.peers: missing; with TLS only racks"):
+        resolve(load(path))
+
+
+def test_a_certificate_cannot_be_checked_for_an_address_of_ipv6(tmp_path: Path) -> None:
+    make_credentials(tmp_path / "certs", {"cell": ["::1"]}, 1)
+    own = 'certificates = "certs"'
+    assert mistakes(tmp_path, "tls/[::1]:7447", own) == []
+    (line,) = mistakes(tmp_path, "", own, connect=("tls/[::1]:7447",))
+    assert "permitted: a host name, or an address of IPv4" in line
+
+
+def test_bundled_configs_bring_no_certificates() -> None:
+    assert not list(CONFIGS.rglob("*.pem"))
+    assert not list(CONFIGS.rglob("secret"))

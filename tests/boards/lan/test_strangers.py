@@ -1,0 +1,233 @@
+"""Strangers on the network: a rack over TLS, and sessions that are not what they should be, in other processes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from rack.boards.lan.credentials import Credentials
+from rack.boards.lan.keys import out_key
+from rack.tools.lan.certificates import make_credentials
+from rack.tools.runs.window import free_port
+from tests.processes import BOUND_S, wait_until
+
+ROOT = Path(__file__).resolve().parents[3]
+MOST = 1000
+IMPORTED = ("friend/pulse.status", "liar/pulse.status", "liar/second.status", "mole/pulse.status", "heavy/pulse.status")
+NAMES = ("friend", "liar", "mole", "heavy", "viewer", "nobody")
+OWN, TOKEN = "rack/home/out/pulse/status", "rack/home/alive/0000000000000007"
+READ, COMMAND, STOP = (f"rack/home/ask/{what}/viewer" for what in ("read", "command", "stop"))
+STRANGER = "rack/home/ask/read/nobody"
+ROUNDS = 10
+"""Rounds of sending after everyone who may connect has."""
+
+
+def pulse(name: str) -> str:
+    """Return the key of a rack's pulse."""
+    return out_key(name, "pulse.status")
+
+
+class Program:
+    """A program that answers each line with one of JSON."""
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        command = [sys.executable, "-m", f"tests.boards.lan.{module}", *arguments]
+        self._process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.pid = self._process.pid
+
+    def state(self) -> dict[str, Any]:
+        """Return what it has got so far."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        return dict(json.loads(self._process.stdout.readline()))
+
+    def end(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.communicate(timeout=BOUND_S)
+
+
+@contextmanager
+def running(module: str, *arguments: str) -> Iterator[Program]:
+    """Run a program until the end of the block."""
+    program = Program(module, *arguments)
+    try:
+        yield program
+    finally:
+        program.end()
+
+
+@dataclass(frozen=True)
+class Site:
+    """A rack at home, its credentials, and the port on which it looks for friend."""
+
+    folder: Path
+    port: int
+    friends_port: int
+    home: Program
+
+    def mutual(self, name: str, folder: str = "set") -> dict[str, Any]:
+        """Return settings of a session that shows the certificate of a name."""
+        own = Credentials(self.folder / folder, name)
+        files = {"certificate": str(own.certificate), "private_key": str(own.key)}
+        shown = {f"{side}_{key}": file for side in ("connect", "listen") for key, file in files.items()}
+        return self._over("tls", {"enable_mtls": True, **shown})
+
+    def bare(self, protocol: str) -> dict[str, Any]:
+        """Return settings of a session without a certificate."""
+        return self._over(protocol, {})
+
+    def secret(self, folder: str = "set") -> str:
+        """Return the secret of the seals."""
+        return Credentials(self.folder / folder, "friend").secret.hex()
+
+    def _over(self, protocol: str, tls: dict[str, Any]) -> dict[str, Any]:
+        tls = {"root_ca_certificate": str(self.folder / "set/authority.pem"), **tls}
+        return {"connect/endpoints": [f"{protocol}/127.0.0.1:{self.port}"], "transport/link/tls": tls}
+
+
+@contextmanager
+def at_home(folder: Path) -> Iterator[Site]:
+    """Run a rack over TLS that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
+    for each in ("set", "forged"):
+        make_credentials(folder / each, {name: ["127.0.0.1"] for name in ("home", *NAMES)}, 1)
+    port, friends_port = free_port(), free_port()
+    entry = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
+    table = {
+        "listen": [f"tls/127.0.0.1:{port}"],
+        "connect": [f"tls/127.0.0.1:{friends_port}"],
+        "certificates": str(folder / "set"),
+        "most_bytes": MOST,
+        "permit": {"viewer": ["watch"], "friend": ["stop"]},
+        "export": {"pulse": {"from": "pulse.status"}},
+        "import": {f"port{at}": {"from": source, **entry} for at, source in enumerate(IMPORTED)},
+    }
+    with running("home", "home", json.dumps(table)) as home:
+        yield Site(folder, port, friends_port, home)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """The rack at home."""
+    with at_home(tmp_path_factory.mktemp("site")) as site:
+        yield site
+
+
+def friend(site: Site) -> dict[str, Any]:
+    """Return the session of a rack that does nothing wrong."""
+    return {
+        "settings": site.mutual("friend"),
+        "secret": site.secret(),
+        "puts": [(pulse("friend"), 100, pulse("friend"))],
+        "listens": [OWN],
+        "asks": ["rack/home/ask/stop/friend"],
+        "token": "rack/friend/alive/9",
+    }
+
+
+def sessions(site: Site) -> dict[str, dict[str, Any]]:
+    """Return a friend's session and those of strangers."""
+    secret = {"secret": site.secret()}
+    eager = {**secret, "puts": [(pulse("friend"), 99, pulse("friend"))], "listens": ["**", OWN], "asks": [STRANGER]}
+    own = [(pulse(name), 99, pulse(name)) for name in ("nobody", "viewer", "home")]
+    liar, second = pulse("liar"), out_key("liar", "second.status")
+    lies = [(liar, 100, None), (liar, MOST + 1, liar), (second, 100, liar), *eager["puts"], *own]
+    heavy = [(pulse("heavy"), size, pulse("heavy")) for size in (100, 1 << 20)]
+    asks = [READ, COMMAND, STOP, "rack/home/ask/stop/friend", "rack/home/ask/**"]
+    return {
+        "friend": friend(site),
+        "bare": {"settings": site.bare("tls"), "fails": True, **eager},
+        "plain": {"settings": site.bare("tcp"), "fails": True, **eager},
+        "forged": {"settings": site.mutual("friend", "forged"), "fails": True, **eager},
+        "nobody": {"settings": site.mutual("nobody"), **eager, "puts": [*eager["puts"], *own]},
+        "viewer": {"settings": site.mutual("viewer"), **eager, "puts": [*eager["puts"], *own], "asks": asks},
+        "liar": {"settings": site.mutual("liar"), **secret, "puts": [*lies, (liar, 100, liar)]},
+        "mole": {"settings": site.mutual("mole"), "puts": [(pulse("mole"), 9, pulse("mole"))], "secret": "00" * 32},
+        "heavy": {"settings": site.mutual("heavy"), **secret, "puts": heavy},
+    }
+
+
+class Found(NamedTuple):
+    """What home and each session have got in the end."""
+
+    home: dict[str, Any]
+    of: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def found(site: Site) -> Found:
+    """What everyone has got after each who may connect has sent for some rounds."""
+    with running("strangers", json.dumps(sessions(site))) as others:
+
+        def everyone_has_acted() -> bool:
+            home, of = site.home.state(), others.state()
+            senders = (pulse(name) for name in ("friend", "liar", "mole", "heavy"))
+            return (
+                all(home["came"].get(key, 0) > ROUNDS for key in senders)
+                and all(of["friend"][got] for got in ("heard", "answers", "tokens"))
+                and of["viewer"]["answers"].get(READ, 0) > 1
+                and of["nobody"]["connected"]
+            )
+
+        wait_until(everyone_has_acted)
+        good = site.home.state()["good"][pulse("friend")]
+        wait_until(lambda: site.home.state()["good"][pulse("friend")] > good + ROUNDS)
+        return Found(site.home.state(), others.state())
+
+
+def test_a_friend_is_heard_answered_and_shown_who_is_there(found: Found) -> None:
+    assert found.home["good"][pulse("friend")] == found.home["came"][pulse("friend")]
+    assert set(found.of["friend"]["tokens"]) >= {TOKEN}
+    assert "friend came" in found.home["tokens"]
+
+
+@pytest.mark.parametrize("name", ["bare", "plain", "forged"])
+def test_who_shows_no_certificate_of_ours_is_not_connected(found: Found, name: str) -> None:
+    assert found.of[name] == {"heard": {}, "tokens": {}, "answers": {}, "connected": False}
+
+
+def test_a_certificate_of_ours_without_a_right_gets_nothing(found: Found) -> None:
+    assert found.of["nobody"] == {"heard": {}, "tokens": {}, "answers": {}, "connected": True}
+    assert STRANGER not in found.home["asked"]
+
+
+def test_whoever_may_watch_may_do_nothing_else(found: Found) -> None:
+    viewer = found.of["viewer"]
+    assert set(viewer["answers"]) == {READ}
+    assert viewer["heard"] == {}
+    # That others are there only home may know.
+    assert set(viewer["tokens"]) == {TOKEN}
+    assert set(found.home["asked"]) == {READ, "rack/home/ask/stop/friend"}
+
+
+def test_nobody_sends_under_another_name(found: Found) -> None:
+    # Friend sends 100 bytes, all others 99 under its key: those would be good.
+    assert set(found.home["came"]) == {out_key(*source.split("/")) for source in IMPORTED}
+    assert found.home["sizes"][pulse("friend")] == [100]
+
+
+def test_what_is_sealed_wrongly_is_counted_by_cause_and_not_taken(found: Found) -> None:
+    home, second = found.home, out_key("liar", "second.status")
+    assert min(home["flaws"].values()) > ROUNDS / 2
+    assert home["came"][second] > ROUNDS / 2
+    assert home["good"][second] == 0
+    assert 0 < home["good"][pulse("liar")] < home["came"][pulse("liar")]
+
+
+def test_a_seal_with_another_secret_does_not_fit(found: Found) -> None:
+    assert found.home["good"][pulse("mole")] == 0 < found.home["came"][pulse("mole")]
+
+
+def test_a_huge_message_is_not_put_together(found: Found) -> None:
+    assert found.home["good"][pulse("heavy")] == found.home["came"][pulse("heavy")] > 0
+    assert found.home["sizes"][pulse("heavy")] == [100]

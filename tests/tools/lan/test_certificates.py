@@ -1,0 +1,119 @@
+"""`rack lan certificates` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import stat
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from rack.boards.lan.credentials import Credentials
+from tests.tools.command_line import rack
+
+SHARED = ["authority.pem", "authority-key.pem", "secret"]
+
+
+def test_a_set_is_made_for_every_name(tmp_path: Path) -> None:
+    folder = tmp_path / "new/certs"
+    done = rack("lan", "certificates", folder, "--for", "cell=10.0.0.1,cell.local", "--for", "operator")
+    assert (done.returncode, done.stderr) == (0, "")
+    names = [*SHARED, "cell.pem", "cell-key.pem", "operator.pem", "operator-key.pem"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(names)
+    assert list(Credentials(folder, "cell").flaws(["10.0.0.1", "cell.local"])) == []
+    assert list(Credentials(folder, "operator").flaws()) == []
+    assert "A set for tests" in done.stdout
+    assert "Each machine needs only authority.pem, secret, and its own pair" in done.stdout
+
+
+def test_only_its_owner_may_read_it(tmp_path: Path) -> None:
+    rack("lan", "certificates", tmp_path / "certs", "--for", "cell")
+    assert stat.S_IMODE((tmp_path / "certs").stat().st_mode) == 0o700
+    assert {stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "certs").iterdir()} == {0o600}
+
+
+def test_it_is_valid_for_a_year_or_as_long_as_asked(tmp_path: Path) -> None:
+    for at, (days, options) in enumerate([(365, ()), (3, ("--days", 3))]):
+        rack("lan", "certificates", tmp_path / str(at), "--for", "cell", *options)
+        for name in ("cell.pem", "authority.pem"):
+            found = x509.load_pem_x509_certificate((tmp_path / str(at) / name).read_bytes())
+            left = found.not_valid_after_utc - datetime.now(UTC)
+            assert abs(left - timedelta(days=days)) < timedelta(hours=1)
+
+
+def test_names_are_added_by_the_same_authority(tmp_path: Path) -> None:
+    rack("lan", "certificates", tmp_path, "--for", "cell", "--days", 2)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    done = rack("lan", "certificates", tmp_path, "--for", "puma=10.0.0.2", "--json")
+    answer = json.loads(done.stdout)
+    assert answer["made"] == ["puma.pem", "puma-key.pem"]
+    assert answer["names"] == {"puma": ["10.0.0.2"]}
+    # Not longer than its authority.
+    assert datetime.fromisoformat(answer["expires"]) < datetime.now(UTC) + timedelta(days=2)
+    assert list(Credentials(tmp_path, "puma").flaws(["10.0.0.2"])) == []
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    rack("lan", "certificates", tmp_path, "--for", "cell")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    done = rack("lan", "certificates", tmp_path, "--for", "puma", "--for", "cell")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"{tmp_path}: cell.pem, cell-key.pem exist already; nothing is overwritten\n"
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("lost", SHARED)
+def test_a_set_that_is_not_whole_is_not_added_to(tmp_path: Path, lost: str) -> None:
+    rack("lan", "certificates", tmp_path, "--for", "cell")
+    (tmp_path / lost).unlink()
+    done = rack("lan", "certificates", tmp_path, "--for", "puma")
+    assert done.returncode == 2
+    assert f"{lost} missing" in done.stderr
+    assert not (tmp_path / "puma.pem").exists()
+
+
+def test_another_key_does_not_sign_for_the_authority(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        rack("lan", "certificates", tmp_path / name, "--for", "cell")
+    (tmp_path / "a/authority-key.pem").write_bytes((tmp_path / "b/authority-key.pem").read_bytes())
+    done = rack("lan", "certificates", tmp_path / "a", "--for", "puma")
+    assert done.returncode == 2
+    assert "authority-key.pem is not the key of authority.pem" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ("Cell", "permitted names"),
+        ("", "permitted names"),
+        ("../cell", "permitted names"),
+        ("authority", "a file of the set would have this name"),
+        ("cell-key", "a file of the set would have this name"),
+        ("cell=", "permitted: NAME, or NAME=ADDRESS"),
+        ("cell=10.0.0.1,", "permitted: NAME, or NAME=ADDRESS"),
+        ("cell=300.0.0.1", "permitted: NAME, or NAME=ADDRESS"),
+        ("cell=*.local", "permitted: NAME, or NAME=ADDRESS"),
+        ("cell=10.0.0.1:7447", "permitted: NAME, or NAME=ADDRESS"),
+    ],
+)
+def test_a_name_or_address_that_cannot_be_is_one_line(tmp_path: Path, given: str, why: str) -> None:
+    done = rack("lan", "certificates", tmp_path / "certs", "--for", given)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f'--for = "{given}": {why}')
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "certs").exists()
+
+
+def test_a_name_given_twice_is_refused(tmp_path: Path) -> None:
+    done = rack("lan", "certificates", tmp_path / "certs", "--for", "cell", "--for", "cell=10.0.0.1")
+    assert (done.returncode, done.stderr) == (2, '--for = "cell=10.0.0.1": cell is named twice\n')
+
+
+def test_a_file_in_place_of_the_folder_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "certs").write_text("")
+    done = rack("lan", "certificates", tmp_path / "certs", "--for", "cell")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
