@@ -176,4 +176,5 @@ class LanAdapter(Adapter):
     def close(self) -> None:
         """Leave the network."""
         if self._link is not None:
+            self._desk.close()
             self._link.close()
