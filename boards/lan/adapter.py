@@ -52,6 +52,7 @@ class LanAdapter(Adapter):
         self._exports: dict[str, Export] = {}
         self._imports: dict[str, Import] = {}
         self._link: LanLink | None = None
+        self._flaws: Sequence[int] = ()
         self._barrier: Barrier | None = None
 
     @classmethod
@@ -104,12 +105,14 @@ class LanAdapter(Adapter):
             for port, entry in self._imports.items():
                 entry.resume(getattr(before.value, f"import_{port}"), status.newest)
             self._desk.resume(before.value.desk)
+            self._flaws = before.value.flaws.tolist()
         if self._grid.is_lockstep and table.racks:
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
+        link.sealer.resume(self._flaws)
         barrier, way = self._barrier, self._barrier or link
         for entry in self._imports.values():
             entry.open(way, link.sealer, self._grid)
@@ -180,6 +183,8 @@ class LanAdapter(Adapter):
             out = getattr(write, peer_port(peer.rack))
             self._clocks.fill(out, peer.rack, tick)
             peer.fill(out, self._grid.is_lockstep)
+        if self._link is not None and not self._grid.is_lockstep:
+            status.flaws[...] = tuple(self._link.sealer.flaws.values())
         status.reason = reason = self._trouble(tick)
         status.state = State.HOLDING if reason else State.EXECUTING
 
@@ -190,6 +195,8 @@ class LanAdapter(Adapter):
                 return f"rack '{peer.rack}' is {'lost' if peer.launches else 'not there yet'}"
             if len(peer.tokens) > 1:
                 return f"{len(peer.tokens)} racks are named '{peer.rack}'"
+            if self._clocks.is_unanswered(peer, tick):
+                return f"clock of rack '{peer.rack}' is not known: it does not answer pings"
         old = [port for port, entry in self._imports.items() if entry.is_old(tick)]
         return f"'{self._table.imports[old[0]].source}' is older than max_age_ms" if old else ""
 
@@ -198,4 +205,5 @@ class LanAdapter(Adapter):
         if self._barrier is not None:
             self._barrier.close()
         if self._link is not None:
+            self._desk.close()
             self._link.close()

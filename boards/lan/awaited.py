@@ -9,7 +9,7 @@ from enum import IntEnum
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
-GIVE_UP_S = 10.0
+GIVE_UP_S = 20.0
 """Real time after which a rack whose adapter is gone counts as lost; a restarted board is back sooner."""
 _PLACES = 8
 

@@ -7,6 +7,7 @@ empty secret it detects damage only.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntEnum
 from hashlib import blake2b
 from hmac import compare_digest
@@ -56,8 +57,14 @@ class Sealer:
         self.flaws = dict.fromkeys(Flaw, 0)
 
     def taking(self, most_bytes: int) -> Sealer:
-        """Return one with the same secret and another limit."""
-        return Sealer(self._secret, most_bytes)
+        """Return one with the same secret, another limit, and common counts."""
+        sealer = Sealer(self._secret, most_bytes)
+        sealer.flaws = self.flaws
+        return sealer
+
+    def resume(self, flaws: Iterable[int]) -> None:
+        """Count on from the flaws that a predecessor has found."""
+        self.flaws |= zip(Flaw, flaws, strict=False)
 
     def seal(self, key: str, head: Envelope, payload: bytes | memoryview) -> bytes:
         """Return the envelope of a payload to be sent under a key expression."""
