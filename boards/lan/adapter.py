@@ -168,10 +168,13 @@ class LanAdapter(Adapter):
                 return f"rack '{peer.rack}' is {'lost' if peer.launches else 'not there yet'}"
             if len(peer.tokens) > 1:
                 return f"{len(peer.tokens)} racks are named '{peer.rack}'"
+            if self._clocks.is_unanswered(peer, tick):
+                return f"clock of rack '{peer.rack}' is not known: it does not answer pings"
         old = [port for port, entry in self._imports.items() if entry.is_old(tick)]
         return f"'{self._table.imports[old[0]].source}' is older than max_age_ms" if old else ""
 
     def close(self) -> None:
         """Leave the network."""
         if self._link is not None:
+            self._desk.close()
             self._link.close()
