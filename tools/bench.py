@@ -378,9 +378,9 @@ def lan(
     bare UDP, and the DDS `cyclonedds`. A rack seals its messages and sees who is there; UDP does neither.
 
     The output shows round trips, ages of messages when a cycle takes them, bytes a second on the coordinator's cable,
-    and the time to see that a cable is pulled, plugged in again, or a process killed; also messages that never came,
-    and deaths that were none. All machines share the cores of this one: with many racks the processor is the limit, not
-    the network. `cyclictest` shows how late the machine itself wakes up.
+    processor time, and the time to see that a cable is pulled, plugged in again, or a process killed; also messages
+    that never came, and deaths that were none. All machines share the cores of this one: with many racks the processor
+    is the limit, not the network. `cyclictest` shows how late the machine itself wakes up.
 
     \b
     Examples:

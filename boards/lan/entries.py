@@ -89,7 +89,6 @@ class Import:
         self._is_away, self._losses = bool(self._box[self._word] & 1), peer.losses
         self._rate_hz, self.every = table.rate_hz, 1
         self._basis: int | None = None
-        self._newest: Envelope | None = None
         # What came before its time, with the tick at which it came.
         self._early: list[tuple[int, Arrived]] = []
         self.count = ImportCount()
@@ -115,9 +114,6 @@ class Import:
         """Void what is here, or keep it, if its rack has been lost since the last look."""
         if self._peer.losses != self._losses:
             self._losses = self._peer.losses
-            if self._newest is not None:
-                self._newest = None
-                self.count.strange += 1
             if not self._is_away:
                 self._switch(True, tick + self._delay if self._grid.is_lockstep else tick)
 
@@ -127,16 +123,15 @@ class Import:
     def exchange(self, out: Message, tick: int) -> None:
         """Take what has come, and pass the newest good message on."""
         early, self._early = self._early, []
+        newest: Envelope | None = None
         for came, arrived in chain(early, zip(repeat(tick), self._arrived(), strict=False)):
             head = self._opened(arrived)
             if head is not None and self._is_due(head, arrived, came, tick) and self._is_next(head, arrived.payload):
-                self.count.overtaken += self._newest is not None
-                self._newest = head
-        newest = self._newest
-        # Its age decides: until the clocks have been compared it is kept, as it may be long too old.
-        if newest is None or (basis := self._grid.tick_of(newest, self._peer, tick)) is None:
+                self.count.overtaken += newest is not None
+                newest = head
+        if newest is None:
             return
-        self._newest = None
+        basis = self._grid.tick_of(newest, self._peer, tick)
         if tick - basis > self._max_age:
             self.count.late += 1
             return

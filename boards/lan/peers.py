@@ -71,8 +71,9 @@ class PeerRack:
             return
         if launch not in self.tokens:
             self.tokens.append(launch)
-        if launch == self.launch and self.is_there:
-            self.confirm_by = -1
+        if self.is_there and self.launch in (NONE, launch):
+            # Without a number it was resumed in lockstep, where launches are not on record.
+            self.launch, self.confirm_by = launch, -1
         else:
             self._enters(launch, tick)
 

@@ -9,11 +9,8 @@ from rack.levels.level import Executor, Input, LevelContext, Ports, Program, Rea
 from rack.levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
 from rack.levels.operator import BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Goal, Operation, Orders
 from rack.levels.tables import read_params
-from rack.levels.task.program import AnyAction, TaskConfig, TaskParams, read_program
+from rack.levels.task.program import ROUNDING_S, AnyAction, TaskConfig, TaskParams, read_program
 from rack.levels.task.window import Detour, ShownWindow
-
-ROUNDING_S = 1e-9
-"""Margin of times against deadlines: ticks times the clock's period are not exact."""
 
 
 class TaskExecutor(Executor):

@@ -14,7 +14,7 @@ from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WO
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
-from rack.levels.task.program import TaskConfig, TaskParams, read_program
+from rack.levels.task.program import ROUNDING_S, TaskConfig, TaskParams, read_program
 from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times, pipeline_periods
 
 FIRST_PLAN = 1
@@ -139,7 +139,7 @@ class TaskPlanner(Planner):
         finish_s = finish_times(moves, visible_s, self._periods, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):
             action, earliest_s = self._program.action[move.action], finished_s + self._ahead_s
-            if move.by_s and action.by is not None and earliest_s > action.by:
+            if move.by_s and action.by is not None and earliest_s > action.by + ROUNDING_S:
                 write.earliest = earliest_s
                 text = f"action {move.action}, {action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"
                 raise Refused(Error.TOO_LATE, text)

@@ -12,6 +12,8 @@ from rack.levels.level import Program
 from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
 
 Vector = tuple[Finite, Finite, Finite]
+ROUNDING_S = 1e-9
+"""Margin of times against deadlines: ticks times the clock's period are not exact."""
 DOWN = (0.0, 0.0, -1.0)
 """Direction of the tool's z axis when none is given."""
 

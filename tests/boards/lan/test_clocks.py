@@ -214,8 +214,8 @@ def found(process: subprocess.Popen[bytes]) -> dict[str, Any]:
 def compared(name: str, port: int, *within: str, through: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what two machines find of each other; the second runs `within` a command, and calls `through` a port."""
     names = (f"{name}-a", f"{name}-b")
-    here = {"listen": [f"tcp/127.0.0.1:{port}"], "insecure": True}
-    there = {"connect": [f"tcp/127.0.0.1:{through or port}"], "insecure": True}
+    here = {"listen": [f"tcp/127.0.0.1:{port}"], "peers": [names[1]], "insecure": True}
+    there = {"connect": [f"tcp/127.0.0.1:{through or port}"], "peers": [names[0]], "insecure": True}
     with machine(names, here) as one, machine(names[::-1], there, *within) as other:
         return found(one), found(other)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -29,7 +28,7 @@ def sockets(pid: int) -> Iterator[tuple[str, str]]:
     own = set()
     for fd in Path(f"/proc/{pid}/fd").iterdir():
         with suppress(FileNotFoundError):
-            own.add(os.readlink(fd))
+            own.add(str(fd.readlink()))
     for protocol in ("tcp", "tcp6", "udp", "udp6", "raw", "raw6"):
         for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
             state, inode = line.split()[3], line.split()[9]

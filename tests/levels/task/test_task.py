@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rack.backplane.message import REASON_BYTES, State
+from rack.backplane.message import REASON_BYTES, Message, State
 from rack.levels.errors import Refused
-from rack.levels.messages import Error, Verb
+from rack.levels.messages import TASK_PLAN, Error, Verb
 from rack.levels.planning.motion_planner import MotionPlanner
-from rack.levels.planning.moves import Situation
+from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.pose import Pose
-from rack.levels.task import read_program
+from rack.levels.task import TaskPlanner, read_program
 from rack.levels.task.actions import rehearse
 from rack.levels.task.program import TaskParams
 from rack.levels.task.rehearsal import PipelinePeriods, Rehearsal, Rehearsed, finish_times
@@ -175,3 +175,13 @@ def test_arm_takes_the_time_that_it_is_given() -> None:
     assert rack.run_to_end(15.0).state == State.DONE
     # Done at the task level by then, and not a cycle of its own before.
     assert 9.0 < rack.seconds <= 10.0 + 1.0
+
+
+def test_time_of_another_rack_is_not_refused_for_the_rounding_of_its_offset() -> None:
+    rack = WholeRack(actions=[{**HOME, "by": 20.0}])
+    planner = rack.tasks["task.planner"].level
+    assert isinstance(planner, TaskPlanner)
+    home = Move(1, 0, Verb.MOVE_JOINTS, None, Pose(np.zeros(3), np.zeros(4)), np.zeros(6), False, 0.0)
+    for offset in np.random.default_rng(1).uniform(-20.0, 0.0, 200):
+        planner._ahead_s = float(offset)  # the move is slowed down to end just in time
+        planner._promise(planner._with_times([Rehearsed(home, 1.0)]), 0.0, Message(TASK_PLAN.dtype(rack.sizes)))

@@ -1,0 +1,48 @@
+"""A rack that floods: `python -m tests.boards.lan.flooder NAME ENDPOINT VICTIM` sends what is no message, all the time.
+
+It is there as any rack is, and floods its mailbox `pulse.status`; of `calm.status` it sends a proper message now and
+then. It ends with its stdin.
+"""
+
+from __future__ import annotations
+
+import select
+import sys
+import time
+
+from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.message import Message
+from rack.boards.config.layout import field_specs
+from rack.boards.lan.config import LanTable
+from rack.boards.lan.envelope import Envelope, kind_of
+from rack.boards.lan.keys import out_key
+from rack.boards.lan.link import LanLink
+from tests.boards.lan.lan_levels import PULSE
+
+LAUNCH = 7
+CALM_NS = 20_000_000
+"""Time between two messages that are not part of the flood."""
+BURST = 64
+
+
+def main(name: str, endpoint: str, victim: str) -> None:
+    """Flood."""
+    exports = {port: {"from": f"{port}.status"} for port in ("pulse", "calm")}
+    link = LanLink(name, LanTable.model_validate({"connect": (endpoint,), "peers": (victim,), "export": exports}))
+    flood, calm = (link.publish(out_key(name, f"{port}.status")) for port in ("pulse", "calm"))
+    dtype = message_dtype(field_specs(PULSE, {}), PULSE.dtype({}).itemsize)
+    message, kind, number, due = Message(dtype), kind_of("pulse", 1, dtype), 0, 0
+    link.declare_alive(LAUNCH)
+    while not select.select([sys.stdin], [], [], 0)[0]:
+        for at in range(BURST):
+            flood(bytes(at), b"flood")
+        if (now := time.monotonic_ns()) >= due:
+            number, due, message.count = number + 1, now + CALM_NS, number
+            payload = bytes(message.raw)
+            head = Envelope(kind, LAUNCH, number, number, 0, 0, now)
+            calm(payload, link.sealer.seal(out_key(name, "calm.status"), head, payload))
+    link.close()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,424 @@
+"""What levels read of another rack's mailbox: verdicts, loss and age, whatever the network does to its messages."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from rack.backplane.mailbox.mailbox import Verdict
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.watch.alarms import AlarmWriter
+from rack.backplane.watch.silence_watch import ReadingTask
+from rack.backplane.watch.watched_reader import watched
+from rack.backplane.words import Block, System
+from rack.boards.config.resolved import loads, wire
+from rack.boards.config.toml import override, parse, to_toml
+from rack.boards.lan.adapter import LanAdapter
+from rack.boards.lan.entries import Export, Import
+from rack.boards.lan.envelope import Envelope, Sealer, kind_of
+from rack.boards.lan.grid import OwnGrid
+from rack.boards.lan.keys import out_key
+from rack.boards.lan.link import Arrived
+from rack.boards.lan.messages import status_of
+from rack.boards.lan.peers import PeerRack
+from rack.boards.run.queues import DemandPort
+from tests.boards.lan.racks import rack_text
+
+EVERY = 8
+"""Ticks of a cycle of the adapter, 20 ms."""
+MAX_AGE = 40
+LAUNCH, NEXT = 101, 202
+
+
+class Network:
+    """Stands in for the link: what tests put into `come` arrives, what is sent is in `sent`."""
+
+    def __init__(self) -> None:
+        self.come: deque[Arrived] = deque()
+        self.sent: list[tuple[bytes, bytes]] = []
+
+    def subscribe(self, key: str) -> Any:
+        """Return a function that yields what has come."""
+        return lambda: iter([self.come.popleft() for _ in range(len(self.come))])
+
+    def publish(self, key: str, reliable: bool = False) -> Any:
+        """Return a function that sends."""
+        return lambda payload, envelope: self.sent.append((payload, envelope))
+
+
+class Importing:
+    """The adapter's import `lan.other`, and a level that reads it."""
+
+    def __init__(self, segment: Segment, goes_on: bool = False) -> None:
+        self.segment, self.peer, self.network = segment, PeerRack("two", goes_on=goes_on, offset_ns=0), Network()
+        self.grid = OwnGrid(segment, EVERY)
+        config = loads(segment.config)
+        assert config.adapter.lan is not None
+        self.table = config.adapter.lan.imports["other"]
+        self.spec = segment.layout.mailbox("lan.other")
+        self.kind = kind_of(self.spec.message, self.spec.version, message_dtype(self.spec.fields, self.spec.size))
+        self.key, self.sealer = out_key("two", "pulse.status"), Sealer()
+        self.status = Message(status_of((), ("other",)).dtype({}))
+        self.task = ReadingTask()
+        self.reader = watched(segment, "lan.other", AlarmWriter(segment, "echo"), self.task)
+        self.open()
+
+    def open(self) -> None:
+        """Open the import, as an adapter does when it begins."""
+        self.entry = Import(self.segment, "lan.other", self.table, self.peer)
+        self.entry.open(self.network, self.sealer, self.grid)  # type: ignore[arg-type]
+        self.writer = open_writer(self.segment, "lan.other")
+        self.port = DemandPort(self.writer)
+
+    def restart(self, tick: int) -> None:
+        """Kill the adapter, and begin another one with what the first wrote."""
+        self.writer.close()
+        self.network.come.clear()
+        self.open()
+        self.entry.resume(self.status.import_other, tick)
+
+    def send(self, number: int, written: int, count: int | None = None, launch: int = LAUNCH, **head: int) -> None:
+        """Let a message arrive, written there at the time of our tick `written`."""
+        message = Message(message_dtype(self.spec.fields, self.spec.size))
+        message.count = number if count is None else count
+        time_ns = self.grid.time_ns(written)
+        envelope = Envelope(self.kind, launch, number, number, written, time_ns, time_ns)._replace(**head)
+        payload = bytes(message.raw)
+        self.network.come.append(Arrived(self.key, self.sealer.seal(self.key, envelope, payload), payload))
+
+    def cycle(self, tick: int) -> None:
+        """Do the adapter's cycle of `tick`."""
+        self.entry.look(tick)
+        self.entry.exchange(self.port.message, tick)
+        self.port.write(self.writer.write, lambda tick, now: None, tick, None, tick)
+        self.entry.fill(self.status.import_other, tick)
+
+    def read(self, tick: int) -> tuple[Verdict, int, bool]:
+        """Return verdict, count and loss, as a level reads them at `tick`."""
+        self.task.reads(tick)
+        reading = self.reader.read(tick)
+        return reading.verdict, reading.value.count, reading.is_lost
+
+    def counts(self) -> dict[str, int]:
+        """Return the counts that are not 0."""
+        return {name: number for name, number in vars(self.entry.count).items() if number}
+
+
+@pytest.fixture(params=["realtime", "lockstep"])
+def segment(rack_name: str, request: pytest.FixtureRequest) -> Iterator[Segment]:
+    """The segment of a rack that imports; its epoch is the origin of all clocks, so that stamps are simulated times."""
+    config = loads(to_toml(override(parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"])))
+    made = Segment.create(wire(config), config.text())
+    made.words[System.PERIOD_NS], made.words[System.LOCKSTEP] = 2_500_000, request.param == "lockstep"
+    yield made
+    made.close()
+    unlink(rack_name)
+
+
+@pytest.fixture
+def importing(segment: Segment) -> Importing:
+    """Its import; the other rack is there."""
+    found = Importing(segment)
+    found.peer.comes(LAUNCH, 0)
+    found.peer.offset_ns = 0
+    return found
+
+
+NONE, OLD, NEW = Verdict.NONE, Verdict.OLD, Verdict.NEW
+
+
+def test_a_message_is_new_once_then_old_then_lost_by_its_age(importing: Importing) -> None:
+    assert importing.read(0) == (NONE, 0, False)
+    importing.send(1, written=2, count=77)
+    importing.cycle(8)
+    # By ticks: visible at the end of the adapter's cycle.
+    assert importing.read(15) == (NONE, 0, False)
+    assert importing.read(16) == (NEW, 77, False)
+    assert importing.read(17) == (OLD, 77, False)
+    assert importing.read(2 + MAX_AGE) == (OLD, 77, False)
+    assert importing.read(3 + MAX_AGE) == (OLD, 77, True)
+    importing.cycle(56)
+    assert importing.entry.is_old(56)
+    assert (importing.status.import_other["age"], importing.status.import_other["age_s"]) == (54, 54 * 0.0025)
+    importing.send(2, written=60)
+    importing.cycle(64)
+    assert importing.read(72) == (NEW, 2, False)
+
+
+def test_what_is_too_old_when_it_comes_is_counted_and_not_passed(importing: Importing) -> None:
+    importing.send(1, written=0)
+    importing.cycle(MAX_AGE)
+    assert importing.counts() == {"taken": 1}
+    importing.send(2, written=1)
+    importing.cycle(MAX_AGE + 8)
+    assert importing.counts() == {"taken": 1, "late": 1}
+    assert importing.read(MAX_AGE + 16)[1] == 1
+
+
+def test_the_newest_of_several_is_passed(importing: Importing) -> None:
+    for number in (3, 5, 4, 4, 5):
+        importing.send(number, written=number)
+    importing.cycle(8)
+    assert importing.read(16) == (NEW, 5, False)
+    assert importing.counts() == {"taken": 1, "missing": 1, "disordered": 1, "repeated": 2, "overtaken": 1}
+    assert importing.read(17)[0] is OLD
+
+
+def test_what_is_no_message_of_this_mailbox_is_refused(importing: Importing) -> None:
+    importing.send(1, written=1, kind=1)
+    importing.send(2, written=1, serial=1 << 63)
+    importing.send(3, written=1, launch=1 << 63)
+    importing.send(4, written=1)
+    good = importing.network.come[-1]
+    importing.network.come += [
+        good._replace(payload=good.payload + b"\0"),
+        good._replace(key=out_key("two", "pulse.other")),
+        good._replace(envelope=None),
+    ]
+    importing.cycle(8)
+    assert importing.counts() == {"refused": 6, "taken": 1}
+    assert importing.read(16) == (NEW, 4, False)
+
+
+def test_a_lost_rack_is_lost_at_once_until_its_first_message_after_that(importing: Importing) -> None:
+    importing.send(1, written=2)
+    importing.cycle(8)
+    assert importing.read(16) == (NEW, 1, False)
+    importing.peer.goes(LAUNCH, 16)
+    importing.peer.leaves(16)
+    importing.cycle(16)
+    lost_from = 24 if importing.grid.is_lockstep else 16
+    assert importing.read(lost_from - 1)[2] is (lost_from <= 15)
+    assert importing.read(lost_from) == (OLD, 1, True)
+    importing.peer.comes(LAUNCH, 24)
+    importing.peer.offset_ns = 0
+    importing.cycle(24)
+    assert importing.read(32) == (OLD, 1, True)
+    importing.send(2, written=30)
+    importing.cycle(32)
+    assert importing.read(39) == (OLD, 1, True)
+    assert importing.read(40) == (NEW, 2, False)
+
+
+@pytest.mark.parametrize("segment", ["realtime"], indirect=True)
+def test_a_rack_that_goes_on_keeps_the_last_message_however_old(segment: Segment) -> None:
+    importing = Importing(segment, goes_on=True)
+    importing.peer.comes(LAUNCH, 0)
+    importing.peer.offset_ns = 0
+    importing.send(1, written=2)
+    importing.cycle(8)
+    importing.peer.leaves(16)
+    importing.cycle(16)
+    assert importing.read(24) == (NEW, 1, False)
+    assert importing.read(10 * MAX_AGE) == (OLD, 1, False)
+    importing.peer.comes(NEXT, 10 * MAX_AGE)
+    importing.peer.offset_ns = 0
+    importing.send(1, written=10 * MAX_AGE, launch=NEXT, count=5)
+    importing.cycle(10 * MAX_AGE + 8)
+    # From here on by its age again.
+    assert importing.read(10 * MAX_AGE + 16) == (NEW, 5, False)
+    assert importing.read(11 * MAX_AGE + 1) == (OLD, 5, True)
+
+
+def test_a_dead_adapter_is_a_lost_writer(importing: Importing) -> None:
+    importing.send(1, written=2)
+    importing.cycle(8)
+    assert importing.read(16) == (NEW, 1, False)
+    importing.segment.block("lan")[Block.LOST] = 18
+    assert importing.read(17) == (OLD, 1, False)
+    assert importing.read(18) == (OLD, 1, True)
+    importing.segment.block("lan")[Block.LOST] = 0
+    assert importing.read(19) == (OLD, 1, False)
+
+
+def test_a_restarted_adapter_continues_and_takes_nothing_twice(importing: Importing) -> None:
+    for number in (1, 2):
+        importing.send(number, written=number)
+    importing.cycle(8)
+    assert importing.read(16) == (NEW, 2, False)
+    importing.restart(8)
+    # Somebody has come, so the newest is sent again; one is lost meanwhile.
+    importing.send(2, written=2)
+    importing.cycle(16)
+    assert importing.read(24) == (OLD, 2, False)
+    importing.send(4, written=4)
+    importing.cycle(24)
+    assert importing.read(32) == (NEW, 4, False)
+    assert importing.counts() == {"taken": 2, "overtaken": 1, "repeated": 1, "missing": 1}
+    assert importing.status.import_other["serial"] == 4
+
+
+def test_an_adapter_restarted_while_a_rack_is_lost_knows_that_it_is(importing: Importing) -> None:
+    importing.send(1, written=2)
+    importing.cycle(8)
+    importing.peer.leaves(16)
+    importing.cycle(16)
+    importing.restart(16)
+    importing.peer.comes(LAUNCH, 24)
+    importing.peer.offset_ns = 0
+    importing.cycle(24)
+    assert importing.read(32) == (NEW, 1, True)
+    importing.send(2, written=30)
+    importing.cycle(32)
+    assert importing.read(40) == (NEW, 2, False)
+
+
+@pytest.mark.parametrize("segment", ["realtime"], indirect=True)
+def test_the_first_message_of_a_restarted_rack_is_known_from_an_old_one(importing: Importing) -> None:
+    peer = importing.peer
+    importing.send(900, written=2)
+    importing.cycle(8)
+    assert importing.read(16) == (NEW, 900, False)
+    # Its first message comes before its token.
+    importing.send(1, written=14, launch=NEXT, count=5)
+    importing.cycle(16)
+    assert importing.counts() == {"taken": 1}
+    peer.comes(NEXT, 24)
+    peer.offset_ns = 0
+    importing.cycle(24)
+    assert importing.read(32) == (NEW, 5, False)
+    # Of the old launch, whose token has not expired yet, and after it has.
+    importing.send(901, written=30)
+    importing.cycle(32)
+    peer.goes(LAUNCH, 40)
+    importing.send(902, written=38)
+    importing.cycle(40)
+    assert importing.read(48) == (OLD, 5, False)
+    assert importing.counts() == {"taken": 2, "strange": 2}
+
+
+@pytest.mark.parametrize("segment", ["realtime"], indirect=True)
+def test_messages_of_a_launch_whose_token_never_comes_are_bounded_and_forgotten(importing: Importing) -> None:
+    for number in range(1, 100):
+        importing.send(number, written=4, launch=NEXT)
+    importing.cycle(8)
+    assert importing.counts() == {"strange": 98}
+    importing.cycle(8 + MAX_AGE + 8)
+    assert importing.counts() == {"strange": 99}
+    importing.cycle(8 + MAX_AGE + 16)
+    assert importing.counts() == {"strange": 99}
+
+
+@pytest.mark.parametrize("segment", ["realtime"], indirect=True)
+def test_a_message_whose_age_is_unknown_waits_for_the_clocks(importing: Importing) -> None:
+    importing.peer.offset_ns = None
+    importing.send(1, written=2)
+    importing.cycle(8)
+    assert importing.counts() == {}
+    importing.peer.offset_ns = 0
+    importing.cycle(16)
+    assert importing.read(24) == (NEW, 1, False)
+    assert importing.status.import_other["age"] == 14
+
+
+@pytest.mark.parametrize("segment", ["lockstep"], indirect=True)
+def test_in_lockstep_what_was_sent_in_a_later_cycle_waits_for_it(importing: Importing) -> None:
+    stamp_ns = importing.grid.time_ns(16)
+    importing.send(1, written=2)
+    importing.send(2, written=8, stamp_ns=stamp_ns)
+    importing.cycle(8)
+    assert importing.read(16) == (NEW, 1, False)
+    importing.cycle(16)
+    assert importing.read(24) == (NEW, 2, False)
+    # Nothing that differs from run to run is on record.
+    assert importing.status.import_other["launch"] == 0
+
+
+def test_a_clock_that_is_ahead_makes_nothing_younger_than_now(importing: Importing) -> None:
+    importing.send(1, written=100_000, stamp_ns=importing.grid.time_ns(4 if importing.grid.is_lockstep else 100_000))
+    importing.cycle(8)
+    assert importing.status.import_other["age"] == 0
+    assert importing.read(16) == (NEW, 1, False)
+
+
+@pytest.mark.parametrize("segment", ["realtime"], indirect=True)
+def test_what_was_written_before_the_first_tick_here_is_as_old_as_it_is(importing: Importing) -> None:
+    importing.send(1, written=-20)
+    importing.cycle(8)
+    assert importing.status.import_other["age"] == 28
+    importing.send(2, written=-MAX_AGE)
+    importing.cycle(16)
+    assert importing.counts() == {"taken": 1, "late": 1}
+
+
+class Exporting:
+    """The adapter's export of `pulse.status`, and the level that writes it."""
+
+    def __init__(self, segment: Segment) -> None:
+        config = loads(segment.config)
+        assert config.adapter.lan is not None
+        self.segment, self.table, self.network = segment, config.adapter.lan.exports["pulse"], Network()
+        self.writer = open_writer(segment, "pulse.status")
+        self.status = Message(status_of(("pulse",), ()).dtype({}))
+        self.open()
+
+    def open(self) -> None:
+        """Open the export."""
+        self.entry = Export(self.segment, self.table, LAUNCH)
+        self.entry.open(self.network, Sealer(), OwnGrid(self.segment, EVERY))  # type: ignore[arg-type]
+
+    def heads(self) -> list[Envelope]:
+        """Return the heads of what was sent since the last call."""
+        sent, self.network.sent = self.network.sent, []
+        key = out_key(self.segment.rack, "pulse.status")
+        found = [Sealer().opened(key, envelope, payload) for payload, envelope in sent]
+        assert all(isinstance(head, Envelope) for head in found)
+        return found  # type: ignore[return-value]
+
+
+def test_each_new_message_is_sent_once(segment: Segment) -> None:
+    exporting = Exporting(segment)
+    exporting.entry.exchange(0)
+    assert exporting.heads() == []
+    exporting.writer.write(0)
+    exporting.entry.exchange(8)
+    exporting.entry.exchange(16)
+    exporting.writer.write(8)
+    exporting.writer.write(16)
+    exporting.entry.exchange(24)
+    heads = exporting.heads()
+    assert [(head.number, head.serial, head.tick) for head in heads] == [(1, 1, 0), (2, 3, 16)]
+    assert heads[1].time_ns == 16 * 2_500_000
+    # In lockstep the stamp says in which cycle it was sent.
+    assert heads[1].stamp_ns == (24 if exporting.segment.words[System.LOCKSTEP] else 16) * 2_500_000
+
+
+def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) -> None:
+    exporting = Exporting(segment)
+    exporting.writer.write(0)
+    exporting.entry.exchange(8)
+    exporting.entry.is_asked = True
+    exporting.entry.exchange(16)
+    exporting.entry.exchange(24)
+    # In lockstep nobody comes late, and nothing may depend on when a token comes.
+    times = 1 if segment.words[System.LOCKSTEP] else 2
+    assert [(head.number, head.serial) for head in exporting.heads()] == [(1, 1)] * times
+    assert exporting.entry.sent == 1
+
+
+def test_a_restarted_adapter_goes_on_with_the_numbers_of_the_one_before(segment: Segment) -> None:
+    exporting = Exporting(segment)
+    for tick in (0, 8, 16):
+        exporting.writer.write(tick)
+        exporting.entry.exchange(tick + 8)
+    exporting.entry.fill(exporting.status.export_pulse)
+    exporting.heads()
+    exporting.open()
+    exporting.entry.resume(exporting.status.export_pulse)
+    exporting.entry.exchange(32)
+    assert exporting.heads() == []
+    exporting.writer.write(32)
+    exporting.entry.exchange(40)
+    assert [(head.number, head.serial) for head in exporting.heads()] == [(4, 4)]
+
+
+def test_the_status_is_written_before_what_it_counts(segment: Segment) -> None:
+    ports = LanAdapter.made_ports(loads(segment.config).board["lan"].params, {})
+    assert next(iter(ports.outputs)) == "status"
+    assert segment.layout.mailbox("lan.other").max_age == MAX_AGE

@@ -1,0 +1,191 @@
+"""Two racks in real time, on one machine's loopback: boards and racks die and come back, and nothing is taken twice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.errors import SegmentError
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Demand, System, switch
+from rack.boards import Rack
+from rack.boards.config.resolved import loads
+from rack.boards.lan.link import UNREAD
+from rack.levels.peer import Presence
+from tests.boards.lan.racks import ROOT, configs, endpoints, rack_text, started
+from tests.processes import BOUND_S, wait_until
+
+SECONDS = 120.0
+"""Longest run of a rack: the tests end them long before."""
+LAUNCH_S = 60.0
+GENTLE = ("adapter.lan.lease_ms=1000",)
+"""Longer than any pause of a loaded machine."""
+
+
+def newest(segment: Segment, mailbox: str) -> Any:
+    """Return the newest message of a mailbox."""
+    return open_observer(segment, mailbox).peek().value
+
+
+def attached(name: str) -> Segment:
+    """Attach to a rack as soon as it is there."""
+    found: list[Segment] = []
+
+    def is_there() -> bool:
+        try:
+            found.append(Segment.attach(name))
+        except SegmentError:
+            return False
+        return True
+
+    wait_until(is_there, LAUNCH_S)
+    return found[0]
+
+
+def written(segment: Segment, mailbox: str) -> np.ndarray:
+    """Return the messages of a mailbox that its slots still hold."""
+    return MailboxRing(segment, mailbox).drain().rows["message"]
+
+
+def kill_adapter(segment: Segment) -> None:
+    """Kill a rack's adapter, and wait until a new one exchanges."""
+    block, status = segment.block("lan"), open_observer(segment, "lan.status")
+    pid = block[Block.PID]
+    os.kill(pid, signal.SIGKILL)
+    wait_until(lambda: block[Block.PID] != pid and not block[Block.LOST])
+    status.peek()
+    after = status.serial
+    wait_until(lambda: status.peek() and status.serial > after + 2)
+
+
+@pytest.mark.alone
+def test_boards_and_racks_die_and_come_back(rack_name: str, tmp_path: Path) -> None:
+    (at,), names = endpoints(1), (f"{rack_name}-a", f"{rack_name}-b")
+    texts = [
+        rack_text(names[0], at, [], peers=[names[1]]),
+        rack_text(names[1], "", [at], names[0], lan='on_peer_loss = "stop"').replace(
+            "max_age_ms = 100", "max_age_ms = 9000"
+        ),
+    ]
+    configs(texts, tmp_path)
+    files = [tmp_path / f"rack-{at}.toml" for at in range(2)]
+    with started(files[1], SECONDS, *GENTLE) as reading:
+        b = attached(names[1])
+        try:
+            with started(files[0], SECONDS, *GENTLE) as writing:
+                a = attached(names[0])
+                wait_until(lambda: newest(b, "echo.status").count > 0)
+                entry = newest(b, "lan.status").import_other.copy()
+                assert (entry["missing"], entry["repeated"], entry["strange"]) == (0, 0, 0)
+                assert entry["age"] >= 0
+
+                kill_adapter(b)
+                after = newest(b, "lan.status").import_other.copy()
+                assert after["taken"] >= entry["taken"]
+                assert after["number"] >= entry["number"]
+                wait_until(lambda: newest(b, "lan.status").import_other["taken"] > after["taken"])
+                # It was away, not the other rack, which saw it go and come.
+                peer = newest(b, f"lan.peer_{names[0].replace('-', '_')}")
+                assert (peer.presence, peer.launches, peer.losses) == (Presence.THERE, 1, 0)
+                peer = newest(a, f"lan.peer_{names[1].replace('-', '_')}")
+                assert (peer.presence, peer.launches, peer.losses) == (Presence.THERE, 1, 1)
+
+                kill_adapter(a)
+                assert newest(a, "lan.status").export_pulse["sent"] >= after["number"]
+                reading.await_event("recovery", f"rack '{names[0]}' is back after")
+                taken = newest(b, "lan.status").import_other["taken"]
+                wait_until(lambda: newest(b, "lan.status").import_other["taken"] > taken)
+                # Whatever died, no message came twice, or after a later one.
+                assert (np.diff(written(b, "lan.other")["count"]) > 0).all()
+                wait_until(lambda: b.words[System.DEMAND] == Demand.NONE)
+                last = newest(b, "echo.status").count
+
+                writing.send(signal.SIGKILL)
+                event = reading.await_event("detection", f"rack '{names[0]}' is lost")
+                assert (event["code"], event["subject"]) == ("peer_lost", names[0])
+                event = reading.await_event("reaction", "a rack that it works with is lost")
+                assert (event["code"], event["value"]) == ("demand", Demand.STOP)
+                lost = newest(b, "echo.status").lost
+                wait_until(lambda: newest(b, "echo.status").lost > lost + 2)
+            with started(files[0], SECONDS, *GENTLE) as writing:
+                event = reading.await_event("recovery", "it was restarted")
+                assert event["subject"] == names[0]
+                reading.await_event("recovery", "arm released")
+                # Its counting begins again: what comes now is of the new launch.
+                wait_until(lambda: 0 < newest(b, "echo.status").count < last)
+                peer = newest(b, f"lan.peer_{names[0].replace('-', '_')}")
+                assert (peer.presence, peer.launches) == (Presence.THERE, 2)
+        finally:
+            b.close()
+
+
+@contextmanager
+def flooding(name: str, endpoint: str, victim: str) -> Iterator[None]:
+    """Let a rack of that name flood another one, which listens at an endpoint."""
+    command = [sys.executable, "-m", "tests.boards.lan.flooder", name, endpoint, victim]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE) as process:
+        try:
+            yield
+        finally:
+            process.stdin.close()  # type: ignore[union-attr]
+            try:
+                process.wait(BOUND_S)
+            finally:
+                process.kill()
+
+
+@pytest.mark.alone
+def test_a_flood_costs_a_bounded_number_of_looks_and_other_entries_go_on(rack_name: str, tmp_path: Path) -> None:
+    (at,) = endpoints(1)
+    calm = """
+[adapter.lan.import.calm]
+from = "flood/calm.status"
+type = "lan_levels:PULSE"
+rate_hz = 50
+max_age_ms = 1000
+"""
+    (config,) = configs([rack_text(rack_name, at, [], "flood", lan="lease_ms = 1000") + calm], tmp_path)
+    with Rack(config) as rack, flooding("flood", at, rack_name):
+        rack.start(SECONDS)
+
+        def goes_on() -> bool:
+            rack.watch(0.01)
+            # The clocks are not compared, so the calm messages wait, and the next one overtakes each.
+            entry = newest(rack.segment, "lan.status")
+            return entry.import_other["refused"] > 20 * UNREAD and entry.import_calm["overtaken"] > 10
+
+        wait_until(goes_on)
+        rows = written(rack.segment, "lan.status")
+        rack.stop("the test has seen enough")
+        while rack.watch(0.1):
+            continue
+    refused = np.diff(rows["import_other"]["refused"].astype(int))
+    assert refused.max() == UNREAD
+    assert (refused >= 0).all()
+    assert rows["import_other"]["taken"][-1] == 0
+
+
+def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
+    """Run a rack whose adapter switches its demand at a tick; return ticks and texts of what the arm must do."""
+    with rack:
+        rack.segment.words[System.PEER_STOP] = switch(demand_from, is_on)
+        rack.run(0.5)
+    return [(event.tick, event.text) for event in rack.events if event.code == "demand"]
+
+
+def test_the_clock_follows_the_adapter_at_its_tick(rack_name: str) -> None:
+    text = rack_text(rack_name, "", []).partition("[adapter.lan]")[0].replace("[clock]", '[clock]\nmode = "lockstep"')
+    stop = "the arm must ramp to rest, then brake: a rack that it works with is lost"
+    assert words(100, True, Rack(loads(text))) == [(100, stop)]
+    assert words(100, False, Rack(loads(text))) == [(0, stop), (100, "arm released: no stop is requested")]
