@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-
 COORDINATOR = 0
 ORDER_BYTES, STATUS_BYTES = 1024, 256
 PORT = 7447
