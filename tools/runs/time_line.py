@@ -86,7 +86,7 @@ class RackPlace:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Largest error of its times on the line."""
+        """Largest error of its stamps on the line's machine."""
         return sum(shift.uncertainty_ns for shift in self.shifts)
 
     @property
@@ -96,7 +96,8 @@ class RackPlace:
         if self.own.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
         begin = self.line.time_ns(self.stamps_ns(np.array([self.own.epoch_ns])))[0] * 1e-9
-        return f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {self.uncertainty_ns * 1e-6:.3f} ms"
+        uncertain_ms = self.uncertainty_ns * self.line.clock_ns / self.line.period_ns * 1e-6
+        return f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {uncertain_ms:.3f} ms"
 
     def stamps_ns(self, stamps_ns: Ints) -> Ints:
         """Return stamps of its machine as stamps of the line's."""

@@ -54,8 +54,12 @@ def _blocks(recording: Recording, last: int, block: int) -> Iterator[tuple[int, 
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
     rings = {name: rows for name in names if len(rows := _rows(recording, name))}
     done = dict.fromkeys(rings, 0)
-    for tick in range(block, last + block, block):
-        ends = {name: int(np.searchsorted(rows["tick"], tick)) for name, rows in rings.items()}
+    for begin in range(0, last, block):
+        tick = min(last, begin + block)
+        # The last block has all that is left: what clock and operator wrote after the last cycle, too.
+        ends = {
+            name: int(np.searchsorted(rows["tick"], tick)) if tick < last else len(rows) for name, rows in rings.items()
+        }
         yield tick, {name: rings[name][done[name] : end] for name, end in ends.items() if end > done[name]}
         done = ends
 

@@ -55,8 +55,8 @@ class Timelines:
         """Return the times of rows released at `ticks`, `within_ns` of simulated time later, stamped `stamps_ns`."""
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
-        simulated_ns = placed.times_ns(ticks, within_ns)
-        return RowTimes(simulated_ns, simulated_ns // placed.line.clock_ns, placed.wall_ns(stamps_ns))
+        released = placed.times_ns(ticks, 0) // placed.line.clock_ns
+        return RowTimes(placed.times_ns(ticks, within_ns), released, placed.wall_ns(stamps_ns))
 
     def columns(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> list[rr.TimeColumn]:
         """Return the same times as columns."""
