@@ -13,6 +13,7 @@ import typer
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import reading_progress
+from rack.tools.runs.parquet import CONFIG
 from rack.tools.runs.recording import Recording
 from rack.tools.runs.time_line import on_one_time_line
 from rack.tools.runs.window import ViewerWindow, has_screen
@@ -41,24 +42,32 @@ def replay(runs: Runs, out: Out = None) -> None:
       rack replay runs/cell-puma-20250101-120000 runs/cell-k1607-20250101-120001
       rack replay runs/cell-puma-* runs/cell-k1607-* --out both.rrd
     """
+    if out is None and len(runs) == 1 and (recordings := _own(runs[0])):
+        _show(*recordings)
+        return
+    parts = [part for run in runs for part in _parts(run)]
     if out is not None:
-        _make(runs, out)
-    elif len(runs) == 1:
-        _open_own(runs[0])
+        _make(parts, out)
+    elif len(parts) == 1:
+        raise Failure(f"{parts[0]}: nothing to replay: it has no run.rrd", 2)
     elif has_screen():
         with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-replay-") as folder:
-            _make(runs, Path(folder, "run.rrd"))
+            _make(parts, Path(folder, "run.rrd"))
             _show(Path(folder, "run.rrd"))
     else:
         raise Failure("no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd saves it for one")
 
 
-def _open_own(run: Path) -> None:
-    # A restarted recorder leaves several files.
-    recordings = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
-    if not recordings or not all(recording.is_file() for recording in recordings):
-        raise Failure(f"{run}: nothing to replay: it has no run.rrd", 2)
-    _show(*recordings)
+def _own(run: Path) -> list[Path]:
+    """Return the viewer's files of a run: a restarted recorder leaves several."""
+    found = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
+    return [path for path in found if path.is_file()]
+
+
+def _parts(run: Path) -> list[Path]:
+    """Return the runs in a folder that `rack record --with` has made; of any other, itself."""
+    parts = [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
+    return parts or [run]
 
 
 def _show(*recordings: Path) -> None:
@@ -71,10 +80,11 @@ def _make(runs: Sequence[Path], out: Path) -> None:
         raise Failure(f"--out {out}: not the name of a viewer's file; permitted: a name that ends in .rrd", 2)
     if out.exists():
         raise Failure(f"--out {out}: exists already", 2)
-    merge(runs, out)
+    for note in merge(runs, out):
+        print(note, file=sys.stderr)
 
 
-def merge(runs: Sequence[Path], out: Path, silent: bool = False) -> list[str]:
+def merge(runs: Sequence[Path], out: Path) -> list[str]:
     """Write the viewer's file of runs that were recorded together; return what a user should know of their times.
 
     Raises `Failure` if they cannot be read, or did not run together.
@@ -84,13 +94,11 @@ def merge(runs: Sequence[Path], out: Path, silent: bool = False) -> list[str]:
             raise Failure(f"{run}: no such folder" if not run.exists() else f"{run}: not the folder of a run", 2)
     placed = on_one_time_line([Recording(run) for run in runs])
     notes = [place.note for place in placed[1:]]
-    for note in () if silent else notes:
-        print(note, file=sys.stderr)
     # It takes half a second to import.
     from rack.tools.viewer.merged import write_merged
 
     try:
-        write_merged(placed, out, reading_progress(silent, "merging the recordings"))
+        write_merged(placed, out, reading_progress(False, "merging the recordings"))
     except RuntimeError as error:
         raise Failure(f"{out}: {' '.join(str(error).split())}") from None
     return notes

@@ -51,3 +51,13 @@ def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
         # The file first: a long path is cut short.
         yield Mistake(f"{PLACE}.certificates", None, f"{flaw.path.name}: {flaw.why}; in {table.certificates}")
+
+
+def network_notes(config: RackConfig) -> list[str]:
+    """Return what a launch says of endpoints without TLS that other machines can reach."""
+    table = config.adapter.lan
+    if table is None:
+        return []
+    found = [str(endpoint) for _, endpoint in table.endpoints if not (endpoint.has_tls or endpoint.is_loopback)]
+    may = "read and forge" if table.certificates is None else "read"
+    return [f"without TLS: whoever reaches {', '.join(found)} may {may} what is exchanged"] if found else []

@@ -27,7 +27,7 @@ from rack.boards.config.files import CONFIGS, anchor, assembled
 from rack.boards.config.lan import at_adapter
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
-from rack.boards.config.network import credential_mistakes
+from rack.boards.config.network import credential_mistakes, network_notes
 from rack.boards.config.ports import TaskPorts, reference
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
@@ -149,9 +149,9 @@ class Resolved:
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:
-        """Return notes for the launch to report: cores replaced, real-time priorities refused, no repeatable run."""
+        """Return notes for the launch to report: cores replaced, priorities refused, no TLS, no repeatable run."""
         refused, live = self._refused(segment), ", ".join(host.board for host in self.hosts)
-        found = shared_out(self.config)
+        found = [*shared_out(self.config), *network_notes(self.config)]
         found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
         if live and self.config.clock.mode == "lockstep":
             found.append(f"what {live} sends enters at ticks that depend on its timing; --entries RUN repeats a run")

@@ -35,7 +35,8 @@ def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
     if asks:
         by_subject[ANYONE] = list(_asking(own))
     if not table.has_tls:
-        by_subject.setdefault(ANYONE, []).extend(_shown(own, [out_key(own, e.source) for e in table.exports.values()]))
+        exported = [out_key(own, entry.source) for entry in table.exports.values()]
+        by_subject.setdefault(ANYONE, []).extend([*_shown(own, exported), *_compared(own)])
     for peer in dict.fromkeys([*table.racks, *table.permit]):
         subject = peer if table.has_tls else ANYONE
         rules = by_subject.setdefault(subject, [])
@@ -65,6 +66,14 @@ def _shown(own: str, keys: Sequence[str]) -> Iterator[Permission]:
         yield Permission(IN, SUBSCRIBE, keys)
         yield Permission(OUT, PUT, keys)
     yield from _visible(own)
+
+
+def _compared(own: str) -> Iterator[Permission]:
+    """Yield the rules for others that may compare their clocks with this rack's: messages of unknown age are no use."""
+    yield Permission(OUT, SUBSCRIBE, [ping_key("*", own)])
+    yield Permission(IN, PUT, [ping_key("*", own)])
+    yield Permission(IN, SUBSCRIBE, [pong_key("*", "*")])
+    yield Permission(OUT, PUT, [pong_key(own, "*")])
 
 
 def _visible(own: str) -> Iterator[Permission]:

@@ -51,6 +51,7 @@ class LanAdapter(Adapter):
         self._exports: dict[str, Export] = {}
         self._imports: dict[str, Import] = {}
         self._link: LanLink | None = None
+        self._flaws: Sequence[int] = ()
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
@@ -102,10 +103,12 @@ class LanAdapter(Adapter):
             for port, entry in self._imports.items():
                 entry.resume(getattr(before.value, f"import_{port}"), status.newest)
             self._desk.resume(before.value.desk)
+            self._flaws = [int(count) for count in before.value.flaws]
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
+        link.sealer.resume(self._flaws)
         for entry in self._imports.values():
             entry.open(link, link.sealer, self._grid)
         for export in self._exports.values():
@@ -153,6 +156,8 @@ class LanAdapter(Adapter):
             out = getattr(write, peer_port(peer.rack))
             self._clocks.fill(out, peer.rack, tick)
             peer.fill(out, self._grid.is_lockstep)
+        if self._link is not None and not self._grid.is_lockstep:
+            status.flaws[...] = tuple(self._link.sealer.flaws.values())
         status.reason = reason = self._trouble(tick)
         status.state = State.HOLDING if reason else State.EXECUTING
 
@@ -163,6 +168,8 @@ class LanAdapter(Adapter):
                 return f"rack '{peer.rack}' is {'lost' if peer.launches else 'not there yet'}"
             if len(peer.tokens) > 1:
                 return f"{len(peer.tokens)} racks are named '{peer.rack}'"
+            if self._clocks.is_unanswered(peer, tick):
+                return f"clock of rack '{peer.rack}' is not known: it does not answer pings"
         old = [port for port, entry in self._imports.items() if entry.is_old(tick)]
         return f"'{self._table.imports[old[0]].source}' is older than max_age_ms" if old else ""
 

@@ -36,6 +36,8 @@ ANSWER_NS = 5_000_000
 """Shortest time between two answers to one rack: a flood of pings is not answered by one of pongs."""
 MOST_ASKERS = 1024
 """Racks that get answers."""
+UNKNOWN_NS = 1_000_000_000
+"""Time after which a clock that is not known is reported."""
 UNREAD = 64
 """Answers that wait for a cycle, at most; a newer one overwrites the oldest."""
 _PONG = Struct("<Q4q")
@@ -240,6 +242,11 @@ class Clocks:
             return False
         clock.epoch_ns, clock.period_ns, clock.clock_ns = epoch, period, clock_ns
         return True
+
+    def is_unanswered(self, peer: PeerRack, tick: int) -> bool:
+        """Say whether the clock of a rack that is there has not been measured for long: its messages are held back."""
+        is_unknown = peer.is_there and peer.offset_ns is None and not self._grid.is_lockstep
+        return is_unknown and tick - peer.since > self._grid.ticks_in(UNKNOWN_NS)
 
     def count(self, record: Any) -> None:
         """Write the counts into the group of a status."""

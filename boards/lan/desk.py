@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import OperatorTableError
@@ -138,9 +138,9 @@ class Desk:
         if self._waiting:
             self._dismiss()
 
-    def resume(self, record: Sequence[int]) -> None:
+    def resume(self, record: Any) -> None:
         """Count on from the group of its predecessor's last status."""
-        self.count = DeskCount(*map(int, record))
+        self.count = DeskCount(*record.tolist())
 
     def fill(self, record: object) -> None:
         """Write its counts into the group of a status; in lockstep none, since they do not depend on ticks alone."""

@@ -33,6 +33,15 @@ IMPORT = MessageType(
         Field("age_s", "f8", "s", "the same in simulated time; -1: none yet"),
     ),
 )
+FLAWS = MessageType(
+    "lan_flaws",
+    1,
+    (
+        Field("malformed", "u4", "1", "not of this protocol, or of another version of it; in lockstep always 0"),
+        Field("unsigned", "u4", "1", "changed on the way, under another key, or sealed with another secret; likewise"),
+        Field("oversized", "u4", "1", "longer than most_bytes; likewise"),
+    ),
+)
 CLOCKS = MessageType(
     "lan_clocks",
     1,
@@ -63,4 +72,5 @@ def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
         *(Field(f"export_{port}", EXPORT, "1", f"export {port}") for port in exports),
         *(Field(f"import_{port}", IMPORT, "1", f"import {port}") for port in imports),
         Field("desk", DESK, "1", "questions from other machines"),
+        Field("flaws", FLAWS, "1", "all that came and was dropped unread, by cause"),
     )

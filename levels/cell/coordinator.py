@@ -68,7 +68,7 @@ class Coordinator(Executor):
             for n, action in enumerate(step.do):
                 if action.arm not in known:
                     why = f"lacks '{action.arm}', the arm of task.step[{k}].do[{n}]"
-                    yield "params.arms", list(known), why
+                    yield "params.arms", ", ".join(known), why
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read what the arms report, go on with the program, order what is next."""

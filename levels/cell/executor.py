@@ -158,13 +158,17 @@ class OrderedTaskExecutor(TaskExecutor):
         """Return the coordinator's simulated time less that here, s."""
         return float(read.peer.value.ahead) if self._table.coordinator else 0.0
 
+    def _knows_time(self, read: Ports) -> bool:
+        peer: Reading | None = read.peer if self._table.coordinator else None
+        return peer is None or (peer.is_there and peer.value.uncertainty >= 0.0)
+
     def _not_ready(self, read: Ports) -> str:
         """Return why nothing can be planned now; empty: it can."""
         if self._orders.standing is not Operation.NONE or not read.status.value.resting:
             return "the arm does not rest yet"
         if not read.world.value.revision:
             return "the world model knows nothing yet"
-        if self._table.coordinator and read.order.value.by and read.peer.value.uncertainty < 0.0:
+        if read.order.value.by and not self._knows_time(read):
             return f"the clock of {self._source} has not been compared yet"
         return ""
 

@@ -43,7 +43,7 @@ ArmAction = Annotated[ArmTransfer | ArmGoto | ArmHome, Field(discriminator="do")
 class CellStep(Table):
     """`[[task.step]]`: actions that begin together, once every arm has answered that it can do its own by its time."""
 
-    do: tuple[ArmAction, ...] = Field(min_length=1, description="actions, one for each arm that has a part in the step")
+    do: tuple[ArmAction, ...] = Field(description="actions, one for each arm that has a part in the step")
 
     @property
     def actions(self) -> dict[str, ArmTransfer | ArmGoto | ArmHome]:
@@ -62,10 +62,14 @@ class CellProgram(Program):
         return zlib.crc32(self.model_dump_json().encode()) or 1
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
-        """Yield key, value and reason of arms named twice in a step, times that do not rise, and what is too long."""
+        """Yield key, value and reason of steps without actions or with two for an arm, times that do not rise, and what
+        is too long for an order.
+        """
         latest = 0.0
         for k, step in enumerate(self.step):
             arms: set[str] = set()
+            if not step.do:
+                yield f"step[{k}].do", [], "has no action; permitted: one or more"
             for n, action in enumerate(step.do):
                 place = f"step[{k}].do[{n}]"
                 if action.arm in arms:

@@ -19,6 +19,7 @@ from rack.tools.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.benches.lan_group import HEAD_START_NS, Group
 from rack.tools.benches.lan_machine import ENDS, TCP, TLS
 from rack.tools.benches.network import Lab
+from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 
 COUNTS = (1, 2, 4, 8, 16, 32)
@@ -61,8 +62,14 @@ def measure(runs: LanRuns, progress: Progress) -> LanFigures:
                 lab.lose(machine, runs.loss)
             for _, who in turns(contestants, runs.rounds):
                 progress.begin(f"{count} racks: {who}")
-                bench.measure(lab, who)
-                progress.end(bench.cost_s(count), "done", ())
+                try:
+                    bench.measure(lab, who)
+                    ended = "done"
+                except Failure as failure:
+                    # The others count all the same.
+                    ended = str(failure)
+                    absent.append(Absent(f"{who} with {count} racks", ended))
+                progress.end(bench.cost_s(count), ended, ())
             if lacks is None:
                 bench.wake(count)
     return bench.figures(absent)
@@ -111,6 +118,8 @@ class LanBench:
             kilobytes = (idle + sent * rate_hz / cycles) * 1e-3
             self._note(Point("age", group.racks, rate_hz, group.who, "ms"), [us * 1e-3 for m in found for us in m.us])
             self._note(Point("on the wire", group.racks, rate_hz, group.who, "kB/s"), [kilobytes])
+            each_us = found[COORDINATOR].processor_us / (cycles * group.racks)
+            self._note(Point("processor", group.racks, rate_hz, group.who, "us"), [each_us])
             steady.missing += sum(one.missing for one in found)
             steady.taken += sum(len(one.us) for one in found)
         steady.false_deaths += group.false_deaths

@@ -15,7 +15,7 @@ from rack.tools.console.pictures import paths_of, picture
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BASELINES = {"round trip": "UDP", "age": "UDP", "on the wire": "UDP"}
+BASELINES = {"round trip": "UDP", "age": "UDP", "on the wire": "UDP", "processor": "UDP"}
 """Whom the others are compared with; in all else, with cyclonedds."""
 COLOURS = {"rack, TLS": "#4477aa", "rack, TCP": "#66ccee", "UDP": "#222222", "cyclonedds": "#ccbb44"}
 TITLE = (
@@ -26,7 +26,8 @@ SIMULATED = (
     "Machines are namespaces that share the cores of this one. Each rack is a process with the link, envelopes and "
     "seals of a rack's adapter; its boards are left out.",
     "round trip: order and status, answered at once. age: when a cycle takes a message; all have grids of their own. "
-    "on the wire: at the coordinator's cable, both ways, without a rate: of links that nobody uses.",
+    "on the wire: at the coordinator's cable, both ways; without a rate: of links that nobody uses. processor: time of "
+    "the coordinator's process, all its threads, for an order and a status.",
 )
 
 

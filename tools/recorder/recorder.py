@@ -109,12 +109,15 @@ RISKED_PART = 4
 class Recorder:
     """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the same rows.
 
-    The first recorder of a rack in lockstep is its follower: the clock waits for it.
+    The first recorder of a rack in lockstep is its follower: the clock waits for it. `refresh` brings a mirror of a
+    segment on another machine up to date.
     """
 
-    def __init__(self, segment: Segment, folder: Path, view: Sink | None = None) -> None:
+    def __init__(
+        self, segment: Segment, folder: Path, view: Sink | None = None, refresh: Callable[[], object] | None = None
+    ) -> None:
         layout = segment.layout
-        self._view = view
+        self._view, self._refresh = view, refresh
         self._segment, self._words = segment, segment.words
         # The spool first: it fails where another recorder is running, and leaves that one's files alone.
         self._spool = Spool(folder, layout, segment.launch)
@@ -125,8 +128,8 @@ class Recorder:
         self._rings = traces | mailboxes
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)
-        # Lockstep has no deadlines that the machine could break.
-        self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
+        # Lockstep has no deadlines that the machine could break; the cores of another machine are not seen.
+        self._cores = None if self._words[System.LOCKSTEP] or refresh is not None else CoreMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         self._is_follower = follower == os.getpid() or not is_alive(follower)
@@ -144,6 +147,8 @@ class Recorder:
 
     def drain(self) -> None:
         """Record everything written since the last call."""
+        if self._refresh is not None:
+            self._refresh()
         tick = self._words[System.TICK]
         for name, ring in self._rings.items():
             rows, lost = ring.drain()

@@ -77,7 +77,7 @@ class Shift:
 
 
 @dataclass(frozen=True)
-class Placed:
+class RackPlace:
     """A recorded rack on the time line: by what shifts its clock leads to the first rack's; in lockstep by none."""
 
     own: RackGrid
@@ -86,7 +86,7 @@ class Placed:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Largest error of its times on the line."""
+        """Largest error of its stamps on the line's machine."""
         return sum(shift.uncertainty_ns for shift in self.shifts)
 
     @property
@@ -96,7 +96,8 @@ class Placed:
         if self.own.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
         begin = self.line.time_ns(self.stamps_ns(np.array([self.own.epoch_ns])))[0] * 1e-9
-        return f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {self.uncertainty_ns * 1e-6:.3f} ms"
+        uncertain_ms = self.uncertainty_ns * self.line.clock_ns / self.line.period_ns * 1e-6
+        return f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {uncertain_ms:.3f} ms"
 
     def stamps_ns(self, stamps_ns: Ints) -> Ints:
         """Return stamps of its machine as stamps of the line's."""
@@ -116,7 +117,7 @@ class Placed:
         return self.stamps_ns(stamps_ns) + launch.wall_offset_ns
 
 
-def on_one_time_line(recordings: Sequence[Recording]) -> list[Placed]:
+def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
     """Return where the racks of these recordings are on the time line of the first one.
 
     Raises `Failure` if they did not run together, or nothing leads from one to another.
@@ -124,7 +125,7 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[Placed]:
     grids = [RackGrid(recording) for recording in recordings]
     for at, grid in enumerate(grids):
         _check_company(grid, grids[:at])
-    placed = {0: Placed(grids[0], grids[0])}
+    placed = {0: RackPlace(grids[0], grids[0])}
     while len(placed) < len(grids):
         near = [(a, b) for a in placed for b in range(len(grids)) if b not in placed]
         ways = ((a, b, way) for a, b in near if (way := _way(grids[b], grids[a])) is not None)
@@ -136,7 +137,7 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[Placed]:
                 2,
             )
         a, b, shifts = found
-        placed[b] = Placed(grids[b], grids[0], (*shifts, *placed[a].shifts))
+        placed[b] = RackPlace(grids[b], grids[0], (*shifts, *placed[a].shifts))
     return [placed[at] for at in range(len(grids))]
 
 

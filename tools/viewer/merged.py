@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from rack.tools.runs.recording import Recording
-from rack.tools.runs.time_line import Placed
+from rack.tools.runs.time_line import RackPlace
 from rack.tools.viewer.blueprint import RackViews, blueprint, together
 from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Stream, Timelines, new_recording
 
 
-def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
+def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
     """Write one recording of all these racks; `show` gets the part that is done, 0 to 1.
 
     The notes on the times of racks are in its log. Of a single rack it is that rack's run.rrd.
@@ -43,7 +43,7 @@ def write_merged(placed: Sequence[Placed], file: Path, show: Callable[[float], N
     recording.disconnect()
 
 
-def _note(stream: Stream, placed: Sequence[Placed]) -> None:
+def _note(stream: Stream, placed: Sequence[RackPlace]) -> None:
     for place in placed[1:]:
         stream.say(0, place.line.epoch_ns, "time line", place.note, "INFO")
 
@@ -54,8 +54,12 @@ def _blocks(recording: Recording, last: int, block: int) -> Iterator[tuple[int, 
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
     rings = {name: rows for name in names if len(rows := _rows(recording, name))}
     done = dict.fromkeys(rings, 0)
-    for tick in range(block, last + block, block):
-        ends = {name: int(np.searchsorted(rows["tick"], tick)) for name, rows in rings.items()}
+    for begin in range(0, last, block):
+        tick = min(last, begin + block)
+        # The last block has all that is left: what clock and operator wrote after the last cycle, too.
+        ends = {
+            name: int(np.searchsorted(rows["tick"], tick)) if tick < last else len(rows) for name, rows in rings.items()
+        }
         yield tick, {name: rings[name][done[name] : end] for name, end in ends.items() if end > done[name]}
         done = ends
 

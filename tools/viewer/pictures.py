@@ -53,12 +53,17 @@ class Screen:
     def __init__(self, client: ViewerClient) -> None:
         self._client = client
 
+    @property
+    def views(self) -> dict[str, str]:
+        """The views that are open, by name, and their ids."""
+        return {view.name: view.view_id for view in self._client.get_state().views}
+
     def look(self, at_s: float, view: str | None = None) -> Look:
         """Return the picture at a simulated time, s, once it no longer changes: all views, or the one of that name.
 
         Raises `KeyError` when there is no such view.
         """
-        shown = None if view is None else {v.name: v.view_id for v in self._client.get_state().views}[view]
+        shown = None if view is None else self.views[view]
         self._client.set_time(SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused")
         drawn, deadline = b"", time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:

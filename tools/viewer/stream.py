@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from rack.backplane.segment import Launch
-from rack.tools.runs.time_line import Placed
+from rack.tools.runs.time_line import RackPlace
 
 Ints = NDArray[np.int64]
 
@@ -31,8 +31,8 @@ SERVER_MEMORY = "200MB"
 """What the server keeps for a viewer that joins later."""
 
 
-class Times(NamedTuple):
-    """Times of rows, each (rows,): simulated, ns; tick; wall clock, ns."""
+class RowTimes(NamedTuple):
+    """RowTimes of rows, each (rows,): simulated, ns; tick; wall clock, ns."""
 
     simulated_ns: Ints
     ticks: Ints
@@ -45,18 +45,18 @@ class Timelines:
     Of a rack `placed` on the time line of another one, all three are that one's.
     """
 
-    def __init__(self, clock_ns: int, launch: Launch, placed: Placed | None = None) -> None:
+    def __init__(self, clock_ns: int, launch: Launch, placed: RackPlace | None = None) -> None:
         self.clock_ns = clock_ns
         self._offset_ns, self._placed = launch.wall_offset_ns, placed
         self._ticks: Ints = np.zeros(1, dtype=np.int64)
         self._stamps: Ints = np.array([launch.monotonic_ns])
 
-    def times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> Times:
+    def times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
         """Return the times of rows released at `ticks`, `within_ns` of simulated time later, stamped `stamps_ns`."""
         if (placed := self._placed) is None:
-            return Times(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
-        simulated_ns = placed.times_ns(ticks, within_ns)
-        return Times(simulated_ns, simulated_ns // placed.line.clock_ns, placed.wall_ns(stamps_ns))
+            return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
+        released = placed.times_ns(ticks, 0) // placed.line.clock_ns
+        return RowTimes(placed.times_ns(ticks, within_ns), released, placed.wall_ns(stamps_ns))
 
     def columns(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> list[rr.TimeColumn]:
         """Return the same times as columns."""

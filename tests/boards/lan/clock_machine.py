@@ -28,13 +28,13 @@ CLOCK_NS, PERIOD_NS = 2_500_000, 1_250_000
 
 def main(name: str, other: str, table: str, trips: int) -> None:
     """Compare clocks until stdin is closed."""
-    segment = Segment.create(Layout(name, CLOCK_NS, (), ()), "")
-    segment.words[System.PERIOD_NS] = PERIOD_NS
-    segment.words[System.EPOCH_NS] = epoch_ns = time.monotonic_ns()
-    peers = Peers([other])
-    clocks = Clocks(segment, peers, epoch_ns, OwnGrid(segment, 1))
     link = LanLink(name, LanTable.model_validate(json.loads(table)))
+    segment = Segment.create(Layout(name, CLOCK_NS, (), ()), "")
     try:
+        segment.words[System.PERIOD_NS] = PERIOD_NS
+        segment.words[System.EPOCH_NS] = epoch_ns = time.monotonic_ns()
+        peers = Peers([other])
+        clocks = Clocks(segment, peers, epoch_ns, OwnGrid(segment, 1))
         clocks.open(link, Sealer())
         peers.watch(link.watch_alive(), is_lockstep=False)
         link.declare_alive(epoch_ns)

@@ -13,6 +13,7 @@ HEARD = status(
     Field("count", "i8", "1", "count last heard"),
     Field("total", "i8", "1", "sum of all counts heard"),
     Field("lost", "i8", "1", "cycles in which the other rack's writer was lost"),
+    Field("backward", "i8", "1", "how often a new count was not above the one before it"),
 )
 MET = status("met", 1, Field("presence", "u1", "1", "where the other rack is"), Field("since", "i8", "tick", "since"))
 
@@ -37,6 +38,7 @@ class Echo(Executor):
         """Add what is new, and count the cycles in which the writer is lost."""
         other = read.other
         if other.is_new:
+            write.status.backward += other.value.count <= write.status.count and write.status.total > 0
             write.status.count = other.value.count
             write.status.total += other.value.count
         write.status.lost += other.is_lost

@@ -10,7 +10,7 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -121,11 +121,17 @@ def _outcome(rack: Rack) -> Outcome:
 
 
 class RackProcess:
-    """A rack in a process of its own. `pid` is its launcher's."""
+    """A rack in a process of its own, started by `popen`. `pid` is its launcher's."""
 
-    def __init__(self, config: Path, seconds: float | None, *settings: str) -> None:
+    def __init__(
+        self,
+        config: Path,
+        seconds: float | None,
+        *settings: str,
+        popen: Callable[..., subprocess.Popen[str]] = subprocess.Popen,
+    ) -> None:
         command = [sys.executable, "-m", "tests.boards.lan.racks", str(config), str(seconds or 0), *settings]
-        self._process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self._process = popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         self.pid = self._process.pid
         self.events: list[dict[str, Any]] = []
 

@@ -82,6 +82,10 @@ def test_flaws_are_counted_by_cause() -> None:
     ):
         sealer.opened(KEY, envelope, payload)
     assert sealer.flaws == {Flaw.MALFORMED: 3, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
+    successor = Sealer(b"s" * 32, MOST)
+    successor.resume(sealer.flaws.values())
+    successor.opened(KEY, None, fits)
+    assert successor.flaws == {Flaw.MALFORMED: 4, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
 
 
 def test_nothing_from_the_network_is_decoded_as_a_program() -> None:

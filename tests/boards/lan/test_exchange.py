@@ -28,6 +28,7 @@ from tests.processes import BOUND_S, wait_until
 
 SECONDS = 120.0
 """Longest run of a rack: the tests end them long before."""
+LAUNCH_S = 60.0
 GENTLE = ("adapter.lan.lease_ms=1000",)
 """Longer than any pause of a loaded machine."""
 
@@ -48,7 +49,7 @@ def attached(name: str) -> Segment:
             return False
         return True
 
-    wait_until(is_there)
+    wait_until(is_there, LAUNCH_S)
     return found[0]
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from rack.boards.config import load, loads, resolve, wire
 from rack.boards.config.files import CONFIGS
+from rack.boards.config.network import network_notes
 from rack.boards.errors import ConfigError
 from rack.tools.lan.certificates import make_credentials
 from tests.boards.lan.racks import rack_text
@@ -128,6 +129,19 @@ def test_a_certificate_cannot_be_checked_for_an_address_of_ipv6(tmp_path: Path) 
     assert mistakes(tmp_path, "tls/[::1]:7447", own) == []
     (line,) = mistakes(tmp_path, "", own, connect=("tls/[::1]:7447",))
     assert "permitted: a host name, or an address of IPv4" in line
+
+
+def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
+    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
+    far, near, own = "tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447", 'certificates = "certs"'
+    for listen, lan, note in (
+        (near, "", ""),
+        (TLS, own, ""),
+        (far, "insecure = true", f"without TLS: whoever reaches {far} may read and forge what is exchanged"),
+        (far, f"insecure = true\n{own}", f"without TLS: whoever reaches {far} may read what is exchanged"),
+    ):
+        assert mistakes(tmp_path, listen, lan) == []
+        assert network_notes(load(tmp_path / "rack.toml")) == ([note] if note else [])
 
 
 def test_bundled_configs_bring_no_certificates() -> None:

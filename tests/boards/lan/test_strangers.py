@@ -97,15 +97,16 @@ class Site:
 
 
 @contextmanager
-def at_home(folder: Path) -> Iterator[Site]:
-    """Run a rack over TLS that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
+def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
+    """Run a rack that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
     for each in ("set", "forged"):
-        make_credentials(folder / each, {name: ["127.0.0.1"] for name in ("home", *NAMES)}, 1)
+        addresses = {name: ["127.0.0.1"] for name in ("home", *NAMES)}
+        make_credentials(folder / each, {**addresses, "impostor": ["127.9.9.9"]}, 1)
     port, friends_port = free_port(), free_port()
     entry = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
     table = {
-        "listen": [f"tls/127.0.0.1:{port}"],
-        "connect": [f"tls/127.0.0.1:{friends_port}"],
+        "listen": [f"{protocol}/127.0.0.1:{port}"],
+        "connect": [f"{protocol}/127.0.0.1:{friends_port}"],
         "certificates": str(folder / "set"),
         "most_bytes": MOST,
         "permit": {"viewer": ["watch"], "friend": ["stop"]},
@@ -143,6 +144,8 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
     liar, second = pulse("liar"), out_key("liar", "second.status")
     lies = [(liar, 100, None), (liar, MOST + 1, liar), (second, 100, liar), *eager["puts"], *own]
     heavy = [(pulse("heavy"), size, pulse("heavy")) for size in (100, 1 << 20)]
+    impostor = site.mutual("impostor") | {"connect/endpoints": []}
+    impostor["listen/endpoints"] = [f"tls/127.0.0.1:{site.friends_port}"]
     asks = [READ, COMMAND, STOP, "rack/home/ask/stop/friend", "rack/home/ask/**"]
     return {
         "friend": friend(site),
@@ -154,6 +157,7 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
         "liar": {"settings": site.mutual("liar"), **secret, "puts": [*lies, (liar, 100, liar)]},
         "mole": {"settings": site.mutual("mole"), "puts": [(pulse("mole"), 9, pulse("mole"))], "secret": "00" * 32},
         "heavy": {"settings": site.mutual("heavy"), **secret, "puts": heavy},
+        "impostor": {"settings": impostor, **eager},
     }
 
 
@@ -196,6 +200,10 @@ def test_who_shows_no_certificate_of_ours_is_not_connected(found: Found, name: s
     assert found.of[name] == {"heard": {}, "tokens": {}, "answers": {}, "connected": False}
 
 
+def test_a_rack_goes_out_only_to_whom_the_address_belongs(found: Found) -> None:
+    assert found.of["impostor"] == {"heard": {}, "tokens": {}, "answers": {}, "connected": False}
+
+
 def test_a_certificate_of_ours_without_a_right_gets_nothing(found: Found) -> None:
     assert found.of["nobody"] == {"heard": {}, "tokens": {}, "answers": {}, "connected": True}
     assert STRANGER not in found.home["asked"]
@@ -231,3 +239,19 @@ def test_a_seal_with_another_secret_does_not_fit(found: Found) -> None:
 def test_a_huge_message_is_not_put_together(found: Found) -> None:
     assert found.home["good"][pulse("heavy")] == found.home["came"][pulse("heavy")] > 0
     assert found.home["sizes"][pulse("heavy")] == [100]
+
+
+def test_without_tls_keys_and_seals_remain(tmp_path: Path) -> None:
+    mole, lies = pulse("mole"), [(out_key(name, "pulse.status"), 9, None) for name in ("nobody", "home")]
+    with at_home(tmp_path, "tcp") as site:
+        both = {
+            "friend": {**friend(site), "settings": site.bare("tcp")},
+            "mole": {"settings": site.bare("tcp"), "puts": [(mole, 9, mole), *lies]},
+        }
+        with running("strangers", json.dumps(both)) as others:
+            wait_until(lambda: site.home.state()["came"].get(mole, 0) > ROUNDS and others.state()["friend"]["answers"])
+            wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
+            home = site.home.state()
+    assert set(home["came"]) == {mole, pulse("friend")}
+    assert home["good"][mole] == 0
+    assert home["flaws"]["UNSIGNED"] == home["came"][mole]

@@ -1,0 +1,98 @@
+"""Several racks in one recording for the viewer: each below its name, on the time line of the first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from rack.tools.runs.recording import Recording
+from rack.tools.runs.time_line import on_one_time_line
+from rack.tools.viewer.merged import write_merged
+from rack.tools.viewer.pictures import NoViewerError, opened
+from rack.tools.viewer.reading import read
+from tests.shared_runs import nasrem_run
+from tests.tools.machines import CLOCK_NS, MS, TICKS, A, B, S, recorded
+
+LIVE = ("/recorder/load",)
+"""What only the recorder itself can write."""
+
+
+def contents(file: Path) -> dict[tuple[str, str], Any]:
+    """Return all values of all components in a file, in the order of ticks, by entity and component."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    for chunk in RrdReader(str(file)).stream().to_chunks():
+        if chunk.entity_path.startswith(("/__", *LIVE)):
+            continue
+        batch = chunk.to_record_batch()
+        ticks = batch.column("tick").to_pylist() if "tick" in batch.schema.names else [-1] * batch.num_rows
+        for name in batch.schema.names:
+            if ":" in name:
+                rows = zip(ticks, map(repr, batch.column(name).to_pylist()), strict=True)
+                found.setdefault((chunk.entity_path, name), []).extend(rows)
+    return {key: sorted(rows) for key, rows in found.items()}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return Recording(nasrem_run(tmp_path_factory))
+
+
+def test_one_rack_from_its_files_is_what_its_recorder_made_of_its_rings(run: Recording, tmp_path: Path) -> None:
+    write_merged(on_one_time_line([run]), tmp_path / "again.rrd")
+    again, live = contents(tmp_path / "again.rrd"), contents(run.folder / "run.rrd")
+    # Rows of losses come with each block, and blocks are cut elsewhere; so are the ends of lines of limits.
+    loose = ("/recorder/rows_lost", "limits")
+    assert again.keys() == live.keys()
+    for key, rows in live.items():
+        if not key[0].endswith(loose):
+            assert again[key] == rows, key
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("both")
+    places = on_one_time_line([recorded(A, [B], folder / "a"), recorded(B, [A], folder / "b")])
+    shown: list[float] = []
+    write_merged(places, folder / "both.rrd", shown.append)
+    assert shown == sorted(shown)
+    assert shown[-1] == 1.0
+    return folder / "both.rrd"
+
+
+def test_each_rack_is_below_its_name(both: Path) -> None:
+    entities = {path.split("/")[1] for path in RrdReader(str(both)).store().schema().entity_paths()}
+    assert {"a", "b", "log"} >= {entity for entity in entities if not entity.startswith("__")}
+    assert {"a", "b"} <= entities
+
+
+def test_what_happened_at_one_time_is_at_one_time(both: Path) -> None:
+    for machine in (A, B):
+        chunks = RrdReader(str(both)).stream().filter(content=f"/{machine.rack}/boards/2-pulse/executor").to_chunks()
+        batches = [chunk.to_record_batch() for chunk in chunks if "tick" in chunk.timeline_names]
+        times = np.concatenate([batch.column("sim_time").to_numpy().astype(np.int64) for batch in batches])[::4]
+        true = [A.shows(machine.true_ns(tick)) - A.epoch_ns for tick in range(TICKS)]
+        assert np.abs(np.sort(times) - true).max() < MS
+        ticks = np.concatenate([batch.column("tick").to_numpy() for batch in batches])[::4]
+        assert (ticks == times // CLOCK_NS).all()
+
+
+def test_how_uncertain_it_is_stands_in_the_log(both: Path) -> None:
+    (line,) = read(both, "/log/time\\ line", "TextLog:text").values.ravel().tolist()
+    begin = (A.shows(B.begins_ns) - A.epoch_ns) / S
+    assert line.startswith(f"rack 'b' is on the time line of 'a': it begins at +{begin:.3f}")
+    assert line.endswith(" ms")
+
+
+def test_no_view_of_several_racks_fails_in_the_viewer(both: Path) -> None:
+    try:
+        with opened(both) as screen:
+            look = screen.look(at_s=2.0)
+            views = set(screen.views)
+    except NoViewerError as error:
+        pytest.skip(str(error))
+    assert look.complaints == ()
+    assert {"a", "b", "log of all"} <= views
