@@ -8,6 +8,9 @@ from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import AnyRackName, AskAs, Certificates
 
+LOOK_S = 0.2
+"""Time from look to look: short, so that the end of a run on another machine is still seen."""
+
 
 def top(rack: AnyRackName, certificates: Certificates = "", name: AskAs = OPERATOR) -> None:
     """Watch a running rack until its run is over, or until Ctrl-C.
@@ -29,6 +32,6 @@ def top(rack: AnyRackName, certificates: Certificates = "", name: AskAs = OPERAT
         monitor = RackMonitor(one.segment)
         with display_for(silent=False) as display:
             display.show(monitor.look())
-            while not one.segment.run_is_over and not ended.wait(display.period_s):
+            while not one.segment.run_is_over and not ended.wait(LOOK_S):
                 one.refresh()
                 display.show(monitor.look())

@@ -53,6 +53,9 @@ BYTES_A_CYCLE = MOST_CONTENT
 """Bytes of content after which a cycle answers no further question to read."""
 CLIENT_S = 2.0
 """Real time without a question of a client after which it counts as gone."""
+WATCHED_S, LINGER_S, PAUSE_S = 1.0, 0.3, 0.005
+"""At the end of a run: time since the last look from which nobody watches any more, how long those who do may still
+look, and how often the desk then has a cycle; real time."""
 MOST_CLIENTS = 16
 """Requests that wait for clients of this desk, at most."""
 _ASKER = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
@@ -111,7 +114,7 @@ class Desk:
         self._channels: dict[Right, Callable[[], Iterator[Question]]] = {}
         self._waiting: list[Waiting] = []
         self.count = DeskCount()
-        self._sent = 0
+        self._sent = self._tick = self._watched_ns = 0
         self._sealer: Sealer
         self._launch = 0
 
@@ -123,7 +126,7 @@ class Desk:
 
     def answer(self, tick: int) -> None:
         """Answer the questions that have come, within the bounds of a cycle."""
-        self._sent = 0
+        self._sent, self._tick = 0, tick
         for right, channel in self._channels.items():
             answers = 0
             for question in islice(channel(), QUESTIONS_A_CYCLE):
@@ -137,6 +140,16 @@ class Desk:
                     break
         if self._waiting:
             self._dismiss()
+
+    def close(self) -> None:
+        """Let those who watch see the end of the run, which their last look was too early for."""
+        now = time.monotonic_ns()
+        if now - self._watched_ns > WATCHED_S * 1e9:
+            return
+        self._channels = {"watch": self._channels["watch"]}
+        while time.monotonic_ns() - now < LINGER_S * 1e9:
+            self.answer(self._tick)
+            time.sleep(PAUSE_S)
 
     def resume(self, record: Any) -> None:
         """Count on from the group of its predecessor's last status."""
@@ -198,7 +211,7 @@ class Desk:
         return Code.GRANTED, b""
 
     def _read(self, payload: bytes) -> tuple[Code, bytes]:
-        memory = self._segment.bytes
+        memory, self._watched_ns = self._segment.bytes, time.monotonic_ns()
         stretches = unpacked_stretches(payload, len(memory))
         if stretches is None:
             return Code.OUTSIDE, b""

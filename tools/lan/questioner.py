@@ -67,7 +67,7 @@ class Questioner:
 
     def __init__(self, at: HostAddress, asker: Asker) -> None:
         self._at, self._asker = at, asker
-        _check_reach(at, asker)
+        check_reach(at, asker)
         protocol = "tls" if asker.certificates else "tcp"
         endpoint = f"{protocol}/{at.host}:{at.port}"
         table = LanTable(connect=(endpoint,), certificates=asker.certificates or None, most_bytes=MOST_BYTES)
@@ -196,7 +196,7 @@ class Questioner:
         raise Failure(f"rack '{rack}' {reasons[answer.code]}")
 
 
-def _check_reach(at: HostAddress, asker: Asker) -> None:
+def check_reach(at: HostAddress, asker: Asker) -> None:
     """Raise `Failure` when nobody listens there, it refuses this user's certificate, or there is none to show."""
     host = at.host.strip("[]")
     try:

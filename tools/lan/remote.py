@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Self
 
+from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.operator_table import Request, RequestEntry, RequestStage, RequestWord
 from rack.boards.lan.questions import (
     MOST_CONTENT,
@@ -86,15 +87,18 @@ class RemoteRack:
         self._check_right("command")
         (answer,) = self._racks.ask(self._launch, "give", [packed_request(request)])
         ticket = Ticket.unpacked(answer.content)
-        if ticket is None:
+        if ticket is None or ticket.entry >= OPERATOR_ENTRIES:
             raise Failure(f"rack '{self.address}': its answer to the command is malformed")
-        self.refresh()
         entry = RequestEntry(self.segment, ticket.entry)
         try:
+            self.refresh()
             yield entry
         finally:
-            if entry[RequestWord.TICKET] == ticket.number and entry.stage == RequestStage.WAITING:
-                list(self._racks.ask(self._launch, "withdraw", [ticket.packed()]))
+            is_known = entry[RequestWord.TICKET] == ticket.number
+            if not is_known or entry.stage == RequestStage.WAITING:
+                # If the rack is out of reach, it withdraws the request by itself.
+                with suppress(Failure):
+                    list(self._racks.ask(self._launch, "withdraw", [ticket.packed()]))
 
     def _check_right(self, right: str) -> None:
         permit = tomllib.loads(self.segment.config)["adapter"]["lan"].get("permit", {})

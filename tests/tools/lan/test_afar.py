@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
+from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.runs.window import free_port
@@ -30,6 +33,8 @@ peers = ["elsewhere"]
 operator = ["watch", "command", "stop"]
 watcher = ["watch"]
 """
+LATE = str(10**9)
+"""A tick that no test reaches."""
 NOT_PERMITTED = "rack '{}' does not permit '{}' to {}; its config: adapter.lan.permit"
 
 
@@ -88,7 +93,22 @@ def started(folder: Path, mode: str, *settings: str) -> Iterator[Far]:
         process.communicate()
 
 
-@pytest.fixture(scope="module", params=["realtime", "lockstep"])
+@contextmanager
+def client(*words: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a command in a process of its own, which is killed at the end, should it still run."""
+    process = subprocess.Popen([*RACK, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+REALTIME = pytest.mark.parametrize("far", ["realtime"], indirect=True)
+IN_BOTH = pytest.mark.parametrize("far", ["realtime", "lockstep"], indirect=True)
+
+
+@pytest.fixture(scope="module")
 def far(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
     """A rack on this machine, to be reached by its address."""
     # In lockstep it would wait for its peer.
@@ -105,6 +125,7 @@ def shape(document: Any) -> Any:
     return "number" if isinstance(document, float | int) and not isinstance(document, bool) else document
 
 
+@IN_BOTH
 def test_a_status_from_afar_has_the_fields_of_the_local_one(far: Far) -> None:
     near = json.loads(rack("status", far.name, "--json").stdout)
     (seen,) = afar(f"status {far.address} --json")
@@ -115,6 +136,7 @@ def test_a_status_from_afar_has_the_fields_of_the_local_one(far: Far) -> None:
     assert all(row["cycles"] > before["cycles"] for row, before in zip(document["tasks"], near["tasks"], strict=True))
 
 
+@IN_BOTH
 def test_a_command_is_given_taken_up_and_resumed(far: Far) -> None:
     held, listed, resumed, wrong = afar(
         f"command {far.address} upper hold --wait --json",
@@ -131,6 +153,7 @@ def test_a_command_is_given_taken_up_and_resumed(far: Far) -> None:
     assert wrong.err.startswith('what = "jump": ')
 
 
+@REALTIME
 def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
     ended = afar(
         f"command {far.address} upper hold --as watcher",
@@ -152,16 +175,17 @@ def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
     assert [one.status for one in ended] == [1, 1, 1, 1, 1, 2]
 
 
+@REALTIME
 def test_the_racks_at_a_host_are_listed_with_the_peers_that_they_await(far: Far) -> None:
     shown, closed = afar(f"list --lan {far.port} --json", f"list --lan {far.port} --as nobody --json")
     found = next(row for row in json.loads(shown.out) if row["host"] == far.port)
-    peers = [] if "lockstep" in far.name else [["elsewhere", "awaited"]]
-    assert (found["rack"], found["state"], found["peers"]) == (far.name, "running", peers)
+    assert (found["rack"], found["state"], found["peers"]) == (far.name, "running", [["elsewhere", "awaited"]])
     assert found["age_s"] > 0
     hidden = next(row for row in json.loads(closed.out) if row["host"] == far.port)
     assert (hidden["state"], hidden["detail"]) == ("closed", NOT_PERMITTED.format(far.name, "nobody", "watch"))
 
 
+@REALTIME
 def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> None:
     segment = Segment.attach(far.name)
     stopped, seen = afar(f"estop {far.address} --json", f"status {far.address}")
@@ -173,6 +197,32 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
     assert rack("estop", far.name, "--reset").returncode == 0
     assert segment.words[System.EMERGENCY_STOP] == 0
     segment.close()
+
+
+@REALTIME
+def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
+    segment = Segment.attach(far.name)
+    table = OperatorTable(segment)
+    with client("top", far.address) as top, client("command", far.address, "upper", "hold", "--tick", LATE) as command:
+        assert top.stdout is not None
+        assert top.stdout.readline().startswith(far.name)
+        wait_until(table.waiting)
+        for process in (top, command):
+            process.send_signal(signal.SIGINT)
+        assert [process.wait(BOUND_S) for process in (top, command)] == [128 + signal.SIGINT] * 2
+        # At once, or, if it did not know its ticket yet, when it has not been heard of for a while.
+        wait_until(lambda: not table.waiting())
+    segment.close()
+
+
+@REALTIME
+def test_who_watches_sees_the_run_stop(far: Far) -> None:
+    with client("top", far.address) as top:
+        assert top.stdout is not None
+        assert "running" not in top.stdout.readline()
+        assert rack("stop", far.name).returncode == 0
+        assert top.wait(BOUND_S) == 0
+        assert "gone" not in top.stdout.read()
 
 
 def test_a_host_that_cannot_be_reached_is_one_line() -> None:
