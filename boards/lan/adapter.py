@@ -103,7 +103,7 @@ class LanAdapter(Adapter):
             for port, entry in self._imports.items():
                 entry.resume(getattr(before.value, f"import_{port}"), status.newest)
             self._desk.resume(before.value.desk)
-            self._flaws = [int(count) for count in before.value.flaws]
+            self._flaws = list(before.value.flaws.tolist())
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
