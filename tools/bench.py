@@ -356,37 +356,22 @@ def systems(
 
 @bench.command()
 def lan(
-    racks: Annotated[
-        list[int] | None, typer.Option(metavar="N", min=1, max=64, help="racks; may be given several times")
-    ] = None,
-    rate: Annotated[
-        list[float] | None,
-        typer.Option("--rate", metavar="HZ", min=0.2, max=50.0, help="rate; may be given several times"),
-    ] = None,
+    racks: Annotated[list[int] | None, typer.Option(metavar="N", min=1, max=64, help="racks; several times")] = None,
+    rate: Rates = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 3.0,
     rounds: Rounds = 1,
-    loss: Annotated[
-        float, typer.Option(metavar="SHARE", min=0.0, max=0.2, help="share of packets lost, as in 0.01")
-    ] = 0.0,
+    loss: Annotated[float, typer.Option(metavar="SHARE", min=0, max=0.2, help="share of packets lost")] = 0.0,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
     """Measure racks that exchange messages over a network.
 
-    A coordinator exchanges with 1 to 32 racks at 1, 10 and 50 Hz, each on a machine of its own: network namespaces,
-    made for this and removed afterwards (root only). By turns with the network link of a rack, with TLS and without:
-    bare UDP, and the DDS `cyclonedds`. A rack seals its messages and sees who is there; UDP does neither.
+    A coordinator exchanges with 1 to 32 racks at 1, 10 and 50 Hz, each on a machine of its own: a network namespace
+    (root only). By turns with a rack's network link, with TLS and without: bare UDP, and the DDS `cyclonedds`.
 
     The output shows round trips, ages of messages when a cycle takes them, bytes a second on the coordinator's cable,
-    processor time, and the time to see that a cable is pulled, plugged in again, or a process killed; also messages
-    that never came, and deaths that were none. All machines share the cores of this one: with many racks the processor
-    is the limit, not the network. `cyclictest` shows how late the machine itself wakes up.
-
-    \b
-    Examples:
-      rack bench lan
-      rack bench lan --racks 2 --rate 10 --rate 50 --seconds 20 --loss 0.01
-      rack bench lan --plot pictures
+    processor time, and the time to see a cable pulled, plugged in, or a process killed; also messages that never came,
+    and false deaths. All machines share the cores of this one: with many racks these are the limit, not the network.
     """
     from rack.tools.benches.lan import COUNTS, RATES_HZ, LanRuns, measure
     from rack.tools.console.progress import progress_for

@@ -1,6 +1,11 @@
 """The link: a rack's session on the network, with everything that looks for others by itself switched off.
 
 What comes is kept in channels of fixed length, which overwrite the oldest; the adapter takes it in its own cycles.
+
+Strangers who fail their TLS handshake disturb nobody who is connected. But zenoh takes no new connection for 0.1 s
+after each (its issue 2685), and over quic only one handshake at a time (2719). A rack that also connects outwards is
+found all the same: where strangers may come, let each rack list the others in `connect`, and let the firewall admit
+their addresses alone.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ class Coordinator(Executor):
             return self._operated.keeps(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):
             return ""
-        lost = next((arm for arm, reading in readings.items() if reading.is_lost), "")
+        lost = next((arm for arm, reading in readings.items() if reading.is_there and reading.is_lost), "")
         return f"{lost} is lost: the program waits until it is back" if lost else ""
 
     def _reason_to_wait(self, readings: Mapping[str, Reading]) -> str:

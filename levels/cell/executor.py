@@ -111,10 +111,10 @@ class OrderedTaskExecutor(TaskExecutor):
         """Take up what the coordinator says, or note why it says nothing."""
         order: Message = reading.value
         self._held = self._absent = ""
-        if reading.is_lost:
-            self._absent = f"{self._source} is lost: held until it is back"
-        elif not reading.is_there:
+        if not reading.is_there:
             self._absent = f"no orders from {self._source} yet"
+        elif reading.is_lost:
+            self._absent = f"{self._source} is lost: held until it is back"
         else:
             self._taken.hear(order.program, order.id, order.what, order.reason)
             self._held = order.reason if order.hold and self._taken.is_under_way else ""

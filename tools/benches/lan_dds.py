@@ -15,7 +15,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from rack.tools.benches.lan_ends import COORDINATOR, LEASE_MS, ORDER_BYTES, STATUS_BYTES, UNREAD, Notice, Place, Take
+from rack.tools.benches.lan_ends import COORDINATOR, LEASE_MS, ORDER_BYTES, STATUS_BYTES, UNREAD, LanPlace, Notice, Take
 
 QOS = Qos(
     Policy.Reliability.Reliable(duration(milliseconds=100)),
@@ -40,14 +40,14 @@ SETTINGS = """
 
 
 @dataclass
-class Order(IdlStruct):
+class DdsOrder(IdlStruct):
     """What the coordinator sends. cyclonedds passes arrays of bytes on as they are."""
 
     data: array[uint8, ORDER_BYTES]  # type: ignore[type-arg, valid-type]
 
 
 @dataclass
-class Status(IdlStruct):
+class DdsStatus(IdlStruct):
     """What the others send."""
 
     data: array[uint8, STATUS_BYTES]  # type: ignore[type-arg, valid-type]
@@ -56,7 +56,7 @@ class Status(IdlStruct):
 def _taken(reader: DataReader[Any]) -> Iterator[bytes]:
     for message in reader.take(UNREAD):
         # That a writer has gone is a message, too.
-        if isinstance(message, Order | Status):
+        if isinstance(message, DdsOrder | DdsStatus):
             yield message.data  # type: ignore[misc]  # the array is bytes
 
 
@@ -91,11 +91,11 @@ class _Events(Listener):
 class DdsEnd:
     """A participant, with a reader and a writer for each machine it exchanges messages with."""
 
-    def __init__(self, place: Place, notice: Notice, take: Take | None) -> None:
+    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None:
         peers = "".join(f'<Peer address="{place.addresses[other]}"/>' for other in place.others)
         self._domain = Domain(0, SETTINGS.format(own=place.addresses[place.machine], peers=peers))
         participant = DomainParticipant(0)
-        own, theirs = (Order, Status) if place.machine == COORDINATOR else (Status, Order)
+        own, theirs = (DdsOrder, DdsStatus) if place.machine == COORDINATOR else (DdsStatus, DdsOrder)
         self._kind = own
         self._writers: dict[int, DataWriter[Any]] = {}
         self._readers: dict[int, DataReader[Any]] = {}

@@ -27,7 +27,7 @@ Notice = Callable[[int, bool], None]
 
 
 @dataclass(frozen=True)
-class Place:
+class LanPlace:
     """Where an end is: on which machine, and the addresses of all. `certificates`: a folder; empty: without TLS."""
 
     machine: int
@@ -51,7 +51,7 @@ class End(Protocol):
     `notice` is called in a thread, too.
     """
 
-    def __init__(self, place: Place, notice: Notice, take: Take | None) -> None: ...
+    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None: ...
 
     def send(self, to: int, content: bytes) -> None:
         """Send a message to a machine, without waiting."""
@@ -63,7 +63,7 @@ class End(Protocol):
 class UdpEnd:
     """A bare UDP socket: no connection, no seal, and nobody notices who is there."""
 
-    def __init__(self, place: Place, notice: Notice, take: Take | None) -> None:
+    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None:
         self._places = {other: (place.addresses[other], PORT) for other in place.others}
         self._from = {address: other for other, (address, _) in self._places.items()}
         self._socket = socket.socket(type=socket.SOCK_DGRAM)

@@ -15,8 +15,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from rack.backplane.process import readable
-from rack.tools.benches.lan_ends import COORDINATOR, Place, rack_name
-from rack.tools.benches.lan_machine import ANSWER_S, FIND_S, TLS, Found, Task, Window
+from rack.tools.benches.lan_ends import COORDINATOR, LanPlace, rack_name
+from rack.tools.benches.lan_machine import ANSWER_S, FIND_S, TLS, LanFound, LanTask, LanWindow
 from rack.tools.benches.network import Lab
 from rack.tools.console.answer import Failure
 
@@ -37,8 +37,8 @@ class Group:
         addresses = tuple(lab.address(machine) for machine in range(len(lab)))
         self._folder = TemporaryDirectory(prefix="rack-bench-")
         certificates = self._certificates(addresses) if who == TLS else ""
-        places = [Place(machine, addresses, certificates) for machine in range(len(lab))]
-        self._tasks = [Task(who, place, echoes, priority) for place in places]
+        places = [LanPlace(machine, addresses, certificates) for machine in range(len(lab))]
+        self._tasks = [LanTask(who, place, echoes, priority) for place in places]
         self._members: list[_Member] = []
         self.false_deaths = 0
 
@@ -75,17 +75,17 @@ class Group:
     def _coordinator(self) -> _Member:
         return self._members[COORDINATOR]
 
-    def run(self, rate_hz: float, cycles: int) -> list[Found]:
+    def run(self, rate_hz: float, cycles: int) -> list[LanFound]:
         """Measure on all machines at a rate; return what each has found."""
         self.begin(rate_hz, cycles)
         bound_s = HEAD_START_NS * 1e-9 + (cycles + 1) / rate_hz + ANSWER_S + FIND_S
-        found = [Found(**member.found(bound_s)) for member in self._members]
+        found = [LanFound(**member.found(bound_s)) for member in self._members]
         self._note_deaths()
         return found
 
     def begin(self, rate_hz: float, cycles: int) -> None:
         """Let all machines exchange at a rate, without waiting for their end."""
-        window = Window(time.monotonic_ns() + HEAD_START_NS, round(1e9 / rate_hz), cycles)
+        window = LanWindow(time.monotonic_ns() + HEAD_START_NS, round(1e9 / rate_hz), cycles)
         for member in self._members:
             member.order(window)
 
@@ -122,7 +122,7 @@ class Group:
 class _Member:
     """One process of a group."""
 
-    def __init__(self, lab: Lab, task: Task) -> None:
+    def __init__(self, lab: Lab, task: LanTask) -> None:
         self._name = f"{task.who}, machine {task.place.machine}"
         self._errors = TemporaryFile()  # noqa: SIM115  # closed when the process ends
         argv = [sys.executable, "-m", "rack.tools.benches.lan_machine", json.dumps(asdict(task))]
@@ -130,7 +130,7 @@ class _Member:
         self._unread = b""
         self.notices: list[dict[str, Any]] = []
 
-    def order(self, window: Window) -> None:
+    def order(self, window: LanWindow) -> None:
         """Let it measure a window."""
         assert self.process.stdin is not None
         self.process.stdin.write((json.dumps(asdict(window)) + "\n").encode())

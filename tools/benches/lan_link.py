@@ -10,13 +10,13 @@ from rack.boards.lan.config import LanTable
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, out_key
 from rack.boards.lan.link import Arrived, LanLink
-from rack.tools.benches.lan_ends import COORDINATOR, LEASE_MS, PORT, UNREAD, Notice, Place, Take, rack_name
+from rack.tools.benches.lan_ends import COORDINATOR, LEASE_MS, PORT, UNREAD, LanPlace, Notice, Take, rack_name
 
 
 class RackEnd:
     """The link of a rack's network adapter, with its envelopes and seals."""
 
-    def __init__(self, place: Place, notice: Notice, take: Take | None) -> None:
+    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None:
         self._link = link = LanLink(rack_name(place.machine), _table(place))
         self._number = 0
         keys = {other: _key(place.machine, other) for other in place.others}
@@ -62,7 +62,7 @@ def _key(writer: int, reader: int) -> str:
     return out_key(rack_name(writer), _mailbox(reader))
 
 
-def _table(place: Place) -> LanTable:
+def _table(place: LanPlace) -> LanTable:
     """Return what would stand in the config of this rack."""
     others = {rack_name(other): other for other in place.others}
     imported = {

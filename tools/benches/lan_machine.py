@@ -1,7 +1,7 @@
 """What runs on each machine of `rack bench lan`: one end, which exchanges messages at a rate and measures.
 
-It is started with one line of JSON, a `Task`, says when it sees those that it exchanges messages with, and then takes a
-`Window` a line, until it is killed. In every window each machine has a grid with a phase of its own, as racks have.
+It is started with one line of JSON, a `LanTask`, says when it sees those that it exchanges messages with, and then
+takes a `LanWindow` a line, until it is killed. In a window each machine has a grid of its own phase, as racks have.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from struct import Struct
 from typing import Any
 
 from rack.backplane.process import die_with_parent, pin, set_priority
-from rack.tools.benches.lan_ends import COORDINATOR, ORDER_BYTES, STATUS_BYTES, End, Place
+from rack.tools.benches.lan_ends import COORDINATOR, ORDER_BYTES, STATUS_BYTES, End, LanPlace
 
 TLS, TCP = "rack, TLS", "rack, TCP"
 ENDS = {
@@ -36,23 +36,24 @@ _HEAD = Struct("<qq")
 
 
 @dataclass(frozen=True)
-class Task:
+class LanTask:
     """What one process is to do. `echoes`: answer, or count answers, at once; else take messages in cycles."""
 
     who: str
-    place: Place
+    place: LanPlace
     echoes: bool
     priority: int
 
     @classmethod
-    def read(cls, text: str) -> Task:
+    def read(cls, text: str) -> LanTask:
         """Return the task that `json.dumps(asdict(...))` wrote."""
         table = json.loads(text)
-        return cls(**table | {"place": Place(**table["place"])})
+        place = table["place"] | {"addresses": tuple(table["place"]["addresses"])}
+        return cls(**table | {"place": LanPlace(**place)})
 
 
 @dataclass(frozen=True)
-class Window:
+class LanWindow:
     """A measurement: cycles on a grid of `period_ns` from `start_ns` on, CLOCK_MONOTONIC."""
 
     start_ns: int
@@ -61,7 +62,7 @@ class Window:
 
 
 @dataclass
-class Found:
+class LanFound:
     """What one machine has found in a window: ages or round trips, us; messages that never came; its processor time."""
 
     us: list[float] = field(default_factory=list)
@@ -72,7 +73,7 @@ class Found:
 class Machine:
     """The process of one machine."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: LanTask) -> None:
         self._place, self._echoes = task.place, task.echoes
         self._there: set[int] = set()
         self._all_there, self._answered = threading.Event(), threading.Event()
@@ -100,20 +101,20 @@ class Machine:
         if len(self._there) == len(self._place.others):
             self._all_there.set()
 
-    def measure(self, window: Window) -> Found:
+    def measure(self, window: LanWindow) -> LanFound:
         """Run a window."""
         before_ns = time.process_time_ns()
         if not self._echoes:
             found = self._cycle(window)
         else:
-            found = self._ask(window) if self._place.machine == COORDINATOR else Found()
+            found = self._ask(window) if self._place.machine == COORDINATOR else LanFound()
         # Of all threads.
         found.processor_us = (time.process_time_ns() - before_ns) * 1e-3
         return found
 
-    def _cycle(self, window: Window) -> Found:
+    def _cycle(self, window: LanWindow) -> LanFound:
         """Take in each cycle what has come, and send: ages are those of messages when a cycle takes them."""
-        found = Found()
+        found = LanFound()
         # The coordinator at 0, the others spread over its period.
         shift = self._place.machine * window.period_ns // len(self._place.addresses)
         for _ in _grid(window, shift):
@@ -130,7 +131,7 @@ class Machine:
                 self._end.send(machine, _HEAD.pack(self._sent, now).ljust(self._size, b"\0"))
         return found
 
-    def _ask(self, window: Window) -> Found:
+    def _ask(self, window: LanWindow) -> LanFound:
         """Send an order to all in each cycle; each is answered at once."""
         self._round_trips.clear()
         self._awaited = window.cycles * len(self._place.others)
@@ -139,7 +140,7 @@ class Machine:
             for machine in self._place.others:
                 self._end.send(machine, _HEAD.pack(cycle, time.monotonic_ns()).ljust(self._size, b"\0"))
         self._answered.wait(ANSWER_S)
-        return Found(list(self._round_trips), self._awaited - len(self._round_trips))
+        return LanFound(list(self._round_trips), self._awaited - len(self._round_trips))
 
     def _count(self, machine: int, content: bytes) -> None:
         now = time.monotonic_ns()
@@ -151,7 +152,7 @@ class Machine:
         self._end.send(machine, content[: self._size])
 
 
-def _grid(window: Window, shift_ns: int) -> Iterator[int]:
+def _grid(window: LanWindow, shift_ns: int) -> Iterator[int]:
     """Yield the number of each cycle at its grid point; one that has passed is skipped."""
     cycle = 0
     while cycle < window.cycles:
@@ -170,7 +171,7 @@ def _say(document: dict[str, Any]) -> None:
 def main() -> None:
     """Run the task of the command line."""
     die_with_parent(os.getppid())
-    task = Task.read(sys.argv[1])
+    task = LanTask.read(sys.argv[1])
     # Before the end starts its threads, which have core and priority of this one: as on a rack's adapter board.
     cores = sorted(os.sched_getaffinity(0))
     pin(cores[task.place.machine % len(cores)])
@@ -179,7 +180,7 @@ def main() -> None:
     machine.find()
     _say({"found": None})
     for line in sys.stdin:
-        _say({"found": asdict(machine.measure(Window(**json.loads(line))))})
+        _say({"found": asdict(machine.measure(LanWindow(**json.loads(line))))})
 
 
 if __name__ == "__main__":

@@ -48,31 +48,29 @@ def test_promised_time_is_kept_though_one_board_after_another_is_killed() -> Non
     assert rack.read("task.report").echo == 2000
 
 
-def test_arm_holds_on_its_path_while_the_coordinator_is_lost_and_goes_on() -> None:
+def test_arm_holds_on_its_path_while_its_coordinator_is_lost_or_held_and_goes_on() -> None:
     rack = CellRack([SLOWLY])
     assert rack.run(8.0, is_moving)
-    rack.lose("cell", 1200)
-    rack.run(2.5)
-    here, done = rack.read("servo.status").position.copy(), rack.report.moves_done
+    rack.lose("cell", 800)
+    rack.run(1.9)
     assert (rack.task.state, rack.task.reason) == (State.HOLDING, "the coordinator is lost: held until it is back")
-    rack.run(0.5)
-    assert rack.read("servo.status").position == pytest.approx(here, abs=1e-4)
-    assert rack.run(16.0, is_over)
-    assert (rack.cell.state, rack.report.echo, done) == (State.DONE, 2000, 0)
-
-
-def test_coordinator_held_by_its_operator_holds_the_arm() -> None:
-    rack = CellRack([SLOWLY])
+    assert_rests(rack)
+    rack.run(0.6)
+    assert rack.task.state == State.EXECUTING
     operator = Operator(rack)
-    assert rack.run(8.0, is_moving)
     operator.say("cell", Operation.HOLD)
-    rack.run(2.5)
-    speed = np.abs(rack.read("servo.status").velocity).max()
-    assert speed < 1e-3
+    rack.run(1.9)
     assert rack.task.reason == rack.cell.reason == "cell held by the operator: `resume` releases it"
+    assert_rests(rack)
     operator.say("cell", Operation.RESUME)
     assert rack.run(16.0, is_over)
-    assert rack.cell.state == State.DONE
+    assert (rack.cell.state, rack.task.action, rack.report.echo) == (State.DONE, 1, 2000)
+
+
+def assert_rests(rack: CellRack) -> None:
+    """Find the arm at rest on its way."""
+    assert np.abs(rack.read("servo.status").velocity).max() < 1e-3
+    assert 0.0 < rack.read("elemental_move.status").progress < 1.0
 
 
 def test_coordinator_that_remembers_nothing_goes_on_with_the_step_under_way() -> None:

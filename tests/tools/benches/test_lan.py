@@ -12,10 +12,10 @@ import pytest
 from rack.tools.benches import lan
 from rack.tools.benches.comparison import Absent
 from rack.tools.benches.lan import LanRuns, measure
-from rack.tools.benches.lan_ends import COORDINATOR, LEASE_MS, ORDER_BYTES, STATUS_BYTES, Place
+from rack.tools.benches.lan_ends import COORDINATOR, LEASE_MS, ORDER_BYTES, STATUS_BYTES, LanPlace
 from rack.tools.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.benches.lan_group import Group
-from rack.tools.benches.lan_machine import ENDS, TLS, Task
+from rack.tools.benches.lan_machine import ENDS, TLS, LanTask
 from rack.tools.benches.network import NAMESPACES, Lab
 from rack.tools.console.progress import Progress
 from tests.machine import needs_lab
@@ -52,15 +52,17 @@ def test_racks_are_measured_next_to_others_and_who_fails_is_named(monkeypatch: p
 
 @needs_lab
 @pytest.mark.skipif(find_spec("cyclonedds") is None, reason="needs cyclonedds")
-def test_a_dds_answers_every_order() -> None:
+def test_a_dds_answers_orders_and_what_it_does_not_answer_is_missing() -> None:
     with Lab(2) as lab, Group(lab, "cyclonedds", echoes=True, priority=0) as group:
-        found = group.run(RATE_HZ, CYCLES)
-    assert (len(found[COORDINATOR].us), found[COORDINATOR].missing) == (CYCLES, 0)
+        found = group.run(RATE_HZ, CYCLES)[COORDINATOR]
+    assert 0 < len(found.us) == CYCLES - found.missing
 
 
 def test_a_task_passes_the_command_line_whole() -> None:
-    task = Task("UDP", Place(1, ("10.0.0.1", "10.0.0.2"), ""), echoes=True, priority=60)
-    assert json.loads(json.dumps(asdict(Task.read(json.dumps(asdict(task)))))) == json.loads(json.dumps(asdict(task)))
+    task = LanTask("UDP", LanPlace(1, ("10.0.0.1", "10.0.0.2"), ""), echoes=True, priority=60)
+    assert json.loads(json.dumps(asdict(LanTask.read(json.dumps(asdict(task)))))) == json.loads(
+        json.dumps(asdict(task))
+    )
 
 
 def test_figures_show_ratios_deaths_that_were_none_and_a_picture(tmp_path: Path) -> None:
