@@ -181,9 +181,9 @@ class Desk:
         head = self._sealer.opened(question.key, question.envelope, question.payload)
         if isinstance(head, Flaw):
             return None
+        # A key has as many parts as the one that is subscribed to.
         *_, asker, what = question.key.split("/")
         is_proper = _ASKER.fullmatch(asker) and what in NEEDED and NEEDED[what] == right  # type: ignore[index]
-        # Its key has as many parts as the one that is subscribed to.
         return Asked(asker, what, head, question) if is_proper else None
 
     def _answered(self, asked: Asked, right: Right, tick: int) -> tuple[Code, bytes]:

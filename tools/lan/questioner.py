@@ -91,11 +91,13 @@ class Questioner:
         self._link.close()
 
     def _note(self, sample: Any) -> None:
-        _, rack, _, launch = str(sample.key_expr).split("/")
-        with self._changed:
+        """Note who comes and goes; a token that is not one of a rack's adapter is nobody's."""
+        _, rack, _, number = str(sample.key_expr).split("/")
+        with self._changed, suppress(ValueError):
+            launch = int(number, 16)
             if sample.kind == zenoh.SampleKind.PUT:
-                self._launches[rack] = int(launch, 16)
-            elif self._launches.get(rack) == int(launch, 16):
+                self._launches[rack] = launch
+            elif self._launches.get(rack) == launch:
                 del self._launches[rack]
             self._changed.notify_all()
 
