@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,15 @@ import pytest
 
 from rack.backplane.message import State
 from rack.boards.config import CONFIGS, load, resolve
+from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
+from rack.levels.cell.messages import Response
 from rack.levels.messages import Error
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import pointing, pose
+from rack.tools.runs.window import free_port
+from tests.boards.lan.racks import run_together
 from tests.levels.arms import cell, config
 from tests.levels.whole_rack import WholeRack
 
@@ -120,3 +125,24 @@ def test_an_obstacle_cannot_be_shared(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as error:
         resolve(load(tmp_path / "post.toml", ['board.servo.params.shared=["post"]', "task.action=[]"]))
     assert "an obstacle, which moves by itself; objects: block1, block2, peg" in str(error.value)
+
+
+def racks(name: str, folder: Path) -> list[RackConfig]:
+    """Return coordinator and arms, in lockstep, under names and on ports of their own."""
+    ports = {"7447": str(free_port()), "7448": str(free_port())}
+    for file in (CONFIGS / "cell").glob("*.toml"):
+        text = re.sub(r'"cell(?=["/-])', f'"{name}', file.read_text().replace('"../', '"'))
+        (folder / file.name).write_text(re.sub("7447|7448", lambda port: ports[port[0]], text))
+    return [load(folder / f"{rack}.toml", ["clock.mode=lockstep"]) for rack in ("cell", "puma", "k1607")]
+
+
+def test_the_three_racks_begin_the_program_together(rack_name: str, tmp_path: Path) -> None:
+    found = run_together(racks(rack_name, tmp_path), [4.0] * 3)
+    assert [one.outcome.cause for one in found] == ["time over"] * 3, [one.texts for one in found]
+    cell, puma, k1607 = (one.last for one in found)
+    assert (cell["task.status"]["state"], cell["task.status"]["moves"]) == (State.EXECUTING, 2)
+    for arm, other in ((puma, k1607), (k1607, puma)):
+        assert arm["task.report"]["response"] == Response.DOING
+        assert arm["elemental_move.status"]["progress"] > 0.0, "it is on its way, slowly: it has time"
+        np.testing.assert_array_equal(arm["lan.shared"]["bodies"]["name"], other["servo.shared"]["bodies"]["name"])
+        assert arm["lan.status"]["import_shared"]["taken"] == 199

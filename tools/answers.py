@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 from rack.tools.console.answer import Failure, print_answer, print_json
 
 if TYPE_CHECKING:
+    from rack.backplane.segment import Segment
     from rack.tools.console.address import Asker
+    from rack.tools.runs.snapshot import Snapshot
 
 
 def list_racks(as_json: bool) -> None:
@@ -49,12 +51,15 @@ def describe(name: str) -> dict[str, str | int | float]:
 
 def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly one."""
-    from rack.tools.runs.watched import watched
+    from rack.backplane.segment import Segment
 
-    with watched(rack or _only_rack(), asker) as one:
-        from rack.tools.runs.snapshot import RackMonitor
+    if rack is not None and "/" in rack:
+        from rack.tools.runs.watched import watched
 
-        found = RackMonitor(one.segment).look()
+        with watched(rack, asker) as far:
+            found = _looked_at(far.segment)
+    else:
+        found = _looked_at(Segment.attach(rack or _only_rack()))
     if as_json:
         print_json(asdict(found))
         return
@@ -62,6 +67,12 @@ def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> 
     from rack.tools.runs.display import RackView
 
     console().print(RackView(found))
+
+
+def _looked_at(segment: Segment) -> Snapshot:
+    from rack.tools.runs.snapshot import RackMonitor
+
+    return RackMonitor(segment).look()
 
 
 def _only_rack() -> str:

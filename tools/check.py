@@ -12,7 +12,7 @@ import typer
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.config import load, shared_out
-from rack.boards.config.schema import CLOCK_SLOT, HostConfig, RackConfig
+from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
 from rack.boards.config.timing import with_budgets
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.rack import spanned
@@ -164,6 +164,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
         "windows": {window.board: window.address for window in places.windows},
         "tasks": tasks,
         "hosts": [_host(name, host, layout) for name, host in config.host.items()],
+        "network": _network(config),
         "mailboxes": mailboxes,
         "notes": notes,
     }
@@ -177,6 +178,46 @@ def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:
         "writes": [mailbox.name for mailbox in layout.mailboxes if mailbox.writer == name],
         "reads": [mailbox.name for mailbox in layout.mailboxes if name in mailbox.readers],
     }
+
+
+def _network(config: RackConfig) -> dict[str, Any] | None:
+    """Return with whom a rack exchanges what; None: with nobody."""
+    table = config.adapter.lan
+    if table is None:
+        return None
+    entries = [
+        *(
+            {"entry": f"{LAN}.{port}", "way": "out", "mailbox": e.source, "rate_hz": e.rate_hz}
+            for port, e in table.exports.items()
+        ),
+        *(
+            {
+                "entry": f"{LAN}.{port}",
+                "way": "in",
+                "mailbox": e.source,
+                "rate_hz": e.rate_hz,
+                "max_age_ms": e.max_age_ms,
+            }
+            for port, e in table.imports.items()
+        ),
+    ]
+    keys = ("listen", "connect", "lease_ms", "on_peer_loss")
+    return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
+
+
+def _network_lines(network: dict[str, Any] | None, width: int | None) -> Iterator[str]:
+    """Yield with whom a rack exchanges what, and what it does while one of them is lost."""
+    if network is None:
+        return
+    peers = ", ".join(network["peers"]) or "no rack in particular"
+    ends = [f"{key} {', '.join(network[key])}" for key in ("listen", "connect") if network[key]]
+    rule = f"lost after {network['lease_ms']:g} ms: {network['on_peer_loss']}"
+    yield from ("", f"network: {'; '.join([*ends, f'works with {peers}', rule])}")
+    rows = [
+        [e["entry"], e["way"], e["mailbox"], f"{e['rate_hz']:g}", f"{e['max_age_ms']:g}" if "max_age_ms" in e else ""]
+        for e in network["entries"]
+    ]
+    yield from table(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows, width)
 
 
 def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[str]:
@@ -222,6 +263,7 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
         for m in found["mailboxes"]
     ]
     yield from _host_lines(found["hosts"], width)
+    yield from _network_lines(found["network"], width)
     head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
     yield ""
     yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))

@@ -14,6 +14,8 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FAULTS = CONFIGS / "faults"
 """Bundled fault scripts, for `--faults`."""
 MAX_FILE_BYTES = 1_000_000
+LAN_ADAPTER = "rack.boards.lan.adapter:LanAdapter"
+"""Class of the board that `[adapter.lan]` adds."""
 EXTENDS = "configs that this file extends, by name or path, in order; its own keys override theirs"
 """Meaning of `extends`, the one key that only files have."""
 
@@ -35,6 +37,8 @@ def named_classes(tables: Tables) -> tuple[str, ...]:
     boards = tables.get("board")
     found = [board for board in boards.values() if isinstance(board, dict)] if isinstance(boards, dict) else []
     names = [board.get(role) for board in found for role in ("executor", "planner")]
+    adapters = tables.get("adapter")
+    names += [LAN_ADAPTER] if isinstance(adapters, dict) and "lan" in adapters else []
     return tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
 
 

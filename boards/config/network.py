@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from rack.boards.config.schema import RackConfig
@@ -12,6 +13,8 @@ from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.endpoint import Endpoint
 
 PLACE = "adapter.lan"
+SOON = timedelta(days=30)
+"""Time before the end of certificates from which a launch warns."""
 
 
 def network_mistakes(config: RackConfig) -> Iterator[Mistake]:
@@ -54,10 +57,15 @@ def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
 
 
 def network_notes(config: RackConfig) -> list[str]:
-    """Return what a launch says of endpoints without TLS that other machines can reach."""
+    """Return what a launch says of the network: endpoints without TLS that others can reach, certificates that end."""
     table = config.adapter.lan
     if table is None:
         return []
-    found = [str(endpoint) for _, endpoint in table.endpoints if not (endpoint.has_tls or endpoint.is_loopback)]
+    far = [str(endpoint) for _, endpoint in table.endpoints if not (endpoint.has_tls or endpoint.is_loopback)]
     may = "read and forge" if table.certificates is None else "read"
-    return [f"without TLS: whoever reaches {', '.join(found)} may {may} what is exchanged"] if found else []
+    notes = [f"without TLS: whoever reaches {', '.join(far)} may {may} what is exchanged"] if far else []
+    if table.certificates is not None and table.has_tls:
+        expires = Credentials(Path(table.certificates), config.name).expires
+        if expires - datetime.now(UTC) < SOON:
+            notes.append(f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC: the other racks are lost then")
+    return notes

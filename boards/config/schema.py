@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Protocol, Role, Sampled, Wake
-from rack.boards.config.files import portable, with_table_files
+from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
@@ -217,7 +217,6 @@ class BoardConfig(Table):
 
 LAN = "lan"
 """Name of the board that exchanges mailboxes with other racks."""
-LAN_ADAPTER = "rack.boards.lan.adapter:LanAdapter"
 
 
 class LanConfig(LanTable):

@@ -54,6 +54,13 @@ class Credentials:
                 return found
         raise Credential(self.secret_file, f"no secret; permitted: {SECRET_BYTES} bytes, or {2 * SECRET_BYTES} digits")
 
+    @property
+    def expires(self) -> datetime:
+        """When the first of the certificates expires. Raises `Credential`."""
+        return min(
+            one.not_valid_after_utc for path in (self.authority, self.certificate) for one in _certificates(path)
+        )
+
     def flaws(self, addresses: Iterable[str] = ()) -> Iterator[Credential]:
         """Yield what is wrong with each file, now. `addresses` are those at which others reach this rack."""
         authorities: list[Certificate] = []

@@ -26,6 +26,7 @@ from rack.levels.timing.trace_times import (
     plan_ages,
     residual_ns,
 )
+from rack.tools.analysis.network import network
 from rack.tools.analysis.report_markdown import markdown
 from rack.tools.faults.judge import faults
 from rack.tools.runs.history import counted, fired_rows, first_difference, frequency, holds, misses, steal
@@ -75,6 +76,7 @@ def report_of(recording: Recording) -> Report:
         "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
         "system_response": system_response(recording),
         "entries": _entries(recording),
+        "network": network(recording),
         "task": _task_outcome(recording),
         "motion": _motion(recording),
         "queues": queues(recording),
@@ -87,7 +89,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
         *("misses", "steal", "frequency_mhz", "notes", "holds", "state_tables", "faults", "unexplained", "restarts"),
-        *("system_response", "entries", "task", "motion", "queues", "rows_lost"),
+        *("system_response", "entries", "network", "task", "motion", "queues", "rows_lost"),
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}

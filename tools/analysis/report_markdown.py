@@ -92,6 +92,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _misses(report)
     yield from _response(report["system_response"])
     yield from _entries(report["entries"])
+    yield from _network(report["network"])
 
 
 def _times(report: Report) -> Iterator[str | Grid]:
@@ -303,3 +304,22 @@ def _entries(entries: list[Report]) -> Iterator[str | Grid]:
         for row in entries
     ]
     yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("overtaken", "waiting", "source"))
+
+
+def _network(network: Report | None) -> Iterator[str | Grid]:
+    """Yield what passed over the network, and how often other racks were lost; nothing without a network adapter."""
+    if network is None:
+        return
+    yield from ("", "## Network, ages in ms of simulated time", "")
+    if imports := network["imports"]:
+        counts = [name for name in imports[0] if name != "age_ms"]
+        rows = [
+            [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ("p50", "p99", "max"))]
+            for row in imports
+        ]
+        yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("disordered", "repeated", "overtaken", "source"))
+    for row in network["exports"]:
+        yield f"- {row['entry']}: {row['source']} sent {row['sent']} times"
+    for row in network["peers"]:
+        times = f"lost {row['losses']} times, {row['lost_s']:g} s; restarted {row['restarts']} times"
+        yield f"- rack {row['peer']}: {row['state']}; {times}"

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress_bar import ProgressBar
@@ -21,6 +21,7 @@ from rack.boards.exchange import PortAge
 from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
 from rack.tools.runs.host_side import EntryRow, HostRow
+from rack.tools.runs.network import ExportRow, ImportRow, PeerRow
 from rack.tools.runs.snapshot import DEAD, GONE, LOST, Snapshot, TaskProgress, TaskRow
 
 if TYPE_CHECKING:
@@ -44,8 +45,11 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
 """Columns by heading; `exec` and `late` are the longest since the last look."""
 DROPPED = ("tick", "sched", "slot", "cycles", "Hz", "restarts", "core", "exec ms", "late ms", "skipped")
 """Columns that a narrow terminal leaves out, in this order."""
-STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green", "holding": "yellow"}
-COUNTED = {"missed": "red", "skipped": "red", "restarts": "yellow", "refused": "yellow", "full": "yellow"}
+STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green", "holding": "yellow", "awaited": "yellow"}
+COUNTED = {
+    **dict.fromkeys(("missed", "skipped"), "red"),
+    **dict.fromkeys(("restarts", "refused", "full", "missing", "late", "strange", "losses"), "yellow"),
+}
 """Colours of counts above 0."""
 HELD = "bold yellow"
 NO_DEMAND = "none"
@@ -141,8 +145,8 @@ class RackView:
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
         yield grid(list(COLUMNS), cells, width, DROPPED, _style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
-        for rows in (snapshot.hosts, snapshot.entries):
-            yield from _host_side(rows, width)
+        for rows in (snapshot.hosts, snapshot.entries, snapshot.peers, snapshot.imports, snapshot.exports):
+            yield from _rows(rows, width)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
@@ -154,13 +158,18 @@ class RackView:
             yield _bar(snapshot.progress, width if terminal.is_terminal else 0)
 
 
-def _host_side(rows: Sequence[HostRow] | Sequence[EntryRow], width: int) -> Iterator[RenderableType]:
-    """Yield the table of the host boards, or of what passes to and from them, if there are any."""
+def _rows(rows: Sequence[HostRow | EntryRow | PeerRow | ImportRow | ExportRow], width: int) -> Iterator[RenderableType]:
+    """Yield the table of host boards, other racks, or what passes to and from them, if there are any."""
     if rows:
         found = [asdict(row) for row in rows]
-        cells = [[decimal(v, 1) if isinstance(v, float | None) else str(v) for v in row.values()] for row in found]
+        cells = [[_cell(name, value) for name, value in row.items()] for row in found]
         yield Text()
         yield grid([name.replace("_", " ") for name in found[0]], cells, width, style=_style)
+
+
+def _cell(column: str, value: Any) -> str:
+    digits = 0 if column.endswith("_ticks") else 3 if column.endswith("_s") else 1
+    return decimal(value, digits) if isinstance(value, float | None) else str(value)
 
 
 def line_of(snapshot: Snapshot) -> str:

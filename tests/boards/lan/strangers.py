@@ -28,7 +28,8 @@ class Stranger:
 
     def __init__(self, table: dict[str, Any]) -> None:
         config = zenoh.Config()
-        quiet = {f"scouting/{way}/enabled": False for way in ("multicast", "gossip")}
+        off = ("scouting/multicast", "scouting/gossip", "transport/shared_memory")
+        quiet = {f"{key}/enabled": False for key in off}
         lasting = {"connect/timeout_ms": -1, "open/return_conditions/connect_scouted": False}
         # Zenoh takes no connection for 0.1 s after each that fails: strangers that try often would keep the others out.
         again = 1000 if table.get("fails") else 50

@@ -21,6 +21,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand, System, switch
 from rack.boards import Rack
 from rack.boards.config.resolved import loads
+from rack.boards.crate.clean import remove_dead
 from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence
 from tests.boards.lan.racks import ROOT, configs, endpoints, rack_text, started
@@ -69,9 +70,18 @@ def kill_adapter(segment: Segment) -> None:
     wait_until(lambda: status.peek() and status.serial > after + 2)
 
 
+@pytest.fixture
+def names(rack_name: str) -> Iterator[tuple[str, str]]:
+    """Names of two racks, which may be killed."""
+    found = f"{rack_name}-a", f"{rack_name}-b"
+    yield found
+    for name in found:
+        remove_dead(name)
+
+
 @pytest.mark.alone
-def test_boards_and_racks_die_and_come_back(rack_name: str, tmp_path: Path) -> None:
-    (at,), names = endpoints(1), (f"{rack_name}-a", f"{rack_name}-b")
+def test_boards_and_racks_die_and_come_back(names: tuple[str, str], tmp_path: Path) -> None:
+    (at,) = endpoints(1)
     texts = [
         rack_text(names[0], at, [], peers=[names[1]]),
         rack_text(names[1], "", [at], names[0], lan='on_peer_loss = "stop"').replace(

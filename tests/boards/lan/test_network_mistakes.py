@@ -131,8 +131,16 @@ def test_a_certificate_cannot_be_checked_for_an_address_of_ipv6(tmp_path: Path) 
     assert "permitted: a host name, or an address of IPv4" in line
 
 
+def test_a_launch_warns_of_certificates_that_end_soon(tmp_path: Path) -> None:
+    for days, count in ((29, 1), (31, 0)):
+        make_credentials(tmp_path / f"for{days}", {"cell": ["127.0.0.1"]}, days)
+        assert mistakes(tmp_path, TLS, f'certificates = "for{days}"') == []
+        notes = network_notes(load(tmp_path / "rack.toml"))
+        assert [note.startswith("certificates expire on 20") for note in notes] == [True] * count
+
+
 def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
-    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
+    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 40)
     far, near, own = "tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447", 'certificates = "certs"'
     for listen, lan, note in (
         (near, "", ""),

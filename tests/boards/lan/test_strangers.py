@@ -52,9 +52,13 @@ class Program:
         return dict(json.loads(self._process.stdout.readline()))
 
     def end(self) -> None:
-        """End it."""
-        self._process.kill()
-        self._process.communicate(timeout=BOUND_S)
+        """End it: by the end of its stdin, if it still listens to that."""
+        try:
+            self._process.communicate(timeout=BOUND_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
+            raise
 
 
 @contextmanager
@@ -239,6 +243,15 @@ def test_a_seal_with_another_secret_does_not_fit(found: Found) -> None:
 def test_a_huge_message_is_not_put_together(found: Found) -> None:
     assert found.home["good"][pulse("heavy")] == found.home["came"][pulse("heavy")] > 0
     assert found.home["sizes"][pulse("heavy")] == [100]
+
+
+def test_a_friend_may_come_over_quic(tmp_path: Path) -> None:
+    with at_home(tmp_path, "quic") as site:
+        settings = site.mutual("friend") | {"connect/endpoints": [f"quic/127.0.0.1:{site.port}"]}
+        assert site.home.state()["came"] == {}
+        with running("strangers", json.dumps({"friend": {**friend(site), "settings": settings}})) as others:
+            wait_until(lambda: all(others.state()["friend"][got] for got in ("heard", "answers", "tokens")))
+            wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
 
 
 def test_without_tls_keys_and_seals_remain(tmp_path: Path) -> None:

@@ -1,0 +1,54 @@
+"""Whole racks over TLS, each with its own certificate."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.errors import BackplaneError
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import Segment
+from rack.tools.lan.certificates import make_credentials
+from tests.boards.lan.racks import configs, endpoints, rack_text, started
+from tests.processes import wait_until
+
+
+@pytest.fixture
+def names(rack_name: str, tmp_path: Path) -> list[str]:
+    """Two racks with certificates; the second connects to the first. Their configs are rack-0.toml and rack-1.toml."""
+    names = [f"{rack_name}-{end}" for end in "ab"]
+    make_credentials(tmp_path / "certs", {name: ["127.0.0.1"] for name in names}, 1)
+    at, own = endpoints(1)[0].replace("tcp", "tls"), 'certificates = "certs"'
+    texts = [rack_text(names[0], at, (), names[1], lan=own), rack_text(names[1], "", (at,), names[0], lan=own)]
+    configs(texts, tmp_path)
+    return names
+
+
+def taken(rack: str) -> int:
+    """Return the messages of the other rack that a rack has taken so far."""
+    with suppress(BackplaneError):
+        segment = Segment.attach(rack)
+        try:
+            status = open_observer(segment, "lan.status").peek()
+            return int(status.value.import_other["taken"]) if status.is_there else 0
+        finally:
+            segment.close()
+    return 0
+
+
+def test_racks_exchange_mailboxes(names: list[str], tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        racks = [stack.enter_context(started(tmp_path / f"rack-{at}.toml")) for at in range(2)]
+        wait_until(lambda: all(taken(name) > 3 for name in names))
+        for rack in racks:
+            rack.send(signal.SIGTERM)
+        for rack in racks:
+            assert rack.outcome()["cause"] == "stopped"
+
+
+def test_a_rack_under_another_name_needs_another_certificate(names: list[str], tmp_path: Path) -> None:
+    with started(tmp_path / "rack-0.toml", 1.0, f"name={names[0]}x") as process:
+        assert f"{names[0]}x.pem: missing" in process.outcome()["error"]
