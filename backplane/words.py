@@ -108,6 +108,7 @@ class Block(IntEnum):
     PLANS = 18  # plans made
     LOST = 19  # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
     LEVEL_SINCE = 20  # tick of the cycle in which the level entered that state
+    AWAITS = 21  # of the network adapter in lockstep: the rack that its cycle awaits; 0: none. See boards.lan.awaited
 
 
 class TaskState(IntEnum):

@@ -15,6 +15,8 @@ from typing import Any
 LONGEST_VALUE = 80
 LONGEST_PLACE = 120
 LONGEST_REASON = 1000
+CANNOT_GO_ON = 4
+"""Exit status of a board that a restart would not help."""
 
 
 class BoardError(Exception):

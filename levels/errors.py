@@ -2,6 +2,7 @@
 
 `LevelError` is the root.
 
+- `CannotGoOn`: another rack's adapter has a cycle of another length, in lockstep; its board is not restarted.
 - `RobotError`: an MJCF file is missing or malformed; the model lacks a joint or a site.
 - `ProgramError`: a task program names an unknown object, verb or place.
 - `Refused`: a command cannot be carried out; a planner turns it into a status with its code and reason.
@@ -12,6 +13,10 @@ from __future__ import annotations
 
 class LevelError(Exception):
     """Root of every error this package raises; its text is one line for the user."""
+
+
+class CannotGoOn(LevelError):
+    """A level that cannot go on, and that a restart would not help."""
 
 
 class RobotError(LevelError):

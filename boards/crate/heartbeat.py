@@ -39,12 +39,14 @@ class Heartbeat:
             return []
         now = time.monotonic()
         for name, block in self._blocks.items():
-            # An idle task, whose newest release is done, is alive; a lost one is already known.
-            idle = block[Block.DONE] == block[Block.RELEASED] or block[Block.LOST]
+            # An idle task, whose newest release is done, is alive; a lost one is already known. One may wait for as
+            # long as another rack wants.
+            idle = block[Block.DONE] == block[Block.RELEASED] or block[Block.LOST] or block[Block.AWAITS]
             if block[Block.DONE] != self._seen[name][0] or idle:
                 self._seen[name] = block[Block.DONE], now
                 self._reported.discard(name)
-        if self._words[System.TICK] != self._seen[CLOCK][0] or self._words[System.HELD]:
+        awaits = any(block[Block.AWAITS] for block in self._blocks.values())
+        if self._words[System.TICK] != self._seen[CLOCK][0] or self._words[System.HELD] or awaits:
             self._seen[CLOCK] = self._words[System.TICK], now
             self._reported.discard(CLOCK)
         late = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]

@@ -1,13 +1,16 @@
-"""Waiting during a launch: with a time limit, and a line to the user when it takes long."""
+"""Waits, with a line to the user when they take long: during a launch, and in lockstep for another rack."""
 
 from __future__ import annotations
 
+import math
 import time
 
+from rack.backplane.segment import Segment
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.requests import Opened, PreloadFailed, Preloading
 from rack.boards.errors import LaunchError
 from rack.boards.events import Journal
+from rack.boards.lan.awaited import awaited
 
 PATIENCE_S = 2.0
 """Time after which a launch reports what it waits for; it does so again each time the wait has doubled."""
@@ -40,6 +43,24 @@ class Patience:
     @property
     def _waited_s(self) -> float:
         return time.monotonic() - self._began
+
+
+class RackAwaited:
+    """Reports for which other rack an adapter waits in lockstep, which may take as long as it wants."""
+
+    def __init__(self, segment: Segment, journal: Journal) -> None:
+        self._segment, self._journal = segment, journal
+        self._patience: Patience | None = None
+
+    def look(self) -> None:
+        """Report it, if that is due."""
+        waits = list(awaited(self._segment))
+        if not waits:
+            self._patience = None
+            return
+        self._patience = self._patience or Patience(self._journal, math.inf)
+        for board, why in waits:
+            self._patience.report(f"'{board}' {why}")
 
 
 def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:

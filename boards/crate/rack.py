@@ -32,7 +32,7 @@ from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.hosts import HostBoards
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.neighbours import conflicts, holders, placed
-from rack.boards.crate.patience import Patience, await_opened
+from rack.boards.crate.patience import Patience, RackAwaited, await_opened
 from rack.boards.crate.recovery import Recovery, Supervision
 from rack.boards.crate.requests import (
     CellConfig,
@@ -44,7 +44,7 @@ from rack.boards.crate.requests import (
     PowerOn,
     Preload,
 )
-from rack.boards.errors import ConfigError, LaunchError, Mistake
+from rack.boards.errors import CANNOT_GO_ON, ConfigError, LaunchError, Mistake
 from rack.boards.events import Cause, Ending, Event, Journal, Outcome
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import Entries
@@ -185,6 +185,7 @@ class Rack:
         self._hosts = HostBoards(self.segment, self._plan.hosts, supervision, self._line, self._journal)
         self._alarms = AlarmWatch(self.segment, self.config)
         self._heartbeat = Heartbeat(self.segment)
+        self._awaited = RackAwaited(self.segment, self._journal)
         self._reset_latch()
         self._line.ask(PowerOn(CLOCK, clock))
         self._hosts.start()
@@ -217,6 +218,7 @@ class Rack:
             for board in self._heartbeat.hanging():
                 self._journal.add("detection", "rack", f"'{board}' is not responding", "hang", subject=board)
                 self._recovery.end_hanging(board)
+            self._awaited.look()
             self._recovery.advance()
             self._hosts.look()
             if not self._is_armed:
@@ -295,10 +297,11 @@ class Rack:
         if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
             self._give_up(end.name, text)
             return
-        restart = self._recovery.lose(end.name, end.tick)
+        is_final = end.status == CANNOT_GO_ON
+        restart = self._recovery.lose(end.name, end.tick, is_final)
         if restart is None:
             self._is_beyond_help = end.name == CLOCK
-            self._give_up(end.name, f"{text}; no restarts left")
+            self._give_up(end.name, text if is_final else f"{text}; no restarts left")
         else:
             self._journal.add("reaction", end.name, str(restart), "restart")
 

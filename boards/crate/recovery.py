@@ -91,10 +91,10 @@ class Recovery:
         self._waiting: list[str] = []
         self._starting: list[str] = []
 
-    def lose(self, board: str, tick: int) -> Restart | None:
-        """Schedule the restart of a board whose process has ended; return None if it is given up."""
+    def lose(self, board: str, tick: int, is_final: bool = False) -> Restart | None:
+        """Schedule the restart of a board whose process has ended; return None if it is given up, as one `is_final`."""
         self._starting = [name for name in self._starting if name != board]
-        restart = self._supervision.admit(board, tick)
+        restart = None if is_final else self._supervision.admit(board, tick)
         if restart is not None:
             self._waiting.append(board)
         elif board != CLOCK:

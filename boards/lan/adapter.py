@@ -27,6 +27,7 @@ from rack.boards.lan.desk import Desk, Permit
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, LanLink
+from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
@@ -52,6 +53,7 @@ class LanAdapter(Adapter):
         self._imports: dict[str, Import] = {}
         self._link: LanLink | None = None
         self._flaws: Sequence[int] = ()
+        self._barrier: Barrier | None = None
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
@@ -103,31 +105,47 @@ class LanAdapter(Adapter):
             for port, entry in self._imports.items():
                 entry.resume(getattr(before.value, f"import_{port}"), status.newest)
             self._desk.resume(before.value.desk)
-            self._flaws = list(before.value.flaws.tolist())
+            self._flaws = before.value.flaws.tolist()
+        if self._grid.is_lockstep and table.racks:
+            self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
     def open(self) -> None:
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
+        barrier, way = self._barrier, self._barrier or link
         for entry in self._imports.values():
-            entry.open(link, link.sealer, self._grid)
+            entry.open(way, link.sealer, self._grid)
         for export in self._exports.values():
-            export.open(link, link.sealer, self._grid)
+            export.open(way, link.sealer, self._grid)
         self._clocks.open(link, link.sealer)
         self._desk.open(link, self._launch)
-        self._peers.watch(link.watch_alive(TOKENS), self._grid.is_lockstep)
+        if barrier is not None:
+            barrier.open(link, self._launch)
+            self._recall(barrier)
+        self._peers.watch(link.watch_alive(TOKENS) if barrier is None else barrier.changes, barrier is not None)
         # Last: whoever sees it knows all subscriptions, and loses nothing.
-        link.declare_alive(self._launch)
+        link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
+
+    def _recall(self, barrier: Barrier) -> None:
+        """Repeat the last step of an adapter before this one: it may have died with that before it left the machine."""
+        if barrier.done >= 0:
+            for export in self._exports.values():
+                export.recall(barrier.done, self.context.every)
+            barrier.prepare(barrier.done)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Exchange what is due."""
-        cycle, arrivals = tick // self.context.every, self._peers.arrivals
-        self.findings += self._peers.look(tick)
-        self._demand_stop(tick)
+        cycle = tick // self.context.every
+        if self._barrier is None:
+            self._look(tick)
         for export in self._exports.values():
-            export.is_asked |= self._peers.arrivals != arrivals
             if cycle % export.every == 0:
                 export.exchange(tick)
+        if self._barrier is not None:
+            if not self._barrier.meet(tick):
+                return
+            self._look(tick)
         for port, entry in self._imports.items():
             entry.look(tick)
             if cycle % entry.every == 0:
@@ -135,6 +153,15 @@ class LanAdapter(Adapter):
         self._clocks.exchange()
         self._desk.answer(tick)
         self._report(write, tick)
+
+    def _look(self, tick: int) -> None:
+        """Note who has come, and who has gone."""
+        arrivals = self._peers.arrivals
+        self.findings += self._peers.look(tick)
+        self._demand_stop(tick)
+        if self._peers.arrivals != arrivals:
+            for export in self._exports.values():
+                export.is_asked = True
 
     def _demand_stop(self, tick: int) -> None:
         """Demand that the arm stop while a rack that had been there is lost, if it is to stop then."""
@@ -175,6 +202,8 @@ class LanAdapter(Adapter):
 
     def close(self) -> None:
         """Leave the network."""
+        if self._barrier is not None:
+            self._barrier.close()
         if self._link is not None:
             self._desk.close()
             self._link.close()

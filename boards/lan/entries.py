@@ -17,7 +17,8 @@ from rack.boards.lan.counts import ImportCount, MessageOrder
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.link import UNREAD, Arrived, LanLink
+from rack.boards.lan.link import Arrived, LanLink
+from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import NONE, PeerRack
 
 NEVER = -1
@@ -44,10 +45,21 @@ class Export:
         """Continue with the counts in the status of an adapter before this one."""
         self.sent, self.serial = int(record["sent"]), int(record["serial"])
 
-    def open(self, link: LanLink, sealer: Sealer, grid: OwnGrid) -> None:
-        """Publish it; in lockstep it waits rather than lose a message."""
-        self._put, self._sealer, self._grid = link.publish(self._key, reliable=grid.is_lockstep), sealer, grid
+    def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
+        """Publish it."""
+        self._put, self._sealer, self._grid = way.publish(self._key), sealer, grid
         self.every = grid.cycles(self._rate_hz)
+
+    def recall(self, tick: int, ticks: int) -> None:
+        """Send what an adapter before this one sent at `tick`, if it did; `ticks` are those of its cycle."""
+        if (tick // ticks) % self.every:
+            return
+        self._source.read(tick - self.every * ticks)
+        before = self._source.serial
+        self._source.read(tick)
+        if self._source.serial == self.serial != before:
+            self.sent, self.serial = self.sent - 1, before
+            self.exchange(tick)
 
     def exchange(self, tick: int) -> None:
         """Send the newest message, if it is new or asked for."""
@@ -62,8 +74,8 @@ class Export:
             return
         self.is_asked = False
         written, payload = source.newest, bytes(reading.value.raw)
-        stamp_ns = grid.stamp_ns(tick if grid.is_lockstep else written)
-        head = Envelope(self._kind, self._launch, self.serial, self.sent, written, grid.time_ns(written), stamp_ns)
+        times = written, grid.time_ns(written), grid.stamp_ns(written)
+        head = Envelope(self._kind, self._launch, self.serial, self.sent, *times)
         self._put(payload, self._sealer.seal(self._key, head, payload))
 
     def fill(self, record: Any) -> None:
@@ -101,9 +113,9 @@ class Import:
         self._order.resume(*(int(record[name]) for name in ("launch", "number", "serial")))
         self._basis = None if record["age"] == NEVER else tick - int(record["age"])
 
-    def open(self, link: LanLink, sealer: Sealer, grid: OwnGrid) -> None:
+    def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
         """Subscribe to it."""
-        self._arrived, self._sealer, self._grid = link.subscribe(self._key), sealer, grid
+        self._arrived, self._sealer, self._grid = way.subscribe(self._key), sealer, grid
         self.every = grid.cycles(self._rate_hz)
 
     def is_old(self, tick: int) -> bool:
@@ -155,22 +167,19 @@ class Import:
     def _is_due(self, head: Envelope, arrived: Arrived, came: int, tick: int) -> bool:
         """Say whether a message is of the launch that is there, and of known age. If it may yet be, keep it for later.
 
-        In lockstep, what was sent in a later cycle than this one is kept.
+        In lockstep it is: see `Barrier`.
         """
         if self._grid.is_lockstep:
-            is_strange, most = self._order.launch not in (NONE, head.launch), UNREAD
-            is_known = False
-            is_due = head.stamp_ns <= self._grid.time_ns(tick)
-        else:
-            is_strange, most = self._peer.is_over(head.launch) or tick - came > self._max_age, 1
-            is_known = self._peer.is_there and head.launch == self._peer.launch
-            # Its age decides: until the clocks have been compared it may be too old.
-            is_due = is_known and self._peer.offset_ns is not None
+            return True
+        is_strange = self._peer.is_over(head.launch) or tick - came > self._max_age
+        is_known = self._peer.is_there and head.launch == self._peer.launch
+        # Its age decides: until the clocks have been compared it may be too old.
+        is_due = is_known and self._peer.offset_ns is not None
         if is_strange:
             self.count.strange += 1
         elif not is_due:
             self._early.append((came, arrived))
-            if len(self._early) > most:
+            if len(self._early) > 1:
                 del self._early[0]
                 self.count.overtaken += is_known
                 self.count.strange += not is_known

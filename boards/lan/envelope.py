@@ -56,6 +56,12 @@ class Sealer:
         self._secret, self._most = secret, most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
 
+    def taking(self, most_bytes: int) -> Sealer:
+        """Return one with the same secret, another limit, and common counts."""
+        sealer = Sealer(self._secret, most_bytes)
+        sealer.flaws = self.flaws
+        return sealer
+
     def resume(self, flaws: Iterable[int]) -> None:
         """Count on from the flaws that a predecessor has found."""
         self.flaws |= zip(Flaw, flaws, strict=False)

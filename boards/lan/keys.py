@@ -1,8 +1,9 @@
 """Key expressions on the network; R is the name of the rack that sends, or that is asked.
 
-    rack/R/alive/<launch>          liveliness token: gone when the adapter's process ends or is silent for the lease
+    rack/R/alive/<launch>          liveliness token: gone when the adapter's process ends or is silent for the lease;
+                                   in lockstep its cycle follows, ns, after a hyphen
     rack/R/out/<board>/<port>      an exported mailbox
-    rack/R/step                    lockstep: the end of a cycle of R's adapter
+    rack/R/step                    lockstep: a cycle of R's adapter, with all that it exports
     rack/R/ping/<to>, .../pong/<to>   round trips between clocks
     rack/R/ask/<what>/<from>       a question to R, answered in its adapter's cycles to those who have the right
 
@@ -25,9 +26,15 @@ def out_key(rack: str, mailbox: str) -> str:
     return f"rack/{rack}/out/{mailbox.replace('.', '/')}"
 
 
-def alive_key(rack: str, launch: int) -> str:
-    """Return the key expression of a launch's token."""
-    return f"rack/{rack}/alive/{launch:016x}"
+def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
+    """Return the key expression of a launch's token; in lockstep with the length of its adapter's cycle, ns."""
+    return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
+
+
+def launch_and_cycle(alive: str) -> tuple[int, int]:
+    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real time."""
+    launch, _, cycle_ns = alive.rpartition("/")[2].partition("-")
+    return int(launch, 16), int(cycle_ns or 0)
 
 
 def any_alive(rack: str) -> str:
@@ -36,7 +43,7 @@ def any_alive(rack: str) -> str:
 
 
 def step_key(rack: str) -> str:
-    """Return the key expression of the ends of a rack's cycles, in lockstep."""
+    """Return the key expression of the cycles of a rack's adapter, in lockstep."""
     return f"rack/{rack}/step"
 
 

@@ -21,7 +21,7 @@ from rack.boards.lan.access import access_control
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.credentials import Credential, Credentials
 from rack.boards.lan.envelope import HEAD_BYTES, Sealer
-from rack.boards.lan.keys import ALL_ALIVE, alive_key
+from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
 
 UNREAD = 32
@@ -137,9 +137,9 @@ class LanLink:
 
         return questions
 
-    def declare_alive(self, launch: int) -> None:
-        """Show others that this launch is there; after everything that they may send it."""
-        self._kept.append(self.session.liveliness().declare_token(alive_key(self.rack, launch)))
+    def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
+        """Show others that this launch is there; after everything that they may send it. See `alive_key`."""
+        self._kept.append(self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns)))
 
     def watch_alive(self, unread: int = UNREAD) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields rack, launch, and whether it has come or gone, of others, oldest first."""
@@ -152,8 +152,8 @@ class LanLink:
             for _ in range(unread):
                 if (sample := subscriber.try_recv()) is None:
                     return
-                _, rack, _, launch = str(sample.key_expr).split("/")
-                yield rack, int(launch, 16), sample.kind == zenoh.SampleKind.PUT
+                key = str(sample.key_expr)
+                yield key.split("/")[1], launch_and_cycle(key)[0], sample.kind == zenoh.SampleKind.PUT
 
         return changes
 

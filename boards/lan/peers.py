@@ -8,8 +8,7 @@ this adapter itself has just joined. So:
 - When its token goes and another one is there, that launch is there; otherwise the rack is lost.
 - A launch that another has replaced, and whose token has gone, is over: no late token or message brings it back.
 
-In lockstep nothing here follows from when a token comes: no rack's first cycle ends before all are there, and whoever
-waits for the others says when one has left.
+In lockstep nothing here follows from when a token comes: the barrier says, cycle by cycle, who is there.
 """
 
 from __future__ import annotations
@@ -112,10 +111,11 @@ class PeerRack:
             self.findings.append(Finding(alarm, self.number, tick - self.since))
         self.presence, self.launch, self.since, self.confirm_by = Presence.THERE, launch, tick, -1
 
-    def joins(self) -> None:
-        """Note, in lockstep, that it is there from the start."""
+    def joins(self, launch: int, tick: int) -> None:
+        """Note, in lockstep, that it is there: from the start, or still when this adapter has been restarted."""
         if self.presence is Presence.AWAITED:
-            self.presence, self.launches = Presence.THERE, 1
+            self.presence, self.launches, self.since = Presence.THERE, 1, tick
+        self.launch, self.confirm_by = launch, -1
 
     def resume(self, message: Any, confirm_by: int) -> None:
         """Continue from the message that an adapter before this one wrote: see `rack.levels.peer.PEER`."""
@@ -146,8 +146,6 @@ class Peers:
     def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
         """Take what comes and goes from now on from this function: rack, launch, whether it has come."""
         self._changes, self._is_lockstep = changes, is_lockstep
-        for peer in self if is_lockstep else ():
-            peer.joins()
 
     def look(self, tick: int) -> list[Finding]:
         """Note who has come and who has gone; return what to report of it."""
@@ -159,7 +157,9 @@ class Peers:
             if not self._is_lockstep:
                 (peer.comes if is_there else peer.goes)(launch, tick)
             elif is_there:
-                peer.launch = launch
+                peer.joins(launch, tick)
+            else:
+                peer.leaves(tick)
         found: list[Finding] = []
         for peer in self:
             if 0 <= peer.confirm_by <= tick:

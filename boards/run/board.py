@@ -16,11 +16,12 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.adapters.adapter import Adapter
 from rack.boards.classes import find_class
+from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
 from rack.boards.run.task import Task
 from rack.boards.wiring import ClockWiring, TaskWiring
-from rack.levels.errors import LevelError
+from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 
 SELF_TEST_FAILED = 3
@@ -40,7 +41,7 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
         return board(segment)
     except (BackplaneError, LevelError) as error:
         print(f"board '{name}': {error}", file=sys.stderr, flush=True)
-        return SELF_TEST_FAILED
+        return CANNOT_GO_ON if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
     except Exception:
         print(f"board '{name}' failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
         return 1

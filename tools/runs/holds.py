@@ -15,6 +15,7 @@ from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.events import Event
+from rack.boards.lan.awaited import awaited
 from rack.boards.operator import describe
 from rack.levels.operator import Answer, Operation
 
@@ -81,7 +82,8 @@ class Holds:
             return ()
         shown: list[str] = []
         held = (hold for level in self._statuses for hold in self._held(level))
-        return (*self._stopped(), *(hold for hold in held if hold.release or is_news(hold.why, shown)))
+        kept = (hold for hold in held if hold.release or is_news(hold.why, shown))
+        return (*self._stopped(), *self._awaiting(), *kept)
 
     def _stopped(self) -> Iterator[Hold]:
         if self._lines.emergency_stop:
@@ -89,6 +91,10 @@ class Holds:
             where = ", on its own machine" if self._segment.is_mirror else ""
             release = f"rack estop {self._segment.layout.rack} --reset{where}"
             yield self._hold("arm", since, "braked: emergency stop", release)
+
+    def _awaiting(self) -> Iterator[Hold]:
+        for board, why in awaited(self._segment):
+            yield self._hold(board, self._segment.block(board)[Block.RELEASED], why, "")
 
     def _held(self, level: str) -> Iterator[Hold]:
         seen = self._statuses[level].peek()

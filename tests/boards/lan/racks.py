@@ -10,12 +10,14 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from rack.backplane.mailbox.protocols import open_observer
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
@@ -100,24 +102,51 @@ def configs(texts: Iterable[str], folder: Path, *settings: str) -> list[RackConf
     return found
 
 
-def run_together(racks: Sequence[RackConfig], seconds: Sequence[float | None]) -> list[tuple[Outcome, list[Event]]]:
-    """Run racks from this process, launched in this order, until all have ended; return outcomes and events."""
+class Ended(NamedTuple):
+    """A rack that has ended: its outcome, its events, and the last message of each mailbox, by name and field."""
+
+    outcome: Outcome
+    events: list[Event]
+    last: dict[str, dict[str, Any]]
+
+    @property
+    def texts(self) -> str:
+        """The texts of its events, a line each."""
+        return "\n".join(event.text for event in self.events)
+
+
+@contextmanager
+def running(racks: Sequence[RackConfig]) -> Iterator[list[Rack]]:
+    """Launch racks from this process, in this order; they begin when the caller starts them."""
     with ExitStack() as stack:
         # All crates import at once.
         crates = [stack.enter_context(CrateLine()) for _ in racks]
-        running: list[Rack] = []
-        for config, crate, most in zip(racks, crates, seconds, strict=True):
-            rack = stack.enter_context(Rack(config, crate=crate))
+        yield [stack.enter_context(Rack(config, crate=crate)) for config, crate in zip(racks, crates, strict=True)]
+
+
+def watch(racks: Sequence[Rack], until: Callable[[], object] = lambda: False) -> None:
+    """Supervise racks until all have ended or `until` holds. Raises `TimeoutError` when neither comes."""
+    deadline = time.monotonic() + BOUND_S
+    while sum(rack.watch(0.005) for rack in racks) and not until():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"not within {BOUND_S:g} s: {[rack.events[-1].text for rack in racks]}")
+
+
+def run_together(racks: Sequence[RackConfig], seconds: Sequence[float | None]) -> list[Ended]:
+    """Run racks from this process, launched in this order, until all have ended."""
+    with running(racks) as launched:
+        for rack, most in zip(launched, seconds, strict=True):
             rack.start(most)
-            running.append(rack)
-        while any([rack.watch(0.01) for rack in running]):  # noqa: C419  each of them is watched
-            continue
-    return [(_outcome(rack), rack.events) for rack in running]
+        watch(launched)
+        return [ended(rack) for rack in launched]
 
 
-def _outcome(rack: Rack) -> Outcome:
+def ended(rack: Rack) -> Ended:
+    """Return how a rack has ended, which is not closed yet."""
     assert rack.outcome is not None
-    return rack.outcome
+    seen = {box.name: open_observer(rack.segment, box.name).peek().value for box in rack.segment.layout.mailboxes}
+    last = {name: {field: getattr(value, field) for field in value.record.dtype.names} for name, value in seen.items()}
+    return Ended(rack.outcome, rack.events, last)
 
 
 class RackProcess:

@@ -131,21 +131,25 @@ def test_alarms_name_the_rack_by_its_number_and_strangers_are_no_peers() -> None
     assert [peer.rack for peer in peers] == ["a", "b"]
 
 
-def test_in_lockstep_nothing_follows_from_when_a_token_comes() -> None:
+def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_and_an_adapter_started_anew_adds_nothing() -> None:
     message = Message(PEER.dtype({}))
     written = []
-    for at in (0, 8, 400):
-        peers, coming = Peers(["b"]), list[tuple[str, int, bool]]()
-        peers.watch(partial(taken, coming), is_lockstep=True)
+    for launch, restarted_at in ((OLD, 400), (NEW, 160)):
         rows = []
         for tick in range(0, 800, 8):
-            coming += [("b", OLD, True)] if tick == at else []
-            assert peers.look(tick) == []
+            if tick in (0, restarted_at):
+                peers, coming = Peers(["b"]), [("b", launch, True)]
+                peers.watch(partial(taken, coming), is_lockstep=True)
+                if tick:
+                    peers["b"].resume(message, tick + 80)
+            coming += [("b", launch, False)] if tick == 600 else []
+            found = peers.look(tick)
+            assert [finding.alarm for finding in found] == [Alarm.PEER_LOST] * (tick == 600)
             peers["b"].fill(message, is_lockstep=True)
             rows.append(bytes(message.raw))
+        assert (message.presence, message.since, message.launches, message.losses) == (Presence.LOST, 600, 1, 1)
         written.append(rows)
-        assert peers["b"].launch == OLD
-    assert written[0] == written[1] == written[2]
+    assert written[0] == written[1]
 
 
 @given(st.lists(st.tuples(st.integers(1, 4), st.booleans()), max_size=40))

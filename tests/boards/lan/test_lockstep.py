@@ -1,0 +1,184 @@
+"""Racks in lockstep step as one: equal runs whatever the machine does, and clear words where they cannot."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System
+from rack.boards.crate import patience
+from rack.levels.peer import Presence, peer_port
+from rack.tools.runs.holds import Holds
+from tests.boards.lan.racks import Ended, configs, ended, ring_texts, run_together, running, started, watch
+from tests.processes import forked, runs, wait_until
+
+CYCLE = 8
+"""Ticks in a cycle of the adapters, at 50 Hz."""
+STEPPED = "clock.mode=lockstep"
+KILLED_AT = 10 * CYCLE + 3
+KILL = f"""
+[[fault]]
+board = "lan"
+kind = "kill"
+tick = {KILLED_AT}
+"""
+
+
+@pytest.fixture
+def names(rack_name: str) -> list[str]:
+    """Names for three racks of this test."""
+    return [f"{rack_name}-{k}" for k in "abc"]
+
+
+def digests(found: Sequence[Ended]) -> list[str]:
+    """Return the digests of racks, each of which ran to its end."""
+    assert [one.outcome.cause for one in found] == ["time over"] * len(found), [one.texts for one in found]
+    return [one.outcome.digest for one in found]
+
+
+def load() -> None:
+    """Keep a core busy."""
+    while True:
+        pass
+
+
+def test_three_racks_repeat_whatever_the_order_of_launches_and_the_load(names: list[str], tmp_path: Path) -> None:
+    racks = configs(ring_texts(names), tmp_path, STEPPED)
+    first = run_together(racks, [1.0, 1.0, 1.0])
+    with forked(load), forked(load):
+        second = run_together(racks[::-1], [1.0, 1.0, 1.0])[::-1]
+    assert digests(first) == digests(second)
+    assert len(set(digests(first))) == 3
+    for one in first:
+        counts = one.last["lan.status"]["import_other"]
+        # In its first cycle an adapter finds nothing to export.
+        assert counts["taken"] == 49
+        assert not any(counts[name] for name in ("missing", "repeated", "late", "refused", "strange", "overtaken"))
+        assert one.last["echo.status"]["total"] == sum(range(48))
+        assert one.last["echo.status"]["lost"] == 0
+
+
+def test_a_rack_that_ends_earlier_is_lost_at_the_same_tick_each_time(names: list[str], tmp_path: Path) -> None:
+    racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
+    found = [run_together(racks, [0.75, 0.3]) for _ in range(2)]
+    assert digests(found[0]) == digests(found[1])
+    first, _ = found[0]
+    peer = first.last[f"lan.{peer_port(names[1])}"]
+    # The other one's last cycle begins 8 ticks before its end, at tick 120.
+    assert (peer["presence"], peer["since"], peer["losses"]) == (Presence.LOST, 120, 1)
+    assert first.last["echo.status"]["lost"] > 0
+
+
+def test_an_adapter_killed_at_a_tick_comes_back_and_the_run_repeats(names: list[str], tmp_path: Path) -> None:
+    texts = ring_texts(names[:2])
+    racks = configs([texts[0], texts[1] + KILL], tmp_path, STEPPED)
+    found = [run_together(racks, [1.0, 1.0]) for _ in range(2)]
+    assert digests(found[0]) == digests(found[1])
+    other, struck = found[0]
+    assert "rejoined" in struck.texts
+    assert other.last[f"lan.{peer_port(names[1])}"]["losses"] == 0
+    assert other.last["lan.status"]["import_other"]["missing"] == 0
+    # It takes what was sent while it was away, of which the newest counts.
+    assert struck.last["lan.status"]["import_other"]["missing"] == 0
+    assert struck.last["lan.status"]["import_other"]["overtaken"] > 0
+
+
+def test_a_killed_rack_is_given_up_and_the_others_go_on(names: list[str], tmp_path: Path) -> None:
+    texts = ring_texts(names[:2])
+    texts[0] = texts[0].replace("lan_levels:Echo", "hasty_levels:Echo")
+    racks = configs(texts, tmp_path, STEPPED)
+    with running(racks[:1]) as (rack,), started(tmp_path / "rack-1.toml", None, STEPPED) as other:
+        rack.start(1.0)
+        other.await_event("start")
+        watch([rack], until=lambda: rack.segment.words[System.TICK] > 100)
+        # Held, so that it does not end first.
+        rack.segment.words[System.HOLD_AT] = 200
+        watch([rack], until=lambda: rack.segment.words[System.HELD])
+        adapter = Segment.attach(names[1]).block("lan")[Block.PID]
+        other.send(signal.SIGKILL)
+        wait_until(lambda: not runs(adapter))
+        rack.segment.words[System.HOLD_AT] = 0
+        watch([rack])
+        assert ended(rack).outcome.cause == "time over"
+        assert ended(rack).last[f"lan.{peer_port(names[1])}"]["presence"] == Presence.LOST
+
+
+def test_a_rack_started_anew_takes_no_part_and_says_why(names: list[str], tmp_path: Path) -> None:
+    racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
+    with running(racks[:1]) as (rack,):
+        rack.start(1.0)
+        with started(tmp_path / "rack-1.toml", None, STEPPED) as other:
+            other.await_event("start")
+            rack.segment.words[System.HOLD_AT] = 100
+            watch([rack], until=lambda: rack.segment.words[System.HELD])
+        with started(tmp_path / "rack-1.toml", None, STEPPED) as other:
+            other.await_event("start")
+            rack.segment.words[System.HOLD_AT] = 0
+            outcome = other.outcome()
+            assert outcome["cause"] == "board lost"
+            assert any(f"rack '{names[0]}' " in event["text"] for event in other.events if event["kind"] == "printed")
+        watch([rack])
+        assert ended(rack).outcome.cause == "time over"
+
+
+def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
+    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "PATIENCE_S", 0.0)
+    racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
+    with running(racks[:1]) as (rack,):
+        rack.start(1.0)
+        watch([rack], until=lambda: rack.segment.block("lan")[Block.AWAITS])
+        said = f"waits for rack '{names[1]}': it has not come yet, or does not name this rack"
+        assert [hold.why for hold in Holds(rack.segment).look() if hold.level == "lan"] == [said]
+        watch([rack], until=lambda: rack.events[-1].kind == "waiting")
+        assert rack.segment.words[System.TICK] < CYCLE
+        rack.stop("test")
+        watch([rack])
+        assert ended(rack).outcome.cause == "stopped"
+        assert ended(rack).outcome.ticks <= CYCLE
+
+
+def test_a_rack_held_by_the_host_holds_the_others(names: list[str], tmp_path: Path) -> None:
+    racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
+    with running(racks) as (first, second):
+        first.segment.words[System.HOLD_AT] = 5 * CYCLE + 1
+        first.start(0.5)
+        second.start(0.5)
+        watch([first, second], until=lambda: second.segment.block("lan")[Block.AWAITS])
+        watch([first, second], until=lambda: first.segment.words[System.HELD])
+        assert first.segment.words[System.TICK] < 5 * CYCLE
+        assert second.segment.words[System.TICK] < 6 * CYCLE
+        first.segment.words[System.HOLD_AT] = 0
+        watch([first, second])
+        held = [ended(first), ended(second)]
+    assert digests(held) == digests(run_together(racks, [0.5, 0.5]))
+
+
+@pytest.mark.parametrize(
+    ("setting", "text"),
+    [
+        ("adapter.lan.rate_hz=100", "cycles of adapter.lan differ: 10 ms in rack '{}', 20 ms here"),
+        ("clock.mode=realtime", "rack '{}' runs in real time, this one in lockstep"),
+    ],
+)
+def test_racks_of_different_clocks_say_so_and_end(names: list[str], tmp_path: Path, setting: str, text: str) -> None:
+    texts = ring_texts(names[:2])
+    racks = [*configs(texts[:1], tmp_path, STEPPED), *configs(texts[1:], tmp_path, STEPPED, setting)]
+    first, _ = run_together(racks, [1.0, 0.5])
+    assert first.outcome.cause == "board lost"
+    assert text.format(names[1]) in first.texts
+    assert "restart" not in first.texts
+
+
+def test_a_rack_that_others_do_not_wait_for_says_so(names: list[str], tmp_path: Path) -> None:
+    a, b, c = names
+    texts = ring_texts(names, {a: [b], b: [a], c: [b]})
+    found = run_together(configs(texts, tmp_path, STEPPED), [0.5, 0.5, 0.5])
+    # Each imports from the one before it; the second one waits for the first alone.
+    assert [one.outcome.cause for one in found] == ["board lost", "time over", "board lost"]
+    assert f"rack '{b}' does not wait for '{c}' in lockstep" in found[2].texts
