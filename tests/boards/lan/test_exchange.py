@@ -24,7 +24,7 @@ from rack.boards.config.resolved import loads
 from rack.boards.crate.clean import remove_dead
 from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence
-from tests.boards.lan.racks import ROOT, configs, endpoints, rack_text, started
+from tests.boards.lan.racks import ROOT, RackProcess, configs, endpoints, rack_text, started
 from tests.machine import needs_fifo
 from tests.processes import BOUND_S, wait_until
 
@@ -58,6 +58,12 @@ def attached(name: str) -> Segment:
 def written(segment: Segment, mailbox: str) -> np.ndarray:
     """Return the messages of a mailbox that its slots still hold."""
     return MailboxRing(segment, mailbox).drain().rows["message"]
+
+
+def awaited(rack: RackProcess, since: int, kind: str, text: str) -> dict[str, Any]:
+    """Return an event of a kind whose text contains this, after the first `since`: clock and adapter ring apart."""
+    past = [event for event in rack.events[since:] if event["kind"] == kind and text in event["text"]]
+    return past[0] if past else rack.await_event(kind, text)
 
 
 def kill_adapter(segment: Segment) -> None:
@@ -122,17 +128,19 @@ def test_boards_and_racks_die_and_come_back(names: tuple[str, str], tmp_path: Pa
                 wait_until(lambda: b.words[System.DEMAND] == Demand.NONE)
                 last = newest(b, "echo.status").count
 
+                since = len(reading.events)
                 writing.send(signal.SIGKILL)
-                event = reading.await_event("detection", f"rack '{names[0]}' is lost")
+                event = awaited(reading, since, "detection", f"rack '{names[0]}' is lost")
                 assert (event["code"], event["subject"]) == ("peer_lost", names[0])
-                event = reading.await_event("reaction", "a rack that it works with is lost")
+                event = awaited(reading, since, "reaction", "a rack that it works with is lost")
                 assert (event["code"], event["value"]) == ("demand", Demand.STOP)
                 lost = newest(b, "echo.status").lost
                 wait_until(lambda: newest(b, "echo.status").lost > lost + 2)
             with started(files[0], SECONDS, *GENTLE) as writing:
-                event = reading.await_event("recovery", "it was restarted")
+                since = len(reading.events)
+                event = awaited(reading, since, "recovery", "it was restarted")
                 assert event["subject"] == names[0]
-                reading.await_event("recovery", "arm released")
+                awaited(reading, since, "recovery", "arm released")
                 # Its counting begins again: what comes now is of the new launch.
                 wait_until(lambda: 0 < newest(b, "echo.status").count < last)
                 peer = newest(b, f"lan.peer_{names[0].replace('-', '_')}")
