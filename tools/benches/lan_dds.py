@@ -1,7 +1,6 @@
 """An end on cyclonedds, a DDS: reliable topics, one for each pair of machines, and its own liveliness."""
 
 # Annotations are not postponed: cyclonedds evaluates them.
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -66,26 +65,24 @@ class _Events(Listener):
     def __init__(self, other: int, notice: Notice, take: Take | None) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self._other, self._notice, self._take = other, notice, take
-        self._lock, self._alive, self._matched, self._is_there = threading.Lock(), False, False, False
+        self._was_there = False
 
     def on_data_available(self, reader: DataReader[Any]) -> None:
         if self._take is not None:
             for content in _taken(reader):
                 self._take(self._other, content)
 
-    def on_liveliness_changed(self, reader: DataReader[Any], status: Any) -> None:
-        self._alive = status.alive_count > 0
-        self._judge()
-
     def on_publication_matched(self, writer: DataWriter[Any], status: Any) -> None:
-        self._matched = status.current_count > 0
-        self._judge()
+        self._set(True)
 
-    def _judge(self) -> None:
-        with self._lock:
-            if (is_there := self._alive and self._matched) != self._is_there:
-                self._is_there = is_there
-                self._notice(self._other, is_there)
+    def on_liveliness_changed(self, reader: DataReader[Any], status: Any) -> None:
+        # Its writer is known before it knows ours.
+        if self._was_there:
+            self._set(status.alive_count > 0)
+
+    def _set(self, is_there: bool) -> None:
+        self._was_there |= is_there
+        self._notice(self._other, is_there)
 
 
 class DdsEnd:

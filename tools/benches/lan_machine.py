@@ -75,7 +75,7 @@ class Machine:
 
     def __init__(self, task: LanTask) -> None:
         self._place, self._echoes = task.place, task.echoes
-        self._there: set[int] = set()
+        self._seen: set[int] = set()
         self._all_there, self._answered = threading.Event(), threading.Event()
         self._awaited = 0
         self._round_trips: list[float] = []
@@ -90,15 +90,16 @@ class Machine:
     def find(self) -> None:
         """Wait until all others are there. Raises `TimeoutError`."""
         if not self._all_there.wait(FIND_S):
-            missing = sorted(set(self._place.others) - self._there)
+            missing = sorted(set(self._place.others) - self._seen)
             raise TimeoutError(f"machine {self._place.machine}: {missing} not found within {FIND_S:g} s")
 
     def _notice(self, machine: int, is_there: bool) -> None:
         """Note that another machine has come or gone; the coordinator says so."""
-        (self._there.add if is_there else self._there.discard)(machine)
+        if is_there:
+            self._seen.add(machine)
         if self._place.machine == COORDINATOR:
             _say({"machine": machine, "is_there": is_there, "ns": time.monotonic_ns()})
-        if len(self._there) == len(self._place.others):
+        if len(self._seen) == len(self._place.others):
             self._all_there.set()
 
     def measure(self, window: LanWindow) -> LanFound:

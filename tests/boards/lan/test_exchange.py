@@ -25,6 +25,7 @@ from rack.boards.crate.clean import remove_dead
 from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence
 from tests.boards.lan.racks import ROOT, configs, endpoints, rack_text, started
+from tests.machine import needs_fifo
 from tests.processes import BOUND_S, wait_until
 
 SECONDS = 120.0
@@ -140,6 +141,23 @@ def test_boards_and_racks_die_and_come_back(names: tuple[str, str], tmp_path: Pa
             b.close()
 
 
+@needs_fifo
+@pytest.mark.alone
+def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(rack_name: str, tmp_path: Path) -> None:
+    (config,) = configs(
+        [rack_text(rack_name, endpoints(1)[0], [])], tmp_path, "adapter.lan.priority=37", "board.pulse.priority=36"
+    )
+    with Rack(config) as rack:
+        pid = rack.segment.block("lan")[Block.PID]
+        core = rack.segment.layout.task("lan").core
+        threads = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()]
+        assert len(threads) > 1
+        for thread in threads:
+            assert os.sched_getscheduler(thread) == os.SCHED_FIFO
+            assert os.sched_getparam(thread).sched_priority == 37
+            assert os.sched_getaffinity(thread) == {core}
+
+
 @contextmanager
 def flooding(name: str, endpoint: str, victim: str) -> Iterator[None]:
     """Let a rack of that name flood another one, which listens at an endpoint."""
@@ -184,6 +202,22 @@ max_age_ms = 1000
     assert refused.max() == UNREAD
     assert (refused >= 0).all()
     assert rows["import_other"]["taken"][-1] == 0
+
+
+def test_an_adapter_killed_in_lockstep_continues_its_counts_and_the_run_repeats(rack_name: str) -> None:
+    text = rack_text(rack_name, "", []).replace("[clock]", '[clock]\nmode = "lockstep"')
+    text += '[[fault]]\nkind = "kill"\nboard = "lan"\ntick = 100\n'
+    ended = []
+    for _ in range(2):
+        with Rack(loads(text)) as rack:
+            outcome = rack.run(1.5)
+            ended.append((outcome.digest, int(newest(rack.segment, "lan.status").export_pulse["sent"])))
+            assert [event.board for event in rack.events if event.code == "rejoined"] == ["lan"]
+            rows = written(rack.segment, "lan.status")["export_pulse"]["sent"].astype(int)
+    assert ended[0] == ended[1]
+    # Of the messages written meanwhile only the newest was sent: it sampled fewer, and none twice.
+    assert (np.diff(rows) >= 0).all()
+    assert 40 < ended[0][1] == rows[-1]
 
 
 def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
