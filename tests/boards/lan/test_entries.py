@@ -321,10 +321,7 @@ def test_a_message_whose_age_is_unknown_waits_for_the_clocks(importing: Importin
 def test_in_lockstep_nothing_that_differs_from_run_to_run_is_on_record(importing: Importing) -> None:
     importing.send(1, written=2)
     importing.cycle(8)
-<<<<<<< HEAD
-=======
     assert importing.read(16) == (NEW, 1, False)
->>>>>>> step
     assert importing.status.import_other["launch"] == 0
 
 
@@ -384,8 +381,6 @@ def test_each_new_message_is_sent_once(segment: Segment) -> None:
     assert [(head.number, head.serial, head.tick) for head in heads] == [(1, 1, 0), (2, 3, 16)]
     assert heads[1].time_ns == 16 * 2_500_000
     assert heads[1].stamp_ns == 16 * 2_500_000
-<<<<<<< HEAD
-=======
 
 
 def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(segment: Segment) -> None:
@@ -403,7 +398,6 @@ def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(se
         exporting.entry.recall(died_after, EVERY)
         assert exporting.heads() == again
         assert exporting.entry.sent == 2
->>>>>>> step
 
 
 def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) -> None:
