@@ -9,6 +9,7 @@ import pytest
 
 from rack.boards.lan.access import PUT, SUBSCRIBE, TOKEN, WATCH_TOKENS, access_control
 from rack.boards.lan.config import LanTable
+from rack.boards.lan.keys import alive_key, launch_and_cycle
 
 TLS, TCP = "tls/10.0.0.1:7447", "tcp/127.0.0.1:7447"
 ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
@@ -97,3 +98,13 @@ def test_who_asks_is_answered_and_sends_nothing() -> None:
     assert ("egress", "query", "rack/*/ask/*/home/**", "*") in found
     assert ("ingress", "reply", "rack/*/ask/*/home/**", "*") in found
     assert not [key for _, message, key, _ in found if message in ("put", "declare_subscriber")]
+
+
+@pytest.mark.parametrize("cycle_ns", [0, 20_000_000])
+def test_a_token_names_launch_and_cycle(cycle_ns: int) -> None:
+    assert launch_and_cycle(alive_key("home", 0xAB, cycle_ns)) == (0xAB, cycle_ns)
+
+
+@pytest.mark.parametrize("launch", ["x", "ab", "-20", f"{1:016x}-", f"{1:016x}-x", f"{1:016x}-{10**18}", f"{1:017x}"])
+def test_a_token_that_no_adapter_has_made_is_none(launch: str) -> None:
+    assert launch_and_cycle(f"rack/home/alive/{launch}") is None
