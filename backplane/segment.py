@@ -26,7 +26,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 11
+VERSION = 12
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""

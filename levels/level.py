@@ -26,6 +26,8 @@ Messages
   be. False: the queue is full; try again in a later cycle. Its one reader gets each once and in order, the older
   unread ones in `Reading.earlier`, at most `room(port)` in a cycle. What a board has taken in the cycle in which it
   dies is lost with it: the sender notices by the ids that the reader's status echoes.
+- A mailbox of another rack, which `[adapter.lan]` imports, is read as `Input(TYPE, "lan.<port>")`. It is lost when its
+  information is older than `max_age_ms`, and at once when that rack is. Where that is says `lan.peer_<rack>`, a `PEER`.
 - Symbolic sizes of fields ("joints", "bodies", "state") follow from `[robot]` and `[scene]`, see `context.sizes`.
   Reader and writer of a mailbox must name the same message type and version.
 

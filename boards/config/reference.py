@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from rack.boards.config.files import EXTENDS
 from rack.boards.config.ports import all_ports, table_of
-from rack.boards.config.schema import RackConfig
+from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.errors import ConfigError, Mistake, shown
 from rack.boards.faults.kind import KINDS
 
@@ -76,7 +76,9 @@ def key_tables(config: RackConfig) -> list[KeyTable]:
     found = [replace(whole, keys=(extends, *whole.keys)), *found, *_fault_kinds()]
     for program in dict.fromkeys(p.kind.program for p in ports if p.kind.program is not None):
         found += _tables(program, "task", Place("task"))
-    for board, params in dict.fromkeys((table_of(p.place), p.kind.params) for p in ports if p.kind.params is not None):
+    # Of the network adapter's board the table is `[adapter.lan]`.
+    own = [p for p in ports if config.adapter.lan is None or p.place.board != LAN]
+    for board, params in dict.fromkeys((table_of(p.place), p.kind.params) for p in own if p.kind.params is not None):
         name = f"{board}.params"
         found += _tables(params, name, Place(name))
     return found

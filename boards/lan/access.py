@@ -36,7 +36,7 @@ def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
         by_subject[ANYONE] = list(_asking(own))
     if not table.has_tls:
         exported = [out_key(own, entry.source) for entry in table.exports.values()]
-        by_subject.setdefault(ANYONE, []).extend([*_shown(own, exported), *(_compared(own) if exported else ())])
+        by_subject.setdefault(ANYONE, []).extend([*_shown(own, exported), *_compared(own)])
     for peer in dict.fromkeys([*table.racks, *table.permit]):
         subject = peer if table.has_tls else ANYONE
         rules = by_subject.setdefault(subject, [])

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -26,7 +27,7 @@ from rack.backplane.message import Message
 from rack.backplane.operator_table import OperatorTable, Request, RequestClaim, RequestStage, RequestWord
 from rack.backplane.segment import VERSION, Segment
 from rack.backplane.watch.alarms import Alarm
-from rack.backplane.words import Block
+from rack.backplane.words import Block, System
 from rack.boards.lan.config import Right
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer
 from rack.boards.lan.grid import OwnGrid
@@ -56,6 +57,10 @@ CLIENT_S = 2.0
 WATCHED_S, LINGER_S, PAUSE_S = 1.0, 0.3, 0.005
 """At the end of a run: time since the last look from which nobody watches any more, how long those who do may still
 look, and how often the desk then has a cycle; real time."""
+STALE_S = 0.5
+"""How much longer than its ticks a cycle may take, real time, before commands that came meanwhile are dropped."""
+REMEMBERED = 64
+"""Commands of which the desk remembers that it gave them, in case they are asked for again."""
 MOST_CLIENTS = 16
 """Requests that wait for clients of this desk, at most."""
 _ASKER = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
@@ -113,8 +118,9 @@ class Desk:
         self._hosts = [segment.map.blocks[host.name] + 8 * Block.PID for host in segment.layout.hosts]
         self._channels: dict[Right, Callable[[], Iterator[Question]]] = {}
         self._waiting: list[Waiting] = []
+        self._given: deque[tuple[tuple[str, int, int], Ticket]] = deque(maxlen=REMEMBERED)
         self.count = DeskCount()
-        self._sent = self._tick = self._watched_ns = 0
+        self._sent = self._tick = self._watched_ns = self._cycled_ns = 0
         self._sealer: Sealer
         self._launch = 0
 
@@ -126,6 +132,7 @@ class Desk:
 
     def answer(self, tick: int) -> None:
         """Answer the questions that have come, within the bounds of a cycle."""
+        self._drop_stale(tick)
         self._sent, self._tick = 0, tick
         for right, channel in self._channels.items():
             answers = 0
@@ -140,6 +147,13 @@ class Desk:
                     break
         if self._waiting:
             self._dismiss()
+
+    def _drop_stale(self, tick: int) -> None:
+        """Drop commands that waited while the rack was held: who gave them may have gone, or asks again."""
+        now, ticks = time.monotonic_ns(), tick - self._tick
+        if now - self._cycled_ns > STALE_S * 1e9 + ticks * self._segment.words[System.PERIOD_NS]:
+            self.count.dropped += sum(1 for _ in self._channels.get("command", lambda: ())())
+        self._cycled_ns = now
 
     def close(self) -> None:
         """Let those who watch see the end of the run, which their last look was too early for."""
@@ -167,9 +181,9 @@ class Desk:
         head = self._sealer.opened(question.key, question.envelope, question.payload)
         if isinstance(head, Flaw):
             return None
+        # A key has as many parts as the one that is subscribed to.
         *_, asker, what = question.key.split("/")
         is_proper = _ASKER.fullmatch(asker) and what in NEEDED and NEEDED[what] == right  # type: ignore[index]
-        # Its key has as many parts as the one that is subscribed to.
         return Asked(asker, what, head, question) if is_proper else None
 
     def _answered(self, asked: Asked, right: Right, tick: int) -> tuple[Code, bytes]:
@@ -218,6 +232,9 @@ class Desk:
         return Code.GRANTED, b"".join([memory[at : at + size] for at, size in stretches])
 
     def _give(self, asked: Asked, tick: int) -> tuple[Code, bytes]:
+        number = asked.asker, asked.head.launch, asked.head.number
+        if (ticket := dict(self._given).get(number)) is not None:
+            return Code.GRANTED, ticket.packed()
         request = unpacked_request(asked.question.payload)
         if request is None or not self._is_proper(request):
             return Code.NOT_VALID, b""
@@ -232,7 +249,9 @@ class Desk:
         if claim is None:
             return Code.BUSY, b""
         self._waiting.append(Waiting((asked.asker, asked.head.launch), claim, self._until_ns()))
-        return Code.GRANTED, Ticket(claim.entry.index, claim.ticket).packed()
+        ticket = Ticket(claim.entry.index, claim.ticket)
+        self._given.append((number, ticket))
+        return Code.GRANTED, ticket.packed()
 
     def _is_proper(self, request: Request) -> bool:
         box = self._boxes.get(request.mailbox)

@@ -12,11 +12,13 @@ All begin with a rack's name, so that access control can hold each rack to its o
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from rack.boards.lan.config import Right
 
 ALL_ALIVE = "rack/*/alive/*"
+_ALIVE = re.compile(r"rack/[^/]+/alive/([0-9a-f]{16})(?:-([0-9]{1,18}))?")
 ASKED: Mapping[Right, str] = {"watch": "read", "command": "command", "stop": "stop"}
 """What those may ask who have a right, as in its key."""
 
@@ -31,9 +33,14 @@ def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
     return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
 
 
-def launch_and_cycle(alive: str) -> tuple[int, int]:
-    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real time."""
-    launch, _, cycle_ns = alive.rpartition("/")[2].partition("-")
+def launch_and_cycle(alive: str) -> tuple[int, int] | None:
+    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real time.
+
+    None for a token that no adapter has made.
+    """
+    if (found := _ALIVE.fullmatch(alive)) is None:
+        return None
+    launch, cycle_ns = found.groups()
     return int(launch, 16), int(cycle_ns or 0)
 
 

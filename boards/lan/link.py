@@ -153,7 +153,8 @@ class LanLink:
                 if (sample := subscriber.try_recv()) is None:
                     return
                 key = str(sample.key_expr)
-                yield key.split("/")[1], launch_and_cycle(key)[0], sample.kind == zenoh.SampleKind.PUT
+                if (found := launch_and_cycle(key)) is not None:
+                    yield key.split("/")[1], found[0], sample.kind == zenoh.SampleKind.PUT
 
         return changes
 

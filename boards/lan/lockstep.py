@@ -213,8 +213,8 @@ class Barrier:
         if partner is None or partner.is_out:
             return
         if key != step_key(partner.rack):
-            launch, cycle_ns = launch_and_cycle(key)
-            self._note_sign(partner, launch, cycle_ns, sample.kind == zenoh.SampleKind.PUT)
+            if (found := launch_and_cycle(key)) is not None:
+                self._note_sign(partner, *found, sample.kind == zenoh.SampleKind.PUT)
             return
         content, envelope = sample.payload.to_bytes(), sample.attachment
         head = self._sealer.opened(key, None if envelope is None else envelope.to_bytes(), content)

@@ -1,9 +1,9 @@
 """Questions to a rack from another machine, and their answers, as bytes.
 
-A question is a query under the key `question_key`. Its envelope carries the version of the segment's
-layout as `kind`, a number of the asker's session as `launch`, and the number of the question in it as `serial`. The
-answer's envelope carries the last two back, as `number` and `serial`: an answer cannot be passed off as that to another
-question.
+A question is a query under the key `question_key`. Its envelope carries the version of the segment's layout as `kind`,
+a number of the asker's session as `launch`, the number of the question in it as `serial`, and as `number` that of the
+question that it repeats, or its own: an answer may be lost. The answer's envelope carries session and number back, as
+`number` and `serial`: it cannot be passed off as that to another question.
 
 A reader maps a window of another rack's memory into its own, as a bus adapter does: it asks for stretches of the
 segment, and finds out by itself what lies there.

@@ -54,6 +54,7 @@ class OrderedTaskExecutor(TaskExecutor):
         self._taken = TakenOrder()
         self._begun = 0  # request whose plan is followed; 0: none
         self._orders_begun = self._orders_done = 0
+        self._moves = 0, 0  # done, of how many, of the newest order begun
         self._halted = False  # moves were withdrawn: the arm is held until another order begins
         self._breaking_off: int | None = None  # first move that must not begin
         self._rests = False  # the arm is held so that the order can be broken off
@@ -80,6 +81,7 @@ class OrderedTaskExecutor(TaskExecutor):
         super()._recall(read, write)
         last = read.last_status.value
         self._orders_begun, self._orders_done = last.actions, last.action
+        self._moves = last.moves_done, last.moves
         if not read.last_report.is_there:
             return
         report: Message = read.last_report.value
@@ -229,12 +231,13 @@ class OrderedTaskExecutor(TaskExecutor):
         report, status, echo = write.report, write.status, write.status.echo
         self._settle(plan)
         taken = self._taken
-        is_new = (report.program, report.echo) != (taken.program, taken.order)
-        if is_new or self._begun:
-            report.moves_done, report.moves = (self._done, plan.count) if self._begun else (0, 0)
+        if self._begun:
+            self._moves = report.moves_done, report.moves = self._done, plan.count
+        elif (report.program, report.echo) != (taken.program, taken.order):
+            report.moves_done = report.moves = 0
         super()._report(plan, waits, write)
         status.echo, status.action, status.actions = echo, self._orders_done, self._orders_begun
-        status.moves_done, status.moves = report.moves_done, report.moves
+        status.moves_done, status.moves = self._moves
         report.program, report.echo, report.response = taken.program, taken.order, taken.response
         report.state, report.error, report.halted = status.state, taken.error, self._halted
         report.reason = taken.reason or waits

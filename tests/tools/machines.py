@@ -61,12 +61,18 @@ class Machine:
 def config_of(machine: Machine, others: Sequence[str], folder: Path) -> RackConfig:
     folder.mkdir(parents=True)
     path = folder / "rack.toml"
-    path.write_text(rack_text(machine.rack, "tcp/127.0.0.1:7447", (), peers=others))
+    heard = others[0] if others and machine.mode == "lockstep" else ""
+    path.write_text(rack_text(machine.rack, "tcp/127.0.0.1:7447", (), heard, peers=others))
     return load(str(path), [f"clock.mode={machine.mode}", f"clock.speed={machine.speed}"])
 
 
-def recorded(machine: Machine, others: Sequence[Machine], folder: Path, seed: int = 1) -> Recording:
-    """Write the recording of a rack that compared its clock with those of others, each time with an error."""
+def recorded(
+    machine: Machine, others: Sequence[Machine], folder: Path, seed: int = 1, counts_from: int = 0
+) -> Recording:
+    """Write the recording of a rack that compared its clock with those of others, each time with an error.
+
+    In lockstep it counts from a number, and takes the count of the others from there, each 4 ticks late.
+    """
     config = config_of(machine, [other.rack for other in others], folder)
     (folder / "config.toml").write_text(config.text())
     layout = wire(config)
@@ -81,6 +87,13 @@ def recorded(machine: Machine, others: Sequence[Machine], folder: Path, seed: in
     for other in others:
         box = layout.mailbox(f"lan.{peer_port(other.rack)}")
         signals.add(box.name, sightings(machine, other, box, seed))
+    if machine.mode == "lockstep":
+        for name, ticks in (("pulse.status", TICKS), *([("lan.other", TICKS - 4)] if others else [])):
+            rows = np.zeros(ticks // 4, row_dtype(layout.mailbox(name)))
+            rows["basis"] = np.arange(0, ticks, 4)
+            rows["tick"] = rows["basis"] + TICKS - ticks
+            rows["message"]["count"] = counts_from + rows["basis"]
+            signals.add(name, rows)
     signals.close({})
     return Recording(folder)
 

@@ -7,18 +7,27 @@ import subprocess
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load
+from rack.boards.crate.line import CrateLine
 from rack.tools.analysis.report import write_report
 from rack.tools.console.answer import Failure
 from rack.tools.replay import replay
 from rack.tools.runs.recording import Recording
+from rack.tools.runs.time_line import on_one_time_line
 from rack.tools.runs.window import ViewerWindow
 from rack.tools.viewer.reading import read
+from tests.boards.lan.racks import configs, ring_texts
 from tests.processes import RACK
+from tests.tools.machines import A, B, recorded
 
+WATCHED = """
+[adapter.lan.permit]
+operator = ["watch"]
+"""
 ROOT = Path(__file__).resolve().parents[2]
 WATCHDOG_S = 50.0
 
@@ -45,6 +54,65 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
     ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
     assert ticks[-1] == rack.outcome.ticks - 1
     assert read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist() == ticks.tolist()
+
+
+def test_racks_that_work_together_are_recorded_on_one_time_line(rack_name: str, tmp_path: Path) -> None:
+    names = [f"{rack_name}-a", f"{rack_name}-b"]
+    one, other = configs(ring_texts(names, lan=WATCHED), tmp_path, "adapter.lan.rate_hz=100")
+    port = one.adapter.lan.listen[0].rpartition(":")[2]
+    with CrateLine() as crate, Rack(one, crate=crate) as near, Rack(other) as far:
+        far.start()
+        near.start()
+        folder = tmp_path / "run"
+        # One from its own machine, one from afar.
+        command = [*RACK, "record", names[1], "--with", f"127.0.0.1:{port}/{names[0]}", "--out", str(folder), "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as recorder:
+            deadline = time.monotonic() + WATCHDOG_S
+            while not all((folder / name / "run.rrd").is_file() for name in names) and time.monotonic() < deadline:
+                near.watch(0.02)
+                far.watch(0.02)
+            near.stop("recorded")
+            far.stop("recorded")
+            while any([near.watch(0.05), far.watch(0.05)]):
+                continue
+            out, err = recorder.communicate(timeout=WATCHDOG_S)
+    assert recorder.returncode == 0, err.decode()
+    (note,) = json.loads(out)["notes"]
+    assert note.startswith(f"rack '{names[0]}' is on the time line of '{names[1]}'")
+    for name in names:
+        report, _ = write_report(folder / name)
+        assert report["tasks"]["pulse"]["traced"] > 0
+    recordings = [Recording(folder / name) for name in names[::-1]]
+    place = on_one_time_line(recordings)[1]
+    assert place.note == note
+    # The two were on one clock: what that showed is the truth.
+    true_ns = place.line.time_ns(np.array([place.own.epoch_ns]))[0]
+    assert abs(place.times_ns(np.zeros(1, dtype=int), 0)[0] - true_ns) <= place.uncertainty_ns
+    assert len(read(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0
+
+
+def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path) -> None:
+    places = [recorded(machine, others, tmp_path / machine.rack) for machine, others in ((A, [B]), (B, []))]
+    runs, out = [place.folder for place in places], tmp_path / "both.rrd"
+    replay(runs, out)
+    made = out.read_bytes()
+    for given, file, why in (
+        (runs, out, "both.rrd: exists already"),
+        (runs, tmp_path / "both.png", "permitted: a name that ends in .rrd"),
+        ([runs[0], out], tmp_path / "new.rrd", "both.rrd: not the folder of a run"),
+        ([runs[0], tmp_path / "c"], tmp_path / "new.rrd", "c: no such folder"),
+        ([runs[0], runs[0]], tmp_path / "new.rrd", "both are of rack 'a'"),
+    ):
+        with pytest.raises(Failure, match=why) as refused:
+            replay(given, file)
+        assert refused.value.status == 2
+    assert out.read_bytes() == made
+    # A folder of such runs stands for all of them.
+    replay([tmp_path], tmp_path / "again.rrd")
+    lanes = [f"/{name}/boards/2-pulse/executor" for name in "ab"]
+    for lane in lanes:
+        again, first = (read(file, lane, "StateChange:state") for file in (tmp_path / "again.rrd", out))
+        assert again.ticks.tolist() == first.ticks.tolist()
 
 
 def test_a_window_without_a_screen_says_what_to_do_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,6 +58,7 @@ class FarLaunch(NamedTuple):
 
 class _Question(NamedTuple):
     number: int
+    first: int
     key: str
     replies: Any
 
@@ -90,11 +91,13 @@ class Questioner:
         self._link.close()
 
     def _note(self, sample: Any) -> None:
-        _, rack, _, launch = str(sample.key_expr).split("/")
-        with self._changed:
+        """Note who comes and goes; a token that is not one of a rack's adapter is nobody's."""
+        _, rack, _, number = str(sample.key_expr).split("/")
+        with self._changed, suppress(ValueError):
+            launch = int(number, 16)
             if sample.kind == zenoh.SampleKind.PUT:
-                self._launches[rack] = int(launch, 16)
-            elif self._launches.get(rack) == int(launch, 16):
+                self._launches[rack] = launch
+            elif self._launches.get(rack) == launch:
                 del self._launches[rack]
             self._changed.notify_all()
 
@@ -128,14 +131,15 @@ class Questioner:
 
         All are on their way at once; one that comes back without an answer is asked again.
         """
-        pending = [self._question(asked.rack, what, payload) for payload in payloads]
+        pending = [self._question(asked.rack, what, payload, self._number + 1) for payload in payloads]
         for payload, question in zip(payloads, pending, strict=True):
             yield self._granted(asked.rack, what, self._answer(asked, what, payload, question))
 
-    def _question(self, rack: str, what: What, payload: bytes) -> _Question:
+    def _question(self, rack: str, what: What, payload: bytes, first: int) -> _Question:
+        """Ask; `first` is the number under which this was asked for the first time: nothing is done twice."""
         self._number += 1
         key = question_key(rack, what, self._asker.name)
-        head = Envelope(VERSION, self._session, self._number, 0, 0, 0, 0)
+        head = Envelope(VERSION, self._session, self._number, first, 0, 0, 0)
         replies = self._link.session.get(
             key,
             zenoh.handlers.FifoChannel(2),
@@ -144,7 +148,7 @@ class Questioner:
             payload=payload,
             attachment=self._link.sealer.seal(key, head, payload),
         )
-        return _Question(self._number, key, replies)
+        return _Question(self._number, first, key, replies)
 
     def _answer(self, asked: FarLaunch, what: What, payload: bytes, question: _Question) -> DeskAnswer:
         """Return the answer to a question. Raises `Failure` when there is none within the patience."""
@@ -165,7 +169,7 @@ class Questioner:
                 why = "its adapter does not cycle; does `rack step` hold it?"
                 raise Failure(f"rack '{asked.rack}' at {self._at} has not answered for {PATIENCE_S:g} s: {why}")
             self._until.wait(PAUSE_S)
-            question = self._question(asked.rack, what, payload)
+            question = self._question(asked.rack, what, payload, question.first)
 
     def _opened(self, question: _Question, launch: int, reply: Any) -> DeskAnswer | None:
         if (sample := reply.ok) is None:

@@ -24,6 +24,7 @@ from rack.tools.viewer.style import lanes_view
 from rack.tools.viewer.timing import BOARDS
 
 CONFIG = "config"
+LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
 CYCLES_S = 0.022
 """Time before and after the cursor in the Gantt lanes: some cycles of fast and of slower boards."""
 DIRECTION = np.array([0.75, -0.95, 0.55])
@@ -48,15 +49,12 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
 def together(racks: Mapping[str, RackViews]) -> rrb.Container:
     """Return the view of several racks, by name: all at once, and in further tabs each by itself.
 
-    All at once are the cells next to each other, or curves of racks without one, then levels and events, and the log.
+    All at once are a column for each rack, its cell above what its levels do, and below them the log of all.
     """
-    scenes = rrb.Horizontal(*(views.scene(name) for name, views in racks.items()))
-    doing = rrb.Vertical(*(views.doing(name) for name, views in racks.items()))
-    columns = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
-    logs = [views.all(LOG) for views in racks.values()]
-    log = rrb.TextLogView(origin="/", contents=[f"{path(LOG)}/**", *logs], name="log of all", columns=columns)
-    below = rrb.Horizontal(doing, log, column_shares=[3, 2])
-    shown = rrb.Vertical(scenes, below, row_shares=[3, 2], name="all racks")
+    columns = rrb.Horizontal(*(views.column(name) for name, views in racks.items()))
+    logs = [f"{path(LOG)}/**", *(views.all(LOG) for views in racks.values())]
+    log = rrb.TextLogView(origin="/", contents=logs, name="log of all racks", columns=LOG_COLUMNS)
+    shown = rrb.Vertical(columns, log, row_shares=[4, 1], name="all racks")
     return rrb.Tabs(shown, *(views.everything(name) for name, views in racks.items()), active_tab=0)
 
 
@@ -78,8 +76,10 @@ class RackViews:
 
     def everything(self, name: str | None = None) -> rrb.Container:
         """Return all views."""
-        below = rrb.Horizontal(self.doing("levels and events, whole run"), self._graph(), column_shares=[3, 2])
-        left = below if self._cell is None else rrb.Vertical(self.scene("cell"), below, row_shares=[11, 9])
+        doing = lanes_view("levels and events, whole run", [self.all(EVENTS), self.all(LEVELS)])
+        below = rrb.Horizontal(doing, self._graph(), column_shares=[3, 2])
+        cell = self._cell
+        left = below if cell is None else rrb.Vertical(self._scene(cell, "cell"), below, row_shares=[11, 9])
         right = rrb.Vertical(
             self._arm() if self._joints else self._signals(),
             lanes_view("boards, cycle by cycle", [self.all(BOARDS)], CYCLES_S),
@@ -88,17 +88,16 @@ class RackViews:
         )
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
 
-    def scene(self, name: str) -> rrb.View:
-        """Return the view of the cell; of a rack without one that of its signals."""
-        if (cell := self._cell) is None:
-            return _curves(name, [self.all(SIGNALS)])
+    def column(self, name: str) -> rrb.Container | rrb.View:
+        """Return the cell, if there is one, above what the levels do."""
+        levels = lanes_view(f"{name}: levels", [self.all(LEVELS)])
+        return levels if self._cell is None else rrb.Vertical(self._scene(self._cell, name), levels, row_shares=[5, 4])
+
+    def _scene(self, cell: Cell, name: str) -> rrb.View:
+        """Return the view of the cell."""
         shown = [self.all(CELL), f"- {self.all(CELL, COLLISION)}", self.all(FRAMES)]
         eye = eye_on(cell)
         return rrb.Spatial3DView(origin=self.path(CELL), contents=shown, name=name, eye_controls=eye, line_grid=False)
-
-    def doing(self, name: str) -> rrb.View:
-        """Return the view of what levels do, and of events, in the whole run."""
-        return lanes_view(name, [self.all(EVENTS), self.all(LEVELS)])
 
     def _arm(self) -> rrb.Container:
         """Return a view of all joints for each quantity, and in a second tab one of each joint with its limits."""
@@ -140,8 +139,7 @@ class RackViews:
         )
 
     def _log(self) -> rrb.Container:
-        columns = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
-        log = rrb.TextLogView(origin=self.path(LOG), name="log", columns=columns)
+        log = rrb.TextLogView(origin=self.path(LOG), name="log", columns=LOG_COLUMNS)
         config = rrb.TextDocumentView(origin=self.path(CONFIG), name="config")
         return rrb.Tabs(log, config, _curves("recorder", [self.all(RECORDER)]))
 

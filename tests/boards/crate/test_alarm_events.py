@@ -38,6 +38,7 @@ KINDS = {
     Alarm.BRAKES_CLOSED: "reaction",
     Alarm.BRAKES_OPENED: "recovery",
     Alarm.RE_REFERENCED: "recovery",
+    Alarm.REMOTE_STOP: "command",
     Alarm.PEER_BACK: "recovery",
     Alarm.PEER_RESTARTED: "recovery",
     Alarm.LATCHED: "reaction",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from rack.backplane.message import Field, status
 from rack.levels.level import Executor, Input, Ports
-from rack.levels.peer import PEER
 
 PULSE = status("pulse", 1, Field("count", "i8", "1", "cycles so far"))
 HEARD = status(
@@ -15,7 +14,6 @@ HEARD = status(
     Field("lost", "i8", "1", "cycles in which the other rack's writer was lost"),
     Field("backward", "i8", "1", "how often a new count was not above the one before it"),
 )
-MET = status("met", 1, Field("presence", "u1", "1", "where the other rack is"), Field("since", "i8", "tick", "since"))
 
 
 class Pulse(Executor):
@@ -42,14 +40,3 @@ class Echo(Executor):
             write.status.count = other.value.count
             write.status.total += other.value.count
         write.status.lost += other.is_lost
-
-
-class Meeting(Executor):
-    """Notes where rack `other` is, as the adapter says."""
-
-    inputs = {"peer": Input(PEER, "lan.peer_other")}
-    outputs = {"status": MET}
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Note it."""
-        write.status.presence, write.status.since = read.peer.value.presence, read.peer.value.since

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from rack.boards.lan.access import TOKEN, WATCH_TOKENS, access_control
+from rack.boards.lan.access import PUT, SUBSCRIBE, TOKEN, WATCH_TOKENS, access_control
 from rack.boards.lan.config import LanTable
+from rack.boards.lan.keys import alive_key, launch_and_cycle
 
 TLS, TCP = "tls/10.0.0.1:7447", "tcp/127.0.0.1:7447"
 ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
@@ -32,9 +33,15 @@ def rules(endpoint: str, asks: bool = False, **table: Any) -> Iterator[tuple[str
                                 yield flow, message, key, name
 
 
-def test_without_others_nothing_is_allowed_but_to_see_that_it_is_there() -> None:
+def test_without_others_nothing_is_allowed() -> None:
     assert list(rules(TLS)) == []
-    assert {message for _, message, *_ in rules(TCP)} == {*WATCH_TOKENS, *TOKEN}
+
+
+def test_without_tls_anyone_may_see_that_it_is_there_and_compare_clocks() -> None:
+    found = list(rules(TCP))
+    assert {message for _, message, *_ in found} == {*WATCH_TOKENS, *TOKEN, *SUBSCRIBE, *PUT}
+    keys = {key for _, message, key, _ in found if message in (*SUBSCRIBE, *PUT)}
+    assert keys == {"rack/*/ping/home", "rack/*/pong/*", "rack/home/pong/*"}
 
 
 def test_over_tls_every_rule_is_for_one_certificate() -> None:
@@ -82,8 +89,7 @@ def test_without_tls_rules_hold_for_anyone_but_by_the_same_keys() -> None:
     tables: dict[str, Any] = {"export": {"pulse": {"from": "pulse.status"}}, "permit": {"viewer": ["watch"]}}
     known, unknown = ({rule[:3] for rule in rules(at, **tables, peers=("friend",))} for at in (TLS, TCP))
     assert known <= unknown
-    # Who may read what is exported may find out how old it is.
-    assert {key for *_, key in unknown - known} == {"rack/*/ping/home", "rack/home/pong/*", "rack/*/pong/*"}
+    assert unknown - known <= {rule[:3] for rule in rules(TCP)}
     assert {name for *_, name in rules(TCP, **tables, peers=("friend",))} == {"*"}
 
 
@@ -92,3 +98,13 @@ def test_who_asks_is_answered_and_sends_nothing() -> None:
     assert ("egress", "query", "rack/*/ask/*/home/**", "*") in found
     assert ("ingress", "reply", "rack/*/ask/*/home/**", "*") in found
     assert not [key for _, message, key, _ in found if message in ("put", "declare_subscriber")]
+
+
+@pytest.mark.parametrize("cycle_ns", [0, 20_000_000])
+def test_a_token_names_launch_and_cycle(cycle_ns: int) -> None:
+    assert launch_and_cycle(alive_key("home", 0xAB, cycle_ns)) == (0xAB, cycle_ns)
+
+
+@pytest.mark.parametrize("launch", ["x", "ab", "-20", f"{1:016x}-", f"{1:016x}-x", f"{1:016x}-{10**18}", f"{1:017x}"])
+def test_a_token_that_no_adapter_has_made_is_none(launch: str) -> None:
+    assert launch_and_cycle(f"rack/home/alive/{launch}") is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -69,11 +70,13 @@ class Line:
 
         return take
 
-    def ask(self, what: str, payload: bytes = b"", asker: str = "operator", version: int = VERSION) -> None:
-        """Ask a proper question."""
+    def ask(
+        self, what: str, payload: bytes = b"", asker: str = "operator", version: int = VERSION, again: int = 0
+    ) -> None:
+        """Ask a proper question, `again` the one of that number."""
         self._number += 1
         key = question_key(self.rack, what, asker)  # type: ignore[arg-type]
-        head = Envelope(version, SESSION, self._number, 0, 0, 0, 0)
+        head = Envelope(version, SESSION, self._number, again or self._number, 0, 0, 0)
         self.put(Question(key, self.sealer.seal(key, head, payload), payload, self._opener(key)))
 
     def put(self, question: Question) -> None:
@@ -98,6 +101,7 @@ class Bench:
         self.desk = Desk(segment, OwnGrid(segment, 8), Permit(RIGHTS, ("other", *RIGHTS)), self.findings)  # type: ignore[arg-type]
         self.line = Line(segment.rack)
         self.desk.open(self.line, LAUNCH)  # type: ignore[arg-type]
+        self.cycle()
 
     def cycle(self) -> list[Got]:
         """Let the desk have a cycle; return its answers."""
@@ -247,6 +251,29 @@ def test_a_command_gets_its_ticket_and_waits_as_long_as_its_client_asks(bench: B
     assert entry.stage is RequestStage.WAITING
     assert bench.asked("withdraw", ticket.packed(), "operator").code is Code.GRANTED
     assert entry.stage is RequestStage.FREE
+
+
+def test_a_command_asked_for_again_is_given_once(bench: Bench) -> None:
+    request = packed_request(bench.command(tick=10_000))
+    first = bench.asked("give", request)
+    bench.line.ask("give", request, again=1)
+    (again,) = bench.cycle()
+    assert again.answer.content == first.content
+    assert len(OperatorTable(bench.segment).waiting()) == 1
+    assert bench.asked("give", request).content != first.content
+
+
+def test_commands_that_waited_while_the_rack_was_held_are_dropped_and_a_stop_is_not(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.cycle()
+    later = time.monotonic_ns() + 10**9
+    monkeypatch.setattr(desks.time, "monotonic_ns", lambda: later)
+    bench.line.ask("give", packed_request(bench.command()))
+    bench.line.ask("stop")
+    assert [got.head.serial for got in bench.cycle()] == [2]
+    assert bench.segment.words[System.EMERGENCY_STOP] == 1
+    assert not OperatorTable(bench.segment).waiting()
 
 
 def test_the_command_of_a_client_that_is_gone_is_withdrawn(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

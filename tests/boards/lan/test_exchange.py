@@ -24,7 +24,8 @@ from rack.boards.config.resolved import loads
 from rack.boards.crate.clean import remove_dead
 from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence
-from tests.boards.lan.racks import ROOT, configs, endpoints, rack_text, started
+from tests.boards.lan.racks import ROOT, RackProcess, configs, endpoints, rack_text, started
+from tests.machine import needs_fifo
 from tests.processes import BOUND_S, wait_until
 
 SECONDS = 120.0
@@ -57,6 +58,12 @@ def attached(name: str) -> Segment:
 def written(segment: Segment, mailbox: str) -> np.ndarray:
     """Return the messages of a mailbox that its slots still hold."""
     return MailboxRing(segment, mailbox).drain().rows["message"]
+
+
+def awaited(rack: RackProcess, since: int, kind: str, text: str) -> dict[str, Any]:
+    """Return an event of a kind whose text contains this, after the first `since`: clock and adapter ring apart."""
+    past = [event for event in rack.events[since:] if event["kind"] == kind and text in event["text"]]
+    return past[0] if past else rack.await_event(kind, text)
 
 
 def kill_adapter(segment: Segment) -> None:
@@ -121,23 +128,42 @@ def test_boards_and_racks_die_and_come_back(names: tuple[str, str], tmp_path: Pa
                 wait_until(lambda: b.words[System.DEMAND] == Demand.NONE)
                 last = newest(b, "echo.status").count
 
+                since = len(reading.events)
                 writing.send(signal.SIGKILL)
-                event = reading.await_event("detection", f"rack '{names[0]}' is lost")
+                event = awaited(reading, since, "detection", f"rack '{names[0]}' is lost")
                 assert (event["code"], event["subject"]) == ("peer_lost", names[0])
-                event = reading.await_event("reaction", "a rack that it works with is lost")
+                event = awaited(reading, since, "reaction", "a rack that it works with is lost")
                 assert (event["code"], event["value"]) == ("demand", Demand.STOP)
                 lost = newest(b, "echo.status").lost
                 wait_until(lambda: newest(b, "echo.status").lost > lost + 2)
             with started(files[0], SECONDS, *GENTLE) as writing:
-                event = reading.await_event("recovery", "it was restarted")
+                since = len(reading.events)
+                event = awaited(reading, since, "recovery", "it was restarted")
                 assert event["subject"] == names[0]
-                reading.await_event("recovery", "arm released")
+                awaited(reading, since, "recovery", "arm released")
                 # Its counting begins again: what comes now is of the new launch.
                 wait_until(lambda: 0 < newest(b, "echo.status").count < last)
                 peer = newest(b, f"lan.peer_{names[0].replace('-', '_')}")
                 assert (peer.presence, peer.launches) == (Presence.THERE, 2)
         finally:
             b.close()
+
+
+@needs_fifo
+@pytest.mark.alone
+def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(rack_name: str, tmp_path: Path) -> None:
+    (config,) = configs(
+        [rack_text(rack_name, endpoints(1)[0], [])], tmp_path, "adapter.lan.priority=37", "board.pulse.priority=36"
+    )
+    with Rack(config) as rack:
+        pid = rack.segment.block("lan")[Block.PID]
+        core = rack.segment.layout.task("lan").core
+        threads = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()]
+        assert len(threads) > 1
+        for thread in threads:
+            assert os.sched_getscheduler(thread) == os.SCHED_FIFO
+            assert os.sched_getparam(thread).sched_priority == 37
+            assert os.sched_getaffinity(thread) == {core}
 
 
 @contextmanager
@@ -184,6 +210,22 @@ max_age_ms = 1000
     assert refused.max() == UNREAD
     assert (refused >= 0).all()
     assert rows["import_other"]["taken"][-1] == 0
+
+
+def test_an_adapter_killed_in_lockstep_continues_its_counts_and_the_run_repeats(rack_name: str) -> None:
+    text = rack_text(rack_name, "", []).replace("[clock]", '[clock]\nmode = "lockstep"')
+    text += '[[fault]]\nkind = "kill"\nboard = "lan"\ntick = 100\n'
+    ended = []
+    for _ in range(2):
+        with Rack(loads(text)) as rack:
+            outcome = rack.run(1.5)
+            ended.append((outcome.digest, int(newest(rack.segment, "lan.status").export_pulse["sent"])))
+            assert [event.board for event in rack.events if event.code == "rejoined"] == ["lan"]
+            rows = written(rack.segment, "lan.status")["export_pulse"]["sent"].astype(int)
+    assert ended[0] == ended[1]
+    # Of the messages written meanwhile only the newest was sent: it sampled fewer, and none twice.
+    assert (np.diff(rows) >= 0).all()
+    assert 40 < ended[0][1] == rows[-1]
 
 
 def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load, resolve
+from rack.boards.config.reference import key_tables
 from rack.boards.config.resolved import loads
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.errors import ConfigError
@@ -166,6 +167,18 @@ def test_what_is_permitted_is_permitted() -> None:
     resolved("clock.mode=realtime", "adapter.lan.priority=41", "board.pulse.priority=40")
     resolved("clock.mode=realtime", "adapter.lan.core=1", "board.pulse.priority=40")
     resolved("adapter.lan.import.other.rate_hz=10", "adapter.lan.import.other.max_age_ms=120")
+
+
+def test_the_loss_of_the_adapter_is_as_bad_as_that_of_a_rack() -> None:
+    for rule, on_loss in (("hold", "hold"), ("stop", "stop"), ("go on", "hold")):
+        text = rack_text("one", "", [], "two", lan=f'on_peer_loss = "{rule}"')
+        assert loads(text).board["lan"].on_loss == on_loss
+
+
+def test_the_schema_shows_the_table_that_users_write() -> None:
+    names = [table.name for table in key_tables(loads(TEXT))]
+    assert {"adapter.lan", "adapter.lan.import", "adapter.lan.export"} <= set(names)
+    assert not [name for name in names if name.startswith("board.lan")]
 
 
 def test_endpoints_can_be_set_for_a_run(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from rack.backplane.message import Message
 from rack.boards.config import load
-from rack.levels.cell import CELL_ORDER, Coordinator, OrderedTaskExecutor, OrderedTaskPlanner
+from rack.levels.cell import Coordinator, OrderedTaskExecutor, OrderedTaskPlanner
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
 from tests.levels.whole_rack import board
@@ -15,23 +15,16 @@ from tests.levels.whole_rack import board
 TASK_EVERY = 100
 
 
-def ordered(orders: str, params: Mapping[str, Any] | None = None) -> BoardSpec:
-    """Return the board of an ordered task level that reads the mailbox `orders`."""
-    return BoardSpec(
-        "task",
-        TASK_EVERY,
-        OrderedTaskExecutor,
-        OrderedTaskPlanner,
-        4,
-        below="elemental_move",
-        params={"orders": orders, **(params or {})},
-    )
-
-
-def below(params: Mapping[str, Mapping[str, Any]] | None = None) -> list[BoardSpec]:
-    """Return the boards below a task level."""
-    nasrem = load("nasrem")
-    return [board(nasrem, name, (params or {}).get(name, {})) for name in nasrem.board if name != "task"]
+ORDERED = BoardSpec(
+    "task",
+    TASK_EVERY,
+    OrderedTaskExecutor,
+    OrderedTaskPlanner,
+    4,
+    below="elemental_move",
+    params={"orders": "cell.order_puma"},
+)
+"""The arm's task level."""
 
 
 class CellRack(Lockstep):
@@ -39,8 +32,10 @@ class CellRack(Lockstep):
 
     def __init__(self, *steps: Sequence[Mapping[str, Any]], **params: Any) -> None:
         cell = BoardSpec("cell", TASK_EVERY, Coordinator, params={"arms": {"puma": "task.report"}, **params})
+        nasrem = load("nasrem")
+        below = [board(nasrem, name, {}) for name in nasrem.board if name != "task"]
         task = {"step": [{"do": [{"arm": "puma", **action} for action in step]} for step in steps]}
-        super().__init__([*below(), ordered("cell.order_puma"), cell], *config("puma560"), task)
+        super().__init__([*below, ORDERED, cell], *config("puma560"), task)
 
     @property
     def cell(self) -> Message:
@@ -56,11 +51,3 @@ class CellRack(Lockstep):
     def report(self) -> Message:
         """What the arm reports to the coordinator."""
         return self.read("task.report")
-
-
-class OrderedArm(Lockstep):
-    """The PUMA with an ordered task level; the test gives its orders."""
-
-    def __init__(self, **params: Any) -> None:
-        self.kinds = {"orders.puma": CELL_ORDER}
-        super().__init__([*below(), ordered("orders.puma", params)], *config("puma560"), outside=self.kinds)

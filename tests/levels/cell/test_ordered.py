@@ -190,7 +190,7 @@ def test_free_motion_is_broken_off_at_once_for_the_end_of_the_program() -> None:
     bench.order(OrderVerb.END, reason="k1607 has failed")
     assert bench.run(3.0, lambda rack: rack.read("task.status").state == State.ERROR)
     assert (bench.report.response, bench.status.error) == (Response.ENDED, Error.GIVEN_UP)
-    assert bench.status.reason == "k1607 has failed"
+    assert (bench.status.reason, bench.status.moves) == ("k1607 has failed", 8)
     assert bench.read("elemental_move.status").done == 1
 
 

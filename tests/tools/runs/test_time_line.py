@@ -73,3 +73,10 @@ def test_in_lockstep_ticks_are_the_time_line(tmp_path: Path) -> None:
     assert (place.times_ns(np.arange(TICKS), 3) == np.arange(TICKS) * CLOCK_NS + 3).all()
     assert place.uncertainty_ns == 0
     assert "lockstep" in place.note
+
+
+def test_in_lockstep_what_one_took_must_be_what_the_other_wrote(tmp_path: Path) -> None:
+    a, b = replace(A, mode="lockstep"), replace(B, mode="lockstep")
+    one, other = recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b", counts_from=1)
+    with pytest.raises(Failure, match=r"not of the same run: what 'a' took from 'b' at 0\.0000 s, in lan\.other, is"):
+        on_one_time_line([one, other])

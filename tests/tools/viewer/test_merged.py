@@ -95,4 +95,4 @@ def test_no_view_of_several_racks_fails_in_the_viewer(both: Path) -> None:
     except NoViewerError as error:
         pytest.skip(str(error))
     assert look.complaints == ()
-    assert {"a", "b", "log of all"} <= views
+    assert {"a: levels", "b: levels", "log of all racks"} <= views
