@@ -172,18 +172,27 @@ class Import:
         if self._grid.is_lockstep:
             return True
         is_strange = self._peer.is_over(head.launch) or tick - came > self._max_age
-        is_known = self._peer.is_there and head.launch == self._peer.launch
         # Its age decides: until the clocks have been compared it may be too old.
-        is_due = is_known and self._peer.offset_ns is not None
+        is_due = self._is_present(head) and self._peer.offset_ns is not None
         if is_strange:
             self.count.strange += 1
         elif not is_due:
             self._early.append((came, arrived))
             if len(self._early) > 1:
-                del self._early[0]
-                self.count.overtaken += is_known
-                self.count.strange += not is_known
+                self._pass_over(self._early.pop(0)[1])
         return is_due and not is_strange
+
+    def _is_present(self, head: Envelope) -> bool:
+        return self._peer.is_there and head.launch == self._peer.launch
+
+    def _pass_over(self, arrived: Arrived) -> None:
+        """Count a message that was kept, and that a newer one replaces."""
+        head = self._opened(arrived)
+        if head is not None and self._is_present(head):
+            # It has come, so it is not missing.
+            self.count.overtaken += self._order.admits(head)
+        else:
+            self.count.strange += 1
 
     def _is_next(self, head: Envelope, payload: bytes) -> bool:
         """Say whether a message is good and the newest so far, and if so keep its content."""
