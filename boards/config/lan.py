@@ -57,7 +57,8 @@ def lan_mistakes(config: RackConfig) -> Iterator[Mistake]:
 
 def is_taken(config: RackConfig) -> bool:
     """Say whether another board has the name of the adapter's."""
-    return config.adapter.lan is not None and config.board[LAN] != config.adapter.lan.board()
+    # If the others are broken, its own is not there either.
+    return config.adapter.lan is not None and LAN in config.board and config.board[LAN] != config.adapter.lan.board()
 
 
 def _names(table: LanTable, rack: str) -> Iterator[Mistake]:

@@ -206,3 +206,10 @@ def test_a_rack_without_zenoh_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> 
     assert str(error.value) == (
         "adapter.lan: an exchange with other racks needs eclipse-zenoh: pip install 'nasrem-rack[lan]'"
     )
+
+
+def test_an_adapter_in_a_rack_without_boards_hides_no_mistake() -> None:
+    tables = parse(TEXT)
+    del tables["board"]
+    with pytest.raises(ConfigError, match="^board: missing; boards by name[^\n]*$"):
+        loads(to_toml(tables))

@@ -136,7 +136,7 @@ def friend(site: Site) -> dict[str, Any]:
         "puts": [(pulse("friend"), 100, pulse("friend"))],
         "listens": [OWN],
         "asks": ["rack/home/ask/stop/friend"],
-        "token": "rack/friend/alive/9",
+        "token": "rack/friend/alive/0000000000000009",
     }
 
 
