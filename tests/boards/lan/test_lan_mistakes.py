@@ -211,5 +211,5 @@ def test_a_rack_without_zenoh_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> 
 def test_an_adapter_in_a_rack_without_boards_hides_no_mistake() -> None:
     tables = parse(TEXT)
     del tables["board"]
-    with pytest.raises(ConfigError, match="^board: missing; boards by name[^\n]*$"):
+    with pytest.raises(ConfigError, match=r"^board: missing; boards by name"):
         loads(to_toml(tables))
