@@ -19,7 +19,7 @@ DIMENSIONLESS = {
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
     "for",  # s, or text with its unit
 }
-WHOLE = ("reads", "planner_reads", "mailbox", "depth", "tables", "arms")
+WHOLE = ("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit")
 """Keys whose tables hold names of the user's own."""
 
 

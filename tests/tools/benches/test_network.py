@@ -59,6 +59,10 @@ def say(lab: Lab, speaker: int, listener: int) -> str:
         return ear.communicate(timeout=BOUND_S)[0].strip()
 
 
+STRAY = 20
+"""Packets that the kernels of the machines send on their own while a test counts: ARP, neighbour discovery."""
+
+
 def lost_of(lab: Lab, packets: int) -> int:
     """Return how many of the packets sent by machine 0 do not reach machine 1."""
     before = lab.traffic()
@@ -91,12 +95,12 @@ def test_the_share_that_is_asked_for_gets_lost_both_ways() -> None:
     spread = 6 * sqrt(packets * share * (1 - share))
     with Lab(3) as lab:
         lab.lose(2, 0.5)
-        assert lost_of(lab, packets) == 0
+        assert abs(lost_of(lab, packets)) < STRAY
         for machine in (0, 1):
             lab.lose(machine, share)
             assert abs(lost_of(lab, packets) - share * packets) < spread
             lab.lose(machine, 0)
-        assert lost_of(lab, packets) == 0
+        assert abs(lost_of(lab, packets)) < STRAY
 
 
 @needs_lab
