@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator
-from typing import Any
-
 import pytest
 
 from rack.backplane.mailbox.mailbox import Verdict
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
-from rack.backplane.words import Block, System
-from rack.boards.config.resolved import loads, wire
-from rack.boards.config.toml import override, parse, to_toml
+from rack.backplane.words import Block
+from rack.boards.config.resolved import loads
 from rack.boards.lan.adapter import LanAdapter
-from rack.boards.lan.entries import Export, Import
+from rack.boards.lan.entries import Import
 from rack.boards.lan.envelope import Envelope, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
@@ -28,28 +23,10 @@ from rack.boards.lan.link import Arrived
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import PeerRack
 from rack.boards.run.queues import DemandPort
-from tests.boards.lan.racks import rack_text
+from tests.boards.lan.conftest import EVERY, LAUNCH, Network
 
-EVERY = 8
-"""Ticks of a cycle of the adapter, 20 ms."""
 MAX_AGE = 40
-LAUNCH, NEXT = 101, 202
-
-
-class Network:
-    """Stands in for the link: what tests put into `come` arrives, what is sent is in `sent`."""
-
-    def __init__(self) -> None:
-        self.come: deque[Arrived] = deque()
-        self.sent: list[tuple[bytes, bytes]] = []
-
-    def subscribe(self, key: str) -> Any:
-        """Return a function that yields what has come."""
-        return lambda: iter([self.come.popleft() for _ in range(len(self.come))])
-
-    def publish(self, key: str, reliable: bool = False) -> Any:
-        """Return a function that sends."""
-        return lambda payload, envelope: self.sent.append((payload, envelope))
+NEXT = 202
 
 
 class Importing:
@@ -108,17 +85,6 @@ class Importing:
     def counts(self) -> dict[str, int]:
         """Return the counts that are not 0."""
         return {name: number for name, number in vars(self.entry.count).items() if number}
-
-
-@pytest.fixture(params=["realtime", "lockstep"])
-def segment(rack_name: str, request: pytest.FixtureRequest) -> Iterator[Segment]:
-    """The segment of a rack that imports; its epoch is the origin of all clocks, so that stamps are simulated times."""
-    config = loads(to_toml(override(parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"])))
-    made = Segment.create(wire(config), config.text())
-    made.words[System.PERIOD_NS], made.words[System.LOCKSTEP] = 2_500_000, request.param == "lockstep"
-    yield made
-    made.close()
-    unlink(rack_name)
 
 
 @pytest.fixture
@@ -340,93 +306,6 @@ def test_what_was_written_before_the_first_tick_here_is_as_old_as_it_is(importin
     importing.send(2, written=-MAX_AGE)
     importing.cycle(16)
     assert importing.counts() == {"taken": 1, "late": 1}
-
-
-class Exporting:
-    """The adapter's export of `pulse.status`, and the level that writes it."""
-
-    def __init__(self, segment: Segment) -> None:
-        config = loads(segment.config)
-        assert config.adapter.lan is not None
-        self.segment, self.table, self.network = segment, config.adapter.lan.exports["pulse"], Network()
-        self.writer = open_writer(segment, "pulse.status")
-        self.status = Message(status_of(("pulse",), ()).dtype({}))
-        self.open()
-
-    def open(self) -> None:
-        """Open the export."""
-        self.entry = Export(self.segment, self.table, LAUNCH)
-        self.entry.open(self.network, Sealer(), OwnGrid(self.segment, EVERY))  # type: ignore[arg-type]
-
-    def heads(self) -> list[Envelope]:
-        """Return the heads of what was sent since the last call."""
-        sent, self.network.sent = self.network.sent, []
-        key = out_key(self.segment.rack, "pulse.status")
-        found = [Sealer().opened(key, envelope, payload) for payload, envelope in sent]
-        assert all(isinstance(head, Envelope) for head in found)
-        return found  # type: ignore[return-value]
-
-
-def test_each_new_message_is_sent_once(segment: Segment) -> None:
-    exporting = Exporting(segment)
-    exporting.entry.exchange(0)
-    assert exporting.heads() == []
-    exporting.writer.write(0)
-    exporting.entry.exchange(8)
-    exporting.entry.exchange(16)
-    exporting.writer.write(8)
-    exporting.writer.write(16)
-    exporting.entry.exchange(24)
-    heads = exporting.heads()
-    assert [(head.number, head.serial, head.tick) for head in heads] == [(1, 1, 0), (2, 3, 16)]
-    assert heads[1].time_ns == 16 * 2_500_000
-    assert heads[1].stamp_ns == 16 * 2_500_000
-
-
-def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(segment: Segment) -> None:
-    exporting = Exporting(segment)
-    for tick in (0, 8):
-        exporting.writer.write(tick)
-        exporting.entry.exchange(tick + 8)
-    exporting.entry.fill(exporting.status.export_pulse)
-    sent = exporting.heads()
-    # Time has gone on meanwhile.
-    exporting.writer.write(32)
-    for died_after, again in ((16, sent[1:]), (24, [])):
-        exporting.open()
-        exporting.entry.resume(exporting.status.export_pulse)
-        exporting.entry.recall(died_after, EVERY)
-        assert exporting.heads() == again
-        assert exporting.entry.sent == 2
-
-
-def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) -> None:
-    exporting = Exporting(segment)
-    exporting.writer.write(0)
-    exporting.entry.exchange(8)
-    exporting.entry.is_asked = True
-    exporting.entry.exchange(16)
-    exporting.entry.exchange(24)
-    # In lockstep nobody comes late, and nothing may depend on when a token comes.
-    times = 1 if segment.words[System.LOCKSTEP] else 2
-    assert [(head.number, head.serial) for head in exporting.heads()] == [(1, 1)] * times
-    assert exporting.entry.sent == 1
-
-
-def test_a_restarted_adapter_goes_on_with_the_numbers_of_the_one_before(segment: Segment) -> None:
-    exporting = Exporting(segment)
-    for tick in (0, 8, 16):
-        exporting.writer.write(tick)
-        exporting.entry.exchange(tick + 8)
-    exporting.entry.fill(exporting.status.export_pulse)
-    exporting.heads()
-    exporting.open()
-    exporting.entry.resume(exporting.status.export_pulse)
-    exporting.entry.exchange(32)
-    assert exporting.heads() == []
-    exporting.writer.write(32)
-    exporting.entry.exchange(40)
-    assert [(head.number, head.serial) for head in exporting.heads()] == [(4, 4)]
 
 
 def test_the_status_is_written_before_what_it_counts(segment: Segment) -> None:

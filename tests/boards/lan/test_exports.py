@@ -1,0 +1,102 @@
+"""A mailbox of this rack, sent to others: each new message once, and on after a restart."""
+
+from __future__ import annotations
+
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.config.resolved import loads
+from rack.boards.lan.entries import Export
+from rack.boards.lan.envelope import Envelope, Sealer
+from rack.boards.lan.grid import OwnGrid
+from rack.boards.lan.keys import out_key
+from rack.boards.lan.messages import status_of
+from tests.boards.lan.conftest import EVERY, LAUNCH, Network
+
+
+class Exporting:
+    """The adapter's export of `pulse.status`, and the level that writes it."""
+
+    def __init__(self, segment: Segment) -> None:
+        config = loads(segment.config)
+        assert config.adapter.lan is not None
+        self.segment, self.table, self.network = segment, config.adapter.lan.exports["pulse"], Network()
+        self.writer = open_writer(segment, "pulse.status")
+        self.status = Message(status_of(("pulse",), ()).dtype({}))
+        self.open()
+
+    def open(self) -> None:
+        """Open the export."""
+        self.entry = Export(self.segment, self.table, LAUNCH)
+        self.entry.open(self.network, Sealer(), OwnGrid(self.segment, EVERY))  # type: ignore[arg-type]
+
+    def heads(self) -> list[Envelope]:
+        """Return the heads of what was sent since the last call."""
+        sent, self.network.sent = self.network.sent, []
+        key = out_key(self.segment.rack, "pulse.status")
+        found = [Sealer().opened(key, envelope, payload) for payload, envelope in sent]
+        assert all(isinstance(head, Envelope) for head in found)
+        return found  # type: ignore[return-value]
+
+
+def test_each_new_message_is_sent_once(segment: Segment) -> None:
+    exporting = Exporting(segment)
+    exporting.entry.exchange(0)
+    assert exporting.heads() == []
+    exporting.writer.write(0)
+    exporting.entry.exchange(8)
+    exporting.entry.exchange(16)
+    exporting.writer.write(8)
+    exporting.writer.write(16)
+    exporting.entry.exchange(24)
+    heads = exporting.heads()
+    assert [(head.number, head.serial, head.tick) for head in heads] == [(1, 1, 0), (2, 3, 16)]
+    assert heads[1].time_ns == 16 * 2_500_000
+    assert heads[1].stamp_ns == 16 * 2_500_000
+
+
+def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(segment: Segment) -> None:
+    exporting = Exporting(segment)
+    for tick in (0, 8):
+        exporting.writer.write(tick)
+        exporting.entry.exchange(tick + 8)
+    exporting.entry.fill(exporting.status.export_pulse)
+    sent = exporting.heads()
+    # Time has gone on meanwhile.
+    exporting.writer.write(32)
+    for died_after, again in ((16, sent[1:]), (24, [])):
+        exporting.open()
+        exporting.entry.resume(exporting.status.export_pulse)
+        exporting.entry.recall(died_after, EVERY)
+        assert exporting.heads() == again
+        assert exporting.entry.sent == 2
+
+
+def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) -> None:
+    exporting = Exporting(segment)
+    exporting.writer.write(0)
+    exporting.entry.exchange(8)
+    exporting.entry.is_asked = True
+    exporting.entry.exchange(16)
+    exporting.entry.exchange(24)
+    # In lockstep nobody comes late, and nothing may depend on when a token comes.
+    times = 1 if segment.words[System.LOCKSTEP] else 2
+    assert [(head.number, head.serial) for head in exporting.heads()] == [(1, 1)] * times
+    assert exporting.entry.sent == 1
+
+
+def test_a_restarted_adapter_goes_on_with_the_numbers_of_the_one_before(segment: Segment) -> None:
+    exporting = Exporting(segment)
+    for tick in (0, 8, 16):
+        exporting.writer.write(tick)
+        exporting.entry.exchange(tick + 8)
+    exporting.entry.fill(exporting.status.export_pulse)
+    exporting.heads()
+    exporting.open()
+    exporting.entry.resume(exporting.status.export_pulse)
+    exporting.entry.exchange(32)
+    assert exporting.heads() == []
+    exporting.writer.write(32)
+    exporting.entry.exchange(40)
+    assert [(head.number, head.serial) for head in exporting.heads()] == [(4, 4)]
