@@ -97,6 +97,36 @@ class GripperConfig(Table):
     damping: Positive = Field(60.0, description="position loop, N s/m")
 
 
+class WristConfig(Table):
+    """`[robot.wrist]`: a force/torque sensor between arm and tool, and the arm's limits on contact."""
+
+    force: str = Field(description="MJCF force sensor; its cutoff is its range, N")
+    torque: str = Field(description="MJCF torque sensor at the same site; its cutoff is its range, N m")
+    most_force: Positive = Field(description="force of a contact at which the arm stops, N; within the range")
+    most_torque: Positive = Field(description="torque of a contact at which the arm stops, N m; within the range")
+    noise: NotNegative = Field(0.0, description="standard deviation of a force as sensed, N; of a torque a tenth, N m")
+
+
+class FingerConfig(Table):
+    """`[[robot.hand.finger]]`: one finger."""
+
+    name: str = Field(description="name of the finger")
+    tip: str = Field(description="MJCF site at its tip")
+    joints: tuple[str, ...] = Field(min_length=1, description="its joints, base to tip; of robot.joints")
+
+
+class HandConfig(Table):
+    """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull. One value per joint."""
+
+    finger: tuple[FingerConfig, ...] = Field(min_length=1, description="the fingers")
+    flexors: tuple[str, ...] = Field(
+        description="MJCF actuators on the tendons that turn a joint in positive direction"
+    )
+    extensors: tuple[str, ...] = Field(description="MJCF actuators on the tendons that turn it back")
+    least: Positive = Field(description="tension below which a tendon is slack, N")
+    rest: Positive = Field(description="mean tension of a pair at rest, N; it stiffens nothing in a linear tendon")
+
+
 class RobotConfig(Table):
     """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per joint."""
 
@@ -115,6 +145,8 @@ class RobotConfig(Table):
     )
     gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
     sensors: SensorConfig = Field(SensorConfig(), description="resolution and noise of the joints' encoders")
+    wrist: WristConfig | None = Field(None, description="force/torque sensor, if the arm has one")
+    hand: HandConfig | None = Field(None, description="tendons and fingers, for a hand in place of an arm")
     substeps: int = Field(5, ge=1, le=50, description="MuJoCo steps in one servo cycle")
     min_armature: Finite = Field(
         0.05, ge=0, description="least drive inertia of every joint, kg m2: light wrists need it"
@@ -130,6 +162,16 @@ class MotionConfig(Table):
     speed: Positive = Field(0.25, description="speed along the straight line, m/s")
 
 
+class PushConfig(Table):
+    """`[[scene.push]]`: a force on an object, which the simulated cell exerts at a fixed time."""
+
+    body: str = Field(description="object that is pushed")
+    at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it begins, s")
+    seconds: Positive = Field(description="time for which it lasts, s")
+    force: tuple[Finite, Finite, Finite] = Field(description="force at the centre of mass, in the world's frame, N")
+    rise: NotNegative = Field(0.0, description="time in which it rises, and in which it falls at its end, s")
+
+
 class SceneConfig(Table):
     """`[scene]`: objects and obstacles in the cell, by their names in the MJCF."""
 
@@ -138,6 +180,7 @@ class SceneConfig(Table):
     supports: tuple[str, ...] = Field((), description="geoms on which objects may stand")
     clearance: Positive = Field(0.015, description="distance that planned motion keeps from everything, m")
     motion: tuple[MotionConfig, ...] = Field((), description="moves of obstacles, by time")
+    push: tuple[PushConfig, ...] = Field((), description="forces on objects, by time")
 
     @property
     def bodies(self) -> tuple[str, ...]:

@@ -1,0 +1,112 @@
+"""The messages of a hand: tensions down to the valves, angles and tensions up, and the targets of the loops between.
+
+Symbolic sizes: `joints` of the hand, in the order of `robot.joints`, and `fingers`, in the order of `robot.hand`.
+Vectors have all joints and all fingers; a board of some of them fills and obeys its own, others are 0. Tensions have
+two rows, flexors and extensors: a flexor's tension turns its joint in the positive direction. Points and forces are in
+the frame of the palm, which is the site `robot.tool`.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from rack.backplane.message import Field, command, status
+from rack.backplane.words import Demand
+from rack.levels.operator import ANSWER, RESTS_ON
+
+FLEXOR, EXTENSOR = 0, 1
+"""Rows of tensions."""
+
+
+class FingerMode(IntEnum):
+    """Modes in which a finger is controlled."""
+
+    JOINTS = 0  # its joints go to positions
+    POINT = 1  # its tip goes to a point, as a spring of given stiffness
+    FORCE = 2  # its tip exerts a force, and is damped
+
+
+TENSION_COMMAND = command(
+    "tension_command",
+    1,
+    RESTS_ON,
+    Field("sampled", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet, so no tension"),
+    Field("tension", "f8", "N", "of the tendons of the board's own joints", (2, "joints")),
+    Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
+)
+"""From the boards of tendon loops to the board of the hand."""
+
+HAND_STATUS = status(
+    "hand_status",
+    1,
+    *ANSWER,
+    Field("tick", "i8", "tick", "tick at which the hand was sensed"),
+    Field("position", "f8", "rad", "joint positions", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    Field("torque", "f8", "N m", "of the tendons on the joints", ("joints",)),
+    Field("tension", "f8", "N", "of the tendons, as sensed", (2, "joints")),
+    Field("wanted", "f8", "N", "tensions commanded of the valves", (2, "joints")),
+    Field("force", "f8", "N", "of the surroundings on the fingertips, as sensed", ("fingers", 3)),
+    Field("holding", "u1", "1", "1: no fresh tensions: the valves keep the last ones"),
+    Field("stopped", "u1", "1", "1: tensions are not followed: a demand, an operator, or a lost board"),
+    Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
+    Field("clipped", "u4", "1", "cycles in which a tension was cut to its limits"),
+    Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
+    Field("violations", "u4", "1", "substeps in which a tendon drove a joint beyond a limit"),
+    Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
+)
+"""From the board of the hand: 16 angles and 32 tensions of the Utah/MIT hand."""
+
+TENDON_TORQUE = command(
+    "tendon_torque",
+    1,
+    RESTS_ON,
+    Field("sampled", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
+    Field("torque", "f8", "N m", "of the joints", ("joints",)),
+)
+"""From the joint loop to the tendon loop."""
+
+FINGER_TARGET = command(
+    "finger_target",
+    1,
+    RESTS_ON,
+    Field("active", "u1", "1", "0: no target yet, hold"),
+    Field("position", "f8", "rad", "joint positions", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    Field("stiff", "f8", "1", "part of the joint loop's stiffness that acts, 0 to 1", ("joints",)),
+    Field("torque", "f8", "N m", "in addition to that of the joint loop: for tip forces", ("joints",)),
+)
+"""From the fingertip loop to the joint loop."""
+
+GRASP_TARGET = command(
+    "grasp_target",
+    1,
+    RESTS_ON,
+    Field("active", "u1", "1", "0: no target yet, hold"),
+    Field("mode", "u1", FingerMode, "how each finger is controlled", ("fingers",)),
+    Field("position", "f8", "rad", "joint positions, for JOINTS", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities, for JOINTS", ("joints",)),
+    Field("tip", "f8", "m", "points of the tips, for POINT and FORCE", ("fingers", 3)),
+    Field("tip_velocity", "f8", "m/s", "their velocities", ("fingers", 3)),
+    Field("stiffness", "f8", "N/m", "of each tip about its point", ("fingers",)),
+    Field("force", "f8", "N", "of each tip on the surroundings, for FORCE", ("fingers", 3)),
+)
+"""From the grasp loop to the fingertip loop, or to the boards of fingers."""
+
+FINGER_STATUS = status(
+    "finger_status",
+    1,
+    *ANSWER,
+    Field("driven", "u1", "1", "1: the finger is one of this board's", ("fingers",)),
+    Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
+    Field("position", "f8", "rad", "joint positions, from the hand's status", ("joints",)),
+    Field("tip", "f8", "m", "points of the tips", ("fingers", 3)),
+    Field("force", "f8", "N", "of the surroundings on the tips", ("fingers", 3)),
+    Field("tension", "f8", "N", "least and largest tension of its tendons", (2,)),
+    Field(
+        "astray", "f8", "rad", "largest distance of a joint of a finger in mode JOINTS from its target", ("fingers",)
+    ),
+    Field("holding", "u1", "1", "1: no fresh target: the fingers stay"),
+    Field("stopped", "u1", "1", "1: targets are not followed: the hand is stopped, or an operator holds the loop"),
+)
+"""From every loop of a hand, and from a board that runs all loops of a finger, to the level above."""
