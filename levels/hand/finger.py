@@ -1,4 +1,4 @@
-"""A board for each finger: all loops of one finger in one cycle, on the same laws as boards of one loop for all fingers."""
+"""All loops of one finger on one board, by the laws of the boards that run one loop of all fingers."""
 
 from __future__ import annotations
 
@@ -79,6 +79,7 @@ class FingerExecutor(HandLoop):
         self._tip.start(hand.position)
         self._tendons.start(hand)
         self._target.position, self._target.stiff = hand.position, 1.0
+        self._servo.start(hand, self._target)
         self._sampled = hand.tick
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
@@ -87,6 +88,6 @@ class FingerExecutor(HandLoop):
         self._sampled = hand.tick
         follow_grasp(self, self._tip, hand, self._target, write.status, tick)
         age_s = (tick + self.context.every - hand.tick) * tick_s
-        self._servo.torques(hand, age_s, self._target, 0.0, self._torque)
+        self._servo.torques(age_s, 0.0, self._torque)
         self._tendons.tensions(self._torque, elapsed * tick_s, write.command.tension)
         write.command.driven, write.command.sampled = self._joints, hand.tick

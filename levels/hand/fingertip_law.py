@@ -63,7 +63,7 @@ class FingertipLaw:
         return self._tips
 
     def targets(self, grasp: Message, ahead_s: float, out: Message) -> None:
-        """Fill a `FINGER_TARGET` from a `GRASP_TARGET`, taken on by `ahead_s` at its velocities. Comes after `sense`."""
+        """Fill a `FINGER_TARGET` from a `GRASP_TARGET`, taken on by `ahead_s` at its velocities; after `sense`."""
         before = self.wanted.copy()
         points = grasp.tip + ahead_s * grasp.tip_velocity
         for finger in self._fingers:

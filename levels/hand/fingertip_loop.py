@@ -56,9 +56,7 @@ class FingertipLoop(HandLoop):
         follow_grasp(self, self._law, hand, write.command, write.status, tick)
 
 
-def follow_grasp(
-    loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int
-) -> None:
+def follow_grasp(loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int) -> None:
     """Fill a `FINGER_TARGET` for the `GRASP_TARGET` that a loop follows, and the `FINGER_STATUS`."""
     status.tip = law.sense(hand.position)
     if loop.stopped:

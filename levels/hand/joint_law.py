@@ -3,9 +3,9 @@
 torque = M(q) (2 d w (qd_wanted - qd) + s w^2 (q_wanted - q)) + weight(q) + friction(qd_wanted) + torque of tip forces
 
 `s`, 0 to 1 a joint, is the part of the stiffness that acts; the damping always acts, so a finger that only exerts a
-force is still slow. The weight of a finger is small, but at a joint that is soft it would cost degrees. Viscous friction
-is fed forward for the velocity that is wanted, not for the one sensed: what damps is not cancelled. The sample is taken
-on to when the torque acts, a valve's lag included, at the velocity sensed.
+force is still slow. The weight of a finger is small, but at a joint that is soft it would cost degrees. Viscous
+friction is fed forward for the velocity wanted, not for the one sensed: what damps is not cancelled. The sample is
+taken on to when the torque acts, a valve's lag included, at the velocity sensed.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
@@ -20,6 +21,7 @@ from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
+from rack.levels.servo.driver import numbers
 from rack.levels.tables import NotNegative, Positive, Table
 
 
@@ -34,27 +36,30 @@ class JointGains(Table):
 class JointLaw:
     """Sets the torques of some joints of a hand."""
 
-    def __init__(self, cell: Cell, driven: Array, gains: JointGains) -> None:
-        """Drive the joints whose `driven`, (joints,), is 1."""
+    def __init__(self, cell: Cell, driven: NDArray[np.bool_], gains: JointGains) -> None:
+        """Drive the joints `driven`, (joints,)."""
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(len(driven))
         self._constants = np.zeros((4, len(driven)))  # in the rows of `set_joint_torques`
         self._constants[:] = self._dynamics.dry, cell.model.dof_damping[cell.dof], cell.bounds.torque, driven
         self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
         self._ahead = gains.ahead
+        self._state: Array = np.zeros(0)  # numbers of a status of the hand, and of a target
+        self._wanted: Array = np.zeros(0)
         self._set = set_joint_torques.load()
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
-    def torques(self, hand: Message, age_s: float, target: Message, ahead_s: float, out: Array) -> None:
-        """Set `out`, (joints,), N m, from a `HAND_STATUS` and a `FINGER_TARGET`.
+    def start(self, hand: Message, target: Message) -> None:
+        """Read the `HAND_STATUS` and the `FINGER_TARGET` from these messages from now on."""
+        self._state = numbers(hand, "position", "velocity").reshape(2, -1)
+        self._wanted = numbers(target, "position", "torque").reshape(4, -1)
 
-        The sample is `age_s` old when the torque is commanded; the target is to be taken on by `ahead_s`.
-        """
-        position, velocity = hand.position, hand.velocity
-        terms = self._dynamics.terms(position, self._still)
+    def torques(self, age_s: float, ahead_s: float, out: Array) -> None:
+        """Set `out`, (joints,), N m, for when the sample is `age_s` old; the target is taken on by `ahead_s`."""
+        terms = self._dynamics.terms(self._state[0], self._still)
         times = age_s + self._ahead, ahead_s
-        wanted = target.position, target.velocity, target.stiff, target.torque
-        if self._set(self._gains, times, self._constants, position, velocity, *wanted, terms.inertia, terms.bias, out):
+        state, wanted = self._state, self._wanted
+        if self._set(self._gains, times, self._constants, state, wanted, terms.inertia, terms.bias, out):
             self.clipped += 1
 
 
@@ -63,12 +68,8 @@ def set_joint_torques(
     gains: tuple[float, float],  # stiffness, 1/s2, and damping, 1/s
     times: tuple[float, float],  # s: by which the sample, and the target, are taken on
     constants: Array,  # (4, joints): rows as below
-    position: Array,  # (joints,), rad
-    velocity: Array,  # (joints,), rad/s
-    target: Array,  # (joints,), rad
-    target_velocity: Array,  # (joints,), rad/s
-    stiff: Array,  # (joints,): part of the stiffness
-    added: Array,  # (joints,), N m
+    state: Array,  # (2, joints): rad, rad/s
+    wanted: Array,  # (4, joints): rad, rad/s, part of the stiffness, N m
     inertia: Array,  # (joints, joints), kg m2
     weight: Array,  # (joints,), N m
     torque: Array,  # (joints,), N m: set; 0 for joints of other boards
@@ -79,13 +80,13 @@ def set_joint_torques(
     for j in range(joints):
         torque[j] = 0.0
         if driven[j] != 0.0:
-            friction = viscous[j] * target_velocity[j] + dry[j] * math.tanh(target_velocity[j] / FRICTION_SPEED)
-            torque[j] = weight[j] + added[j] + friction
+            friction = viscous[j] * wanted[1, j] + dry[j] * math.tanh(wanted[1, j] / FRICTION_SPEED)
+            torque[j] = weight[j] + wanted[3, j] + friction
     for k in range(joints):
         if driven[k] == 0.0:
             continue
-        away = target[k] + times[1] * target_velocity[k] - position[k] - times[0] * velocity[k]
-        acceleration = gains[0] * stiff[k] * away + gains[1] * (target_velocity[k] - velocity[k])
+        away = wanted[0, k] + times[1] * wanted[1, k] - state[0, k] - times[0] * state[1, k]
+        acceleration = gains[0] * wanted[2, k] * away + gains[1] * (wanted[1, k] - state[1, k])
         for j in range(joints):
             if driven[j] != 0.0:
                 torque[j] += inertia[j, k] * acceleration
@@ -99,5 +100,5 @@ def set_joint_torques(
 
 def preload() -> None:
     """Load this module's compiled function."""
-    joint, square = np.zeros(1), np.zeros((1, 1))
-    set_joint_torques.load()((0.0,) * 2, (0.0,) * 2, np.zeros((4, 1)), *[joint] * 6, square, joint, joint)
+    joint, table = np.zeros(1), np.zeros((4, 1))
+    set_joint_torques.load()((0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], joint, joint)

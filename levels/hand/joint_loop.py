@@ -50,10 +50,11 @@ class JointLoop(HandLoop):
     def meet(self, read: Ports, hand: Message) -> None:
         """Hold the joints where they are, until there are targets."""
         self.command.position, self.command.stiff = hand.position, 1.0
+        self._law.start(hand, self.command)
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
         """Write the torques for the newest targets."""
         age_s = (tick + self.context.every - hand.tick) * self.context.tick_s
-        self._law.torques(hand, age_s, self.command, self.ahead_s(tick), write.command.torque)
+        self._law.torques(age_s, self.ahead_s(tick), write.command.torque)
         write.command.sampled = hand.tick
         write.status.clipped = self._law.clipped

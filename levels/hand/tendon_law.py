@@ -1,8 +1,8 @@
 """The law of the tendons: tensions for a torque, early enough for slow valves, and corrected by what is sensed.
 
-A pair turns its joint with torque = a (Tf - Te), a being its moment arm. Of all tensions that give a torque, those about
-a mean T0 are Tf = T0 + torque / 2a and Te = T0 - torque / 2a: the statics of a symmetric pair. Tendons only pull: where
-one would go slack, the mean is raised; where the other could then not pull enough, the torque is clipped.
+A pair turns its joint with torque = a (Tf - Te), a being its moment arm. Of all tensions that give a torque, those
+about a mean T0 are Tf = T0 + torque / 2a and Te = T0 - torque / 2a: the statics of a symmetric pair. Tendons only pull:
+where one would go slack, the mean is raised; where the other could then not pull enough, the torque is clipped.
 
 A valve follows its command with a lag [assumed: of first order]. `lead` commands more than is wanted while the tension,
 by a model of the valve, has not arrived: it is then there (1 + lead) times as soon, and nothing sensed is fed back, so
@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
@@ -37,13 +38,14 @@ class TendonGains(Table):
 
 
 class TendonLaw:
-    """Sets the tensions of some joints of a hand. What it has learned of valves is lost with a restart, and learned anew."""
+    """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew after a restart."""
 
-    def __init__(self, hand: Hand, driven: Array, gains: TendonGains, period_s: float) -> None:
-        """Drive the joints whose `driven`, (joints,), is 1, every `period_s`."""
+    def __init__(self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, period_s: float) -> None:
+        """Drive the joints `driven`, (joints,), every `period_s`."""
         joints = len(driven)
         self._constants = np.zeros((4, joints))  # in the rows of `set_tensions`
-        self._constants[:] = hand.arms, hand.least + gains.margin, hand.most, driven
+        self._constants[0], self._constants[1] = hand.arms, hand.least + gains.margin
+        self._constants[2], self._constants[3] = hand.most, driven
         self._numbers = hand.rest, gains.lead, 1.0 - math.exp(-period_s / gains.lag), gains.most_trim
         self._lag, self._trim = gains.lag, gains.trim
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
@@ -58,7 +60,7 @@ class TendonLaw:
         self._sensed = numbers(status, "tension", "wanted")
 
     def tensions(self, torque: Array, elapsed_s: float, out: Array) -> None:
-        """Set `out`, (2, joints), N, for `torque`, (joints,), N m; the sample before was `elapsed_s` older, 0: the same."""
+        """Set `out`, (2, joints), N, for `torque`, (joints,), N m; the sample before was `elapsed_s` older."""
         if elapsed_s != self._elapsed_s:
             self._elapsed_s = elapsed_s
             self._shares = 1.0 - math.exp(-elapsed_s / self._lag), min(self._trim * elapsed_s, 0.5)
