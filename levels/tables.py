@@ -125,6 +125,9 @@ class HandConfig(Table):
     extensors: tuple[str, ...] = Field(description="MJCF actuators on the tendons that turn it back")
     least: Positive = Field(description="tension below which a tendon is slack, N")
     rest: Positive = Field(description="mean tension of a pair at rest, N; it stiffens nothing in a linear tendon")
+    closed: NotNegative = Field(
+        0.0, description="stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its tension"
+    )
 
 
 class RobotConfig(Table):
