@@ -78,6 +78,9 @@ class Alarm(IntEnum):
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
     MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
+    # Raised by the board of a hand.
+    TENSION_INVALID = 55  # [joint; -]  rejected: a tension is NaN or infinite
+    TENSION_LIMIT = 56  # [joint; N]  a tension beyond its limits was cut
     # Raised by the network adapter: other racks, and those who ask from other machines.
     PEER_LOST = 60  # [number among the level's `names`; -]
     PEER_BACK = 61  # [number; ticks it was away]  the same launch as before
