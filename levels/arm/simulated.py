@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import mujoco
 import numpy as np
 
 from rack.backplane.message import Message
@@ -11,6 +12,7 @@ from rack.levels.algebra import Array
 from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, give
 from rack.levels.arm.simulation import Simulation
+from rack.levels.arm.wrist import WristSensor
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -42,6 +44,7 @@ class SimulatedArm(Simulation, Arm):
         self._brake = Brake(cell.limits.acceleration, dynamics, cell.home)
         self._most: Array | None = None  # (joints,), N m: torques of weakened motors
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
+        self._wrist = None if cell.wrist is None else WristSensor(cell.wrist, d, seed)
         # N m: the newest command, the one in force, and its torque as given.
         self._asked, self._command, self.torque = torques = np.zeros((3, joints))
         self._given = False  # the command for the coming tick has passed the gate
@@ -49,6 +52,9 @@ class SimulatedArm(Simulation, Arm):
         places = np.stack((qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof))
         self._clear = torques, self.dynamics.newest, *self._gate.clearance, places, memory
         self._give_clear = give.load()
+        if self._wrist is not None:  # until the first step it senses an arm that is braked, not one that falls
+            self._give()
+            mujoco.mj_forward(cell.model, d)
 
     @property
     def holds(self) -> bool:
@@ -117,6 +123,10 @@ class SimulatedArm(Simulation, Arm):
             self.tick += 1
         if self.fault:
             self._data.time = self._now_s
+
+    def feel(self) -> Array | None:
+        """Return the sample of the wrist sensor, (6,), N, N m: that of a substep ago, as MuJoCo's are."""
+        return None if self._wrist is None else self._wrist.sample(self.tick)
 
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE`."""
