@@ -118,6 +118,7 @@ def index(
     object_geoms = lookup.geoms_of(model, lookup.below(model, objects))
     supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
+    wrist = find_wrist(model, robot.wrist, moved)
     return Cell(
         model=model,
         qpos=model.jnt_qposadr[joints].astype(int),
@@ -145,7 +146,7 @@ def index(
         bounds=bounds,
         limits=planned_limits(bounds, robot),
         encoders=Encoders.of(robot),
-        wrist=find_wrist(model, robot.wrist, moved),
+        wrist=wrist,
         hand=hand,
     )
 
