@@ -208,6 +208,10 @@ class Layout:
         found = [m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots]
         return sorted(found, key=lambda mailbox: self.task(mailbox.writer).slot)
 
+    def handler(self, slot: int) -> str:
+        """Return the task that serves the interrupts of the board in a slot: its first one. Raises `StopIteration`."""
+        return next(task.name for task in self.tasks if task.slot == slot)
+
     def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
         """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises `KeyError`."""
         slowest = max((e.grid for e in mailbox.exchanges if e.task == reader), default=None)

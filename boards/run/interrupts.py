@@ -41,10 +41,8 @@ class InterruptHandler:
     @classmethod
     def of(cls, segment: Segment, task: str, inbox: BoardInbox | None, alarms: AlarmWriter) -> Self | None:
         """Return the handler that a task runs; None: nothing interrupts its board, or another task runs it."""
-        layout = segment.layout
-        slot = layout.task(task).slot
-        first = next(other.name for other in layout.tasks if other.slot == slot)
-        return cls(segment, task, inbox, alarms) if inbox is not None and task == first else None
+        is_first = task == segment.layout.handler(segment.layout.task(task).slot)
+        return cls(segment, task, inbox, alarms) if inbox is not None and is_first else None
 
     def serve(self, tick: int) -> None:
         """Serve everything that has come up to the release at `tick`."""

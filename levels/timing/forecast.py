@@ -14,7 +14,10 @@ from rack.levels.timing.verdicts import EquationVerdict, verdicts
 
 @dataclass(frozen=True)
 class Forecast:
-    """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction."""
+    """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction.
+
+    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it.
+    """
 
     system: Prediction
     context_switch_ns: int
@@ -22,6 +25,7 @@ class Forecast:
     verdicts: tuple[EquationVerdict, ...]
     responses: tuple[TaskResponse, ...]
     loads: dict[int, float]
+    inboxes: tuple[dict[str, Any], ...]
     notes: tuple[str, ...]
 
     @classmethod
@@ -34,6 +38,9 @@ class Forecast:
             verdicts=tuple(verdicts(rack)),
             responses=task_responses(rack.tasks, rack.context_switch_ns),
             loads=rack.loads,
+            inboxes=tuple(
+                inbox.document(rack.slice_ticks(name) * rack.clock_ns) for name, inbox in rack.inboxes.items()
+            ),
             notes=tuple(_notes(rack, has_cores)),
         )
 
@@ -51,6 +58,7 @@ class Forecast:
             "verdicts": [verdict.document() for verdict in self.verdicts],
             "responses": [response.document() for response in self.responses],
             "loads": {str(core): load for core, load in self.loads.items()},
+            "inboxes": list(self.inboxes),
             "notes": list(self.notes),
             "holds": self.holds,
         }
