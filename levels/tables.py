@@ -180,7 +180,9 @@ class SceneConfig(Table):
 
     objects: tuple[str, ...] = Field((), description="free bodies that tasks may move")
     obstacles: tuple[str, ...] = Field((), description="mocap bodies that may move by themselves")
-    supports: tuple[str, ...] = Field((), description="geoms on which objects may stand")
+    supports: tuple[str, ...] = Field(
+        (), description="geoms on which objects may stand, and a tool on a wrist sensor may press"
+    )
     clearance: Positive = Field(0.015, description="distance that planned motion keeps from everything, m")
     motion: tuple[MotionConfig, ...] = Field((), description="moves of obstacles, by time")
     push: tuple[PushConfig, ...] = Field((), description="forces on objects, by time")

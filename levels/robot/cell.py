@@ -16,6 +16,7 @@ from rack.levels.robot.hand import Hand, find_hand, fit_tendons
 from rack.levels.robot.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
+from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import RobotConfig, SceneConfig
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -51,6 +52,7 @@ class Cell:
     bounds: Bounds  # that the arm never exceeds
     limits: Limits  # of planned motion
     encoders: Encoders  # resolution and noise of its sensors
+    wrist: Wrist | None  # force/torque sensor; None: there is none
     hand: Hand | None  # None for an arm
 
     def start(self) -> mujoco.MjData:
@@ -116,6 +118,7 @@ def index(
     object_geoms = lookup.geoms_of(model, lookup.below(model, objects))
     supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
+    wrist = find_wrist(model, robot.wrist, moved)
     return Cell(
         model=model,
         qpos=model.jnt_qposadr[joints].astype(int),
@@ -138,10 +141,12 @@ def index(
         object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
         mocap=lookup.mocap_ids(model, obstacles),
         supports=supports,
-        touch=unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports),
+        touch=unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports)
+        & ~pressed_pairs(model, wrist, supports),
         bounds=bounds,
         limits=planned_limits(bounds, robot),
         encoders=Encoders.of(robot),
+        wrist=wrist,
         hand=hand,
     )
 
@@ -156,7 +161,8 @@ def unintended_pairs(
     """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
 
     Intended are an object on a support, an object in the gripper, the parts of one object and the fingers on each
-    other. Every other contact of arm or object is unintended; the rest of the cell is ignored.
+    other; and, see `pressed_pairs`, a tool on a support. Every other contact of arm or object is unintended; the rest
+    of the cell is ignored.
     """
     touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     ours = np.union1d(arm, objects)
@@ -166,6 +172,15 @@ def unintended_pairs(
     root = model.body_rootid[model.geom_bodyid]
     touch[np.ix_(objects, objects)] &= root[objects][:, None] != root[objects][None, :]
     return touch
+
+
+def pressed_pairs(model: mujoco.MjModel, wrist: Wrist | None, supports: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Return (ngeom, ngeom), True for a support and what hangs on the wrist sensor: their contact is measured."""
+    pressed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    if wrist is not None:
+        tool = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
+        pressed[np.ix_(tool, supports)] = pressed[np.ix_(supports, tool)] = True
+    return pressed
 
 
 def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArray[np.int32]:
