@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from pydantic import Field
 
-from rack.levels.algebra import Array, mat_vec, norm, transposed_mat_vec
+from rack.levels.algebra import Array, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.hand.kinematics import FingerKinematics
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import NotNegative, Positive, Table
-from pydantic import Field
 
 LINES = 72
 """Directions tried."""
@@ -37,7 +37,9 @@ class GraspRules(Table):
 
     pad: Positive = Field(0.009, description="distance of a tip's site from the surface that the tip touches, m")
     clear: Positive = Field(0.02, description="distance from the object at which tips begin to close, m")
-    pull: NotNegative = Field(2.0, description="force on the object, in addition to its weight, that friction must bear, N")
+    pull: NotNegative = Field(
+        2.0, description="force on the object, in addition to its weight, that friction must bear, N"
+    )
     reserve: Positive = Field(1.5, ge=1.0, description="by how much more it could bear")
 
 
@@ -53,7 +55,7 @@ class PlannedGrasp:
 
 
 class GraspPlanner:
-    """Plans for one hand; `opposing` is the finger that opposes all others. Raises `LevelError` if there is none such."""
+    """Plans for one hand; `opposing` is the finger that opposes all others. Raises `LevelError` without one."""
 
     def __init__(self, cell: Cell, opposing: str, rules: GraspRules) -> None:
         assert cell.hand is not None, "a cell with a hand"
@@ -98,8 +100,13 @@ class GraspPlanner:
         margin = float((np.minimum(closed - low, high - closed) / (high - low)).min())
         body = self._cell.bodies[row]
         turned, origin = self._data.xmat[body].reshape(3, 3), self._data.xpos[body]
-        within = [np.array([transposed_mat_vec(turned, v) for v in rows]) for rows in (contact - origin, normal)]
-        return PlannedGrasp(*within, posture=open_, grip=self._grip(row), margin=margin)
+        return PlannedGrasp(
+            contact=np.array([transposed_mat_vec(turned, point - origin) for point in contact]),
+            normal=np.array([transposed_mat_vec(turned, way) for way in normal]),
+            posture=open_,
+            grip=self._grip(row),
+            margin=margin,
+        )
 
     def _touched(self, row: int, base: Array, way: Array) -> Array | None:
         """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it does not."""
@@ -107,7 +114,7 @@ class GraspPlanner:
         along = self._palm[:, 1]  # the knuckles' line
         centre = data.xipos[body]
         centre = centre + float(((base - centre) * along).sum()) * along
-        start, geom, nearest = centre - OUTSIDE_M * way, np.zeros(1, dtype=np.int32), math.inf
+        start, nearest = centre - OUTSIDE_M * way, math.inf
         for own in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
             if not model.geom_contype[own]:
                 continue

@@ -134,10 +134,11 @@ class HandPicture:
     def _surface(self, geom: int) -> Array:
         """Return points, (n, 3), m, whose hull is that of a geom."""
         turned = self._data.geom_xmat[geom].reshape(3, 3)
-        return np.array([mat_vec(turned, point) for point in self._local[geom]]) + self._data.geom_xpos[geom]
+        points = np.array([mat_vec(turned, point) for point in self._local[geom]])
+        return np.asarray(points + self._data.geom_xpos[geom])
 
     def _is_solid(self, geom: int) -> bool:
-        return int(self._cell.model.geom_type[geom]) != mujoco.mjtGeom.mjGEOM_PLANE
+        return bool(self._cell.model.geom_type[geom] != int(mujoco.mjtGeom.mjGEOM_PLANE))
 
     def _joint(self, address: int) -> int:
         return int(np.flatnonzero(self._cell.model.jnt_qposadr == address)[0])
@@ -155,7 +156,7 @@ def local_points(model: mujoco.MjModel, geom: int) -> Array:
         return np.concatenate(ends if kind == kinds.mjGEOM_CYLINDER else [*ends, [(a + b) * up, -(a + b) * up]])
     if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
         size = np.array([a, a, a] if kind == kinds.mjGEOM_SPHERE else [a, b, c])
-        return size * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]])
+        return np.array(size * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]]))
     corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
     return np.asarray(model.geom_aabb[geom, :3] + corners * model.geom_aabb[geom, 3:])
 

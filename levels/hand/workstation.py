@@ -1,13 +1,11 @@
 """The workstation of a hand: it plans the grasp, and draws the hand. A program of the host side.
 
-It reads messages through the bus adapter, and sends plans the same way. Besides, it reads words of the crate's memory at
-their bus addresses, as the host of a crate on a bus adapter maps its memory: the counts of the boards, which no message
-carries.
+It reads messages through the bus adapter, and sends plans the same way. The counts of the boards, which no message
+carries, it reads in the crate's memory, word by word at their bus addresses: the adapter maps it for its host.
 """
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -115,7 +113,7 @@ class Workstation(HostProgram):
         self._picture.parent.mkdir(parents=True, exist_ok=True)
         partial = self._picture.with_suffix(".part")
         partial.write_text(text)
-        os.replace(partial, self._picture)
+        partial.replace(self._picture)
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
         """Return what a prompt offers: `plan()`, `draw()`, and `boards()`, the counts in the crate's memory."""
@@ -139,10 +137,12 @@ class Workstation(HostProgram):
             status = grasp.value
             kind = GraspKind(int(status.kind)).name.lower()
             yield f"step {min(status.step + 1, status.steps)} of {status.steps}: {kind}, plan {status.plan or 'none'}"
-            yield f"grip {status.grip.max():.1f} N, moved {1e3 * status.moved:.1f} mm, at most {1e3 * status.farthest:.1f}"
-            yield f"{status.reason or ''}"
+            moved = f"moved {1e3 * status.moved:.1f} mm, at most {1e3 * status.farthest:.1f}"
+            yield f"grip {status.grip.max():.1f} N, {moved}"
+            yield str(status.reason)
         if self._planned is not None:
-            yield f"planned: grip {self._planned.grip:.1f} N, margin {100 * self._planned.margin:.0f} % of the joints' ranges"
+            margin = f"{100 * self._planned.margin:.0f} % of their ranges"
+            yield f"planned: grip {self._planned.grip:.1f} N, joints {margin} from their ends"
         robot = self.context.robot.hand
         for finger, force in zip(robot.finger if robot is not None else (), hand.force, strict=True):
             rows = [self.context.robot.joints.index(joint) for joint in finger.joints]
