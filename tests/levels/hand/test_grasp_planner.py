@@ -53,10 +53,8 @@ def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_
 
 
 def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(planner: GraspPlanner) -> None:
-    moved, turned = (
-        planner.plan(0, AT + (0.006, -0.004, 0.003), UPRIGHT),
-        np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)]),
-    )
+    turned = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)])
+    moved = planner.plan(0, AT + np.array([0.006, -0.004, 0.003]), UPRIGHT)
     rotated = planner.plan(0, AT, turned)
     assert moved is not None
     assert rotated is not None
@@ -72,7 +70,7 @@ def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(
 
 
 def test_an_object_out_of_reach_has_no_grasp(planner: GraspPlanner) -> None:
-    assert planner.plan(0, AT + (0.3, 0.0, 0.0), UPRIGHT) is None
+    assert planner.plan(0, AT + np.array([0.3, 0.0, 0.0]), UPRIGHT) is None
 
 
 def test_the_grip_bears_weight_and_pull_by_friction_with_a_reserve() -> None:
