@@ -14,25 +14,29 @@ from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
 
 ARROWS, FORCES = ("cell", "forces"), "forces"
-TASK, CONTACT, TIPS = "task frame", "contact", "fingertips"
+TASK, CONTACT, TIPS = "task_frame", "contact", "fingertips"
 """Groups of curves: along the axes of a task frame, of the whole contact against its limits, of a hand."""
-ARROW_COLOUR = (255, 60, 60)
+ARROW_COLOUR = (0, 230, 255)
 ARROW_S = 0.02
 """Time between arrows: the rate of a screen."""
-LONGEST_M = 0.3
-"""Length of an arrow at the limit of the arm on contacts."""
-TIP_M = 0.02
-"""Length of an arrow at a fingertip, for 1 N."""
-SHAFT_M = 0.004
+LONGEST_M, TOOL_SHAFT_M = 1.0, 0.014
+"""Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show beyond the tool."""
+TIP_M, TIP_SHAFT_M = 0.02, 0.003
+"""Length of an arrow at a fingertip for 1 N, and its radius."""
 AXES = {"x": "N", "y": "N", "z": "N", "rx": "N m", "ry": "N m", "rz": "N m"}
 
 
 class ContactPlace(NamedTuple):
     """A place where forces are sensed, and the frame in which its messages give them."""
 
-    frame: str  # its name in the recording
+    name: str
     site: int  # where it is
     turned: int | None  # site whose orientation the frame has; None: the world's
+
+    @property
+    def frame(self) -> str:
+        """Name of the frame in the recording."""
+        return f"contact/{self.name}"
 
     def pose(self, data: mujoco.MjData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return place, m, and quaternion in `data`."""
@@ -46,8 +50,8 @@ def contacts_of(cell: Cell) -> list[ContactPlace]:
     """Return the places where a cell's forces are sensed: the tool on a wrist sensor, the tips of a hand."""
     if cell.hand is not None:
         tips = zip(cell.hand.names, cell.hand.tips, strict=True)
-        return [ContactPlace(f"contact/{name}", int(tip), cell.tool) for name, tip in tips]
-    return [] if cell.wrist is None else [ContactPlace("contact/tool", cell.tool, None)]
+        return [ContactPlace(name, int(tip), cell.tool) for name, tip in tips]
+    return [] if cell.wrist is None else [ContactPlace("tool", cell.tool, None)]
 
 
 class Arrows:
@@ -56,11 +60,13 @@ class Arrows:
     def __init__(self, stream: Stream, cell: Cell, field: str, clock_ns: int) -> None:
         """Take the forces from `field`, whose numbers begin with three for each place."""
         self._stream, self._field, self._places = stream, field, contacts_of(cell)
-        self._scale = TIP_M if cell.wrist is None else LONGEST_M / cell.wrist.most[0]
+        self._scale, shaft = TIP_M, TIP_SHAFT_M
+        if cell.wrist is not None:
+            self._scale, shaft = LONGEST_M / cell.wrist.most[0], TOOL_SHAFT_M
         self._every, self._last = max(1, round(ARROW_S * 1e9 / clock_ns)), -1
         for place in self._places:
-            arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=SHAFT_M)
-            stream.static((*ARROWS, place.frame), arrow, stream.within(place.frame))
+            arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
+            stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
 
     def write(self, block: RowBlock) -> None:
         """Write an arrow every 20 ms of simulated time."""
@@ -72,7 +78,7 @@ class Arrows:
         forces = block.messages[self._field][chosen].reshape(len(chosen), -1)
         for at, place in enumerate(self._places):
             vectors = self._scale * forces[:, 3 * at : 3 * at + 3]
-            self._stream.columns((*ARROWS, place.frame), times, rr.Arrows3D.columns(vectors=vectors))
+            self._stream.columns((*ARROWS, place.name), times, rr.Arrows3D.columns(vectors=vectors))
 
 
 class TaskForces:
