@@ -319,33 +319,40 @@ def systems(
             metavar="CONFIG", help="config by name, or path to a .toml file; several", autocompletion=config_names
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e6, help="simulated time of one run")] = 10.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e6, help="time of the run in real time")] = 6.0,
     share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Compare racks with each other: what their configs promise, and what one short run each shows.
+    """Compare racks with each other: what their configs promise, and what their runs show.
 
-    Without CONFIG these are nasrem and the bundled racks that model other systems. Of each config: the levels of its
-    longest chain, boards, processes, rates, the longest cycle R_max, the response R_s by eqs 3.2 and 3.3 and on the
-    clock's grid, the loads of its cores, and whether it fits.
+    Without CONFIG these are nasrem and the bundled racks that model other systems: about six minutes on two quiet
+    cores, 40 seconds a rack.
 
-    Of a run in lockstep: how many times faster than real time. Of a run in real time: the cycles of the fastest boards
-    missed, next to those of `cyclictest` at that rate on those cores; the response down and up, measured by what each
-    message rests on; the age of commands when the lowest level reads them, and of its statuses when they are read; and
-    the response to an operator's hold of the highest level that takes one and responds within the run, from giving it
-    to the end of the cycle that acts on it.
+    Of each config: the levels of its longest chain, boards, processes, cores, rates, the longest cycle R_max, the
+    response R_s by eqs 3.2 and 3.3 and on the clock's grid, and whether it fits.
+
+    Of a run in real time: R_s down and up, measured by what each message rests on; the age of commands when the lowest
+    level reads them, and of its statuses when they are read; the response to an operator's hold, from giving it to the
+    end of the cycle that acts on it; missed cycles next to those of `cyclictest` at that rate on those cores; how long
+    plans take; accesses to the bus, and processor time.
+
+    Of a run in lockstep in which every process is killed once: the ticks until the Rack and a neighbour detect it.
+
+    Of three runs in lockstep of the same motion, if the rack has a config for it (three-poses.toml next to it, or
+    NAME-three-poses.toml): the tracking error, its time, and the time from an operator's hold of the highest level that
+    takes one, and from an emergency stop, until the arm rests.
 
     Exit status: 0 all racks ran; 1 a run failed; 2 a bad config.
 
     \b
     Examples:
       rack bench systems
-      rack bench systems nasrem fig2 --seconds 5 --plot pictures
+      rack bench systems nasrem rccl --seconds 10 --plot pictures
     """
     from rack.tools.benches.observed import Runs
-    from rack.tools.benches.systems import measure
-    from rack.tools.benches.systems import systems as bundled
+    from rack.tools.benches.systems.bench import measure
+    from rack.tools.benches.systems.bench import systems as bundled
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
