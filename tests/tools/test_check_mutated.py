@@ -106,7 +106,7 @@ def spoilt(draw: st.DrawFn) -> str:
         if not tables:
             break
     text = to_toml(tables)
-    return draw(torn(text)) if draw(st.integers(0, 5)) == 0 else text
+    return draw(torn(text)) if text and draw(st.integers(0, 5)) == 0 else text
 
 
 @st.composite
