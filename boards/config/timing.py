@@ -8,6 +8,7 @@ from dataclasses import asdict, fields
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.boards.config.mistakes import PLANNER_BUDGET
+from rack.boards.config.schedule import frames
 from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
 from rack.levels.timing.rack import BoardTiming, RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
@@ -30,6 +31,7 @@ def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] 
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
         response_goal_ns=None if goal_ms is None else goal_ms * NS_PER_MS,
+        schedule=None if config.schedule is None else frames(config.schedule, config.clock_ns),
     )
 
 
