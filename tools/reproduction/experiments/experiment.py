@@ -54,6 +54,11 @@ class Workshop:
     def __init__(self, folder: Path, share: bool) -> None:
         self.folder, self.share = folder, share
 
+    @property
+    def rack(self) -> str:
+        """The name of its racks in shared memory: one runs at a time."""
+        return f"{RACK}-{os.getpid()}"
+
     def prepare(self) -> None:
         """Make the folders, and remove racks that a killed command has left in shared memory."""
         for name in (KEPT, RUNS, PICTURES):
@@ -66,7 +71,7 @@ class Workshop:
 
     def config(self, name: str, settings: Sequence[str] = (), faults: str | None = None) -> RackConfig:
         """Return a config under a name of its own. Raises `ConfigError`."""
-        return load(name, [*settings, f"name={RACK}-{os.getpid()}"], faults)
+        return load(name, [*settings, f"name={self.rack}"], faults)
 
     def run(self, label: str, config: RackConfig, seconds: float | None) -> Recording:
         """Run a rack and return its recording, which stays in the folder; one of an unfinished run is replaced."""
