@@ -18,6 +18,7 @@ from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
 from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
 from rack.tools.viewer.events import EVENTS, RECORDER
+from rack.tools.viewer.forces import AXES, CONTACT, FORCES, TASK, TIPS
 from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
 from rack.tools.viewer.style import lanes_view
@@ -81,7 +82,7 @@ class RackViews:
         cell = self._cell
         left = below if cell is None else rrb.Vertical(self._scene(cell, "cell"), below, row_shares=[11, 9])
         right = rrb.Vertical(
-            self._arm() if self._joints else self._signals(),
+            self._arm() if self._joints else rrb.Tabs(*self._forces(), self._signals()),
             lanes_view("boards, cycle by cycle", [self.all(BOARDS)], CYCLES_S),
             rrb.Horizontal(self._load(), self._ages(), self._log(), column_shares=[3, 3, 4]),
             row_shares=[4, 5, 3],
@@ -113,7 +114,22 @@ class RackViews:
             for quantity in QUANTITIES
         ]
         error = _curves("tracking error, mrad", [self.path(ERROR)])
-        return rrb.Grid(*views, rrb.Tabs(error, _curves("gripper", [self.all(GRIPPER)])), grid_columns=2)
+        gripper = _curves("gripper", [self.all(GRIPPER)])
+        return rrb.Grid(*views, rrb.Tabs(*self._forces(), error, gripper), grid_columns=2)
+
+    def _forces(self) -> list[rrb.View]:
+        """Return the views of forces, of an arm or hand that senses them."""
+        cell = self._cell
+        if cell is not None and cell.hand is not None:
+            return [_curves("forces on the fingertips, N", [self.path(FORCES, TIPS)])]
+        if cell is None or cell.wrist is None:
+            return []
+        task = [[self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit] for unit in ("N", "N m")]
+        return [
+            _curves("force wanted and exerted, N", task[0]),
+            _curves("torque wanted and exerted, N m", task[1]),
+            _curves("contact, with limits", [self.all(FORCES, CONTACT)]),
+        ]
 
     def _joint(self, name: str, quantity: str) -> rrb.View:
         shown = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]
