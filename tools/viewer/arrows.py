@@ -16,7 +16,7 @@ from rack.tools.viewer.style import FORCE
 
 ARROWS_S = 0.02
 """Time between arrows: the rate of a screen."""
-LENGTH_M, RADIUS_M = 0.012, 0.0015
+LENGTH_M, RADIUS_M = 0.02, 0.0015
 """Length of an arrow for each N, and its radius."""
 LEAST_N = 0.05
 """A smaller force has no arrow."""
@@ -40,13 +40,13 @@ class Arrows:
         return [int(row) for row in found]
 
     def write(self, block: RowBlock, row: int, points: Array, forces: Array) -> None:
-        """Write forces, (n, 3), N, that act at points, (n, 3), m: each arrow ends where it acts."""
+        """Write forces, (n, 3), N, at the points where they act, (n, 3), m."""
         shown = np.abs(forces).max(axis=1, initial=0.0) > LEAST_N
         if self._is_empty and not shown.any():
             return
         self._is_empty = not shown.any()
         vectors = LENGTH_M * forces[shown]
-        arrows = rr.Arrows3D(origins=points[shown] - vectors, vectors=vectors, radii=RADIUS_M, colors=[FORCE])
+        arrows = rr.Arrows3D(origins=points[shown], vectors=vectors, radii=RADIUS_M, colors=[FORCE])
         self._stream.at(int(block.ticks[row]), int(block.stamps_ns[row]), self._entity, arrows)
 
 

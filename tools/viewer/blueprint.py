@@ -19,7 +19,7 @@ from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
 from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
 from rack.tools.viewer.events import EVENTS, RECORDER
-from rack.tools.viewer.hand import BY_FINGER, HAND, TIPS, UNITS
+from rack.tools.viewer.hand import BY_FINGER, HAND, TIPS
 from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
 from rack.tools.viewer.style import lanes_view
@@ -122,14 +122,11 @@ class RackViews:
         """Return a view of every finger for tensions, joints and forces, each kind in a tab, and one of all tips."""
         tabs = [
             rrb.Grid(
-                *(
-                    _curves(f"{finger}, {UNITS[kind]}", [self.path(HAND, finger, name) for name in names], legend=False)
-                    for finger in hand.names
-                ),
+                *(_curves(f"{finger}, {unit}", [self.path(HAND, finger, kind)], legend=False) for finger in hand.names),
                 grid_columns=2,
                 name=kind,
             )
-            for kind, names in BY_FINGER.items()
+            for kind, unit in BY_FINGER.items()
         ]
         return rrb.Horizontal(rrb.Tabs(*tabs, active_tab=0), _curves("force on the tips, N", [self.path(*TIPS)]))
 

@@ -15,13 +15,11 @@ from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, dimmed, of_joint
 
 HAND = "hand"
-JOINTS, TENSIONS, WANTED, FORCES = "joints", "tensions", "wanted", "forces"
-BY_FINGER = {TENSIONS: (TENSIONS, WANTED), JOINTS: (JOINTS,), FORCES: (FORCES,)}
-"""Entities of a finger that each view shows."""
+JOINTS, TENSIONS, FORCES = "joints", "tensions", "forces"
+BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FORCES: "N"}
+"""Curves of a finger, and their units."""
 TIPS = (HAND, "tip_forces")
 ARROWS = (CELL, "tip_forces")
-UNITS = {TENSIONS: "N", JOINTS: "rad", FORCES: "N"}
-"""Units of those views."""
 
 
 class HandCurves:
@@ -34,16 +32,14 @@ class HandCurves:
         for finger, joints in self._fingers.items():
             own = [names[joint] for joint in joints]
             colours = [of_joint(at) for at in range(len(own))]
-            pairs = [f"{name} {row}, N" for row in ("flexor", "extensor") for name in own]
+            rows = ("flexor", "extensor")
+            pairs = [f"{name} {row}{what}, N" for what in (" commanded", "") for row in rows for name in own]
             angles = rr.SeriesLines(names=[f"{name}, rad" for name in own], colors=colours)
             stream.static((HAND, finger, JOINTS), angles)
-            dim = [dimmed(colour) for colour in colours]
-            stream.static((HAND, finger, TENSIONS), rr.SeriesLines(names=pairs, colors=[*colours, *dim]))
-            # The lower one is wider: it shows on both sides where the two agree.
-            wanted = rr.SeriesLines(
-                names=[f"{name} wanted" for name in pairs], colors=[COMMANDED] * len(pairs), widths=[2.5] * len(pairs)
-            )
-            stream.static((HAND, finger, WANTED), wanted)
+            # The lower ones are wider: they show on both sides where the two agree.
+            shades = [*[COMMANDED] * (2 * len(own)), *colours, *(dimmed(colour) for colour in colours)]
+            widths = [2.5] * (2 * len(own)) + [1.0] * (2 * len(own))
+            stream.static((HAND, finger, TENSIONS), rr.SeriesLines(names=pairs, colors=shades, widths=widths))
             axes = [f"{axis}, N" for axis in "xyz"]
             stream.static((HAND, finger, FORCES), rr.SeriesLines(names=axes, colors=[of_joint(at) for at in range(3)]))
         labels = [f"{finger}, N" for finger in self._fingers]
@@ -54,9 +50,10 @@ class HandCurves:
         messages, times = block.messages, block.times
         for at, (finger, joints) in enumerate(self._fingers.items()):
             self._stream.scalars((HAND, finger, JOINTS), times, messages["position"][:, joints])
-            for entity, field in ((TENSIONS, "tension"), (WANTED, "wanted")):
-                both = messages[field][:, :, joints]
-                self._stream.scalars((HAND, finger, entity), times, np.hstack((both[:, FLEXOR], both[:, EXTENSOR])))
+            tensions = [
+                messages[field][:, row][:, joints] for field in ("wanted", "tension") for row in (FLEXOR, EXTENSOR)
+            ]
+            self._stream.scalars((HAND, finger, TENSIONS), times, np.hstack(tensions))
             self._stream.scalars((HAND, finger, FORCES), times, messages["force"][:, at])
         self._stream.scalars(TIPS, times, np.sqrt((messages["force"] ** 2).sum(axis=2)))
 
