@@ -4,9 +4,9 @@ The fingers that share one task are taken as one virtual finger (Arbib, Iberall 
 presses along the line from its tip to the mean of the other tips, those press back along the same line, in equal parts.
 Forces so chosen have neither sum nor moment, wherever the tips are. Against weight and pull the springs at the tips act
 at once, and give way; an integral of the object's distance from its anchor brings it back, half of it at the opposing
-tip, half at the others. What the springs bear together for long it takes over: the points of all tips follow where these
-have crept or slipped to, and the forces stay. Friction bears more the harder the grip is: it rises at once with the load sensed at the tips,
-and falls slowly after it.
+tip, half at the others. What the springs bear together for long it takes over: the points of all tips follow where
+these have crept or slipped to, and the forces stay. Friction bears more the harder the grip is: the grip rises at once
+with the load sensed at the tips, and falls slowly after it.
 """
 
 from __future__ import annotations

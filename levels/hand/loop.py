@@ -112,7 +112,7 @@ class HandLoop(Executor):
 
     def _wait(self, status: Message) -> None:
         status.driven, status.sensed, status.holding, status.stopped = self.driven, -1, True, True
-        status.state, status.reason = State.HOLDING, NO_HAND_YET
+        status.reason = NO_HAND_YET
 
     def _kept(self, read: Ports, tick: int) -> str:
         """Return why the hand does not follow the level above; empty: it does."""
@@ -144,7 +144,7 @@ class HandLoop(Executor):
         status.stopped, status.holding, status.reason, status.error = shown
         if hand.error:
             status.state = State.ERROR
-        elif note:
+        elif note and self.commanded:
             status.state = State.HOLDING
         else:
             status.state = State.EXECUTING if self.commanded else State.IDLE
