@@ -56,6 +56,16 @@ class Bus(Protocol):
     def sent(self, port: str) -> int:
         """Return the number of messages sent so far, by former processes of this board too."""
 
+    def address(self, name: str) -> int:
+        """Return the bus address of a mailbox, or of the control block of a task. Raises `LookupError`."""
+
+    def words(self, address: int, count: int = 1) -> list[int]:
+        """Return words of 8 bytes of the crate's memory, from a bus address on; `rack check` prints addresses.
+
+        Any word may be read, whoever writes it, without a message. Raises `ValueError` for an address that is no
+        word's, or beyond the memory.
+        """
+
     def finish(self) -> None:
         """Declare the program's work done, as its return does."""
 

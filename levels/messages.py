@@ -47,6 +47,7 @@ class Error(IntEnum):
     MOTORS = 15  # a motor did not give its torque, however often it was retried
     TABLE = 16  # a state table came to a row with status error
     GIVEN_UP = 17  # the program of several racks was given up, for a reason in another one
+    FORCE = 18  # a contact stronger than the arm's limits
 
 
 class Verb(IntEnum):

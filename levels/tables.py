@@ -125,6 +125,9 @@ class HandConfig(Table):
     extensors: tuple[str, ...] = Field(description="MJCF actuators on the tendons that turn it back")
     least: Positive = Field(description="tension below which a tendon is slack, N")
     rest: Positive = Field(description="mean tension of a pair at rest, N; it stiffens nothing in a linear tendon")
+    closed: NotNegative = Field(
+        0.0, description="stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its tension"
+    )
 
 
 class RobotConfig(Table):
@@ -177,7 +180,9 @@ class SceneConfig(Table):
 
     objects: tuple[str, ...] = Field((), description="free bodies that tasks may move")
     obstacles: tuple[str, ...] = Field((), description="mocap bodies that may move by themselves")
-    supports: tuple[str, ...] = Field((), description="geoms on which objects may stand")
+    supports: tuple[str, ...] = Field(
+        (), description="geoms on which objects may stand, and a tool on a wrist sensor may press"
+    )
     clearance: Positive = Field(0.015, description="distance that planned motion keeps from everything, m")
     motion: tuple[MotionConfig, ...] = Field((), description="moves of obstacles, by time")
     push: tuple[PushConfig, ...] = Field((), description="forces on objects, by time")

@@ -80,6 +80,8 @@ class Alarm(IntEnum):
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
     MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
+    FORCE_LIMIT = 53  # [-1; N]  a contact's force beyond the arm's limit, or the end of the wrist sensor's range
+    MOMENT_LIMIT = 54  # [-1; N m]  a contact's torque, likewise
     # Raised by the network adapter: other racks, and those who ask from other machines.
     PEER_LOST = 60  # [number among the level's `names`; -]
     PEER_BACK = 61  # [number; ticks it was away]  the same launch as before

@@ -22,6 +22,7 @@ from rack.backplane.errors import ClockError
 from rack.boards.config.files import file_at
 from rack.boards.config.lan import lan_mistakes
 from rack.boards.config.network import network_mistakes
+from rack.boards.config.schedule import schedule_mistakes
 from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, HostConfig, RackConfig
 from rack.boards.errors import Mistake
 
@@ -128,7 +129,7 @@ def disagreements(config: RackConfig, broken: frozenset[str] = frozenset()) -> l
         *(_robot(config) if "robot" not in broken else ()),
     ]
     if "clock" not in broken:
-        found += [*_clock(config), *_rates(config), *_polling(config)]
+        found += [*_clock(config), *_rates(config), *_polling(config), *schedule_mistakes(config)]
     return found
 
 

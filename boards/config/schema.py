@@ -104,6 +104,17 @@ class TimingConfig(Table):
     )
 
 
+class ScheduleConfig(Table):
+    """`[schedule]`: a static cyclic schedule, in which every board has its place; see `rack.levels.timing.frames`."""
+
+    minor_ms: Positive = Field(
+        description="minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"
+    )
+    major_ms: Positive = Field(
+        description="major frame, ms; a multiple of the minor one, which every board's cycle divides"
+    )
+
+
 class BudgetConfig(Table):
     """`[board.<name>.budget]`: the level's worst-case processor times, for the timing model."""
 
@@ -309,6 +320,7 @@ class RackConfig(Table):
     clock: ClockConfig = Field(description="the system clock")
     protocol: ProtocolConfig = Field(ProtocolConfig(), description="how mailboxes are shared")
     timing: TimingConfig = Field(TimingConfig(), description="assumptions of the timing model about the processors")
+    schedule: ScheduleConfig | None = Field(None, description="static cyclic schedule of all boards, if they have one")
     robot: RobotConfig | None = Field(None, description="the arm; required by levels that move one")
     scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
     task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")

@@ -10,6 +10,7 @@ from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
 from rack.boards.config.mistakes import PLANNER_BUDGET
+from rack.boards.config.schedule import frames
 from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
 from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.rack import BoardTiming, RackTiming
@@ -34,6 +35,7 @@ def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] 
         small_share=config.timing.small_share,
         response_goal_ns=None if goal_ms is None else goal_ms * NS_PER_MS,
         inboxes=inboxes(layout),
+        schedule=None if config.schedule is None else frames(config.schedule, config.clock_ns),
     )
 
 

@@ -75,6 +75,8 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.BRAKES_OPENED: ("nothing", "brakes released after {span}"),
     Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
+    Alarm.FORCE_LIMIT: ("nothing", "contact too strong: force of {value:.3g} N"),
+    Alarm.MOMENT_LIMIT: ("nothing", "contact too strong: torque of {value:.3g} N m"),
     Alarm.MODIFICATION: ("name", "control modification '{subject}' failed and was taken out"),
     Alarm.PEER_LOST: ("name", "rack '{subject}' is lost: its network adapter ended, or is out of reach"),
     Alarm.PEER_BACK: ("name", "rack '{subject}' is back after {span}"),

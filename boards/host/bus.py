@@ -19,6 +19,7 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards.wiring import HostWiring
 
 COMMAND_ID = "id"
+WORD = 8
 _Port = TypeVar("_Port")
 
 
@@ -87,6 +88,21 @@ class HostBus:
     def sent(self, port: str) -> int:
         """Return the number of messages sent so far, by former processes of this board too."""
         return _of(self._writers, port).serial
+
+    def address(self, name: str) -> int:
+        """Return the bus address of a mailbox, or of the control block of a task. Raises `LookupError`."""
+        places = self._segment.map
+        found = {**places.blocks, **places.mailboxes}
+        if name not in found:
+            raise LookupError(f"nothing on the bus is called '{name}'; known: {', '.join(found)}")
+        return found[name]
+
+    def words(self, address: int, count: int = 1) -> list[int]:
+        """Return words of the crate's memory from a bus address on. Raises `ValueError` for an address without one."""
+        size, last = self._segment.map.size, address + WORD * count
+        if address % WORD or not 0 <= address < last <= size:
+            raise ValueError(f"words of {WORD} bytes at 0x{address:06x} to 0x{last:06x}: the bus has 0 to 0x{size:06x}")
+        return list(self._words[address // WORD : last // WORD])
 
     def finish(self) -> None:
         """Declare the program's work done, as its return does."""

@@ -131,6 +131,10 @@ class Arm(ABC):
         Injected faults of motors act through this. Default: they have no effect.
         """
 
+    def feel(self) -> Array | None:
+        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. Default: None, it has none."""
+        return None
+
     def look(self, scene: Message) -> None:
         """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the tool as sensed."""
         self._data.qpos[self.cell.qpos] = self.sense().position

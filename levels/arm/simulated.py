@@ -14,6 +14,7 @@ from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, give
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
 from rack.levels.arm.substeps import advance, copy_state, substeps
+from rack.levels.arm.wrist import WristSensor
 from rack.levels.level import Finding
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -58,6 +59,7 @@ class SimulatedArm(Arm):
             for mocap, body, name in obstacles
         ]
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
+        self._wrist = None if cell.wrist is None else WristSensor(cell.wrist, d, seed)
         # N m: the newest command, the one in force, and its torque as given.
         self._asked, self._command, self.torque = torques = np.zeros((3, joints))
         self._given = False  # the command for the coming tick has passed the gate
@@ -65,6 +67,9 @@ class SimulatedArm(Arm):
         places = np.stack((qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof))
         self._clear = torques, self.dynamics.newest, *self._gate.clearance, places, memory
         self._give_clear, self._advance, self._copy_state = give.load(), advance.load(), copy_state.load()
+        if self._wrist is not None:  # until the first step it senses an arm that is braked, not one that falls
+            self._give()
+            mujoco.mj_forward(cell.model, d)
         # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the working directory.
         mujoco.set_mju_user_warning(lambda _: None)
 
@@ -144,6 +149,10 @@ class SimulatedArm(Arm):
             self.tick += 1
         if self.fault:
             self._data.time = self._now_s
+
+    def feel(self) -> Array | None:
+        """Return the sample of the wrist sensor, (6,), N, N m: that of a substep ago, as MuJoCo's are."""
+        return None if self._wrist is None else self._wrist.sample(self.tick)
 
     def look(self, scene: Message) -> None:
         """Fill a `SCENE` with the poses as simulated."""

@@ -19,7 +19,7 @@ WRENCH = MessageType(
     (
         Field("tick", "i8", "tick", "tick at which it was sensed"),
         Field("wrench", "f8", "N, N m", "of the contact, at the tool, in the world's frame, without weights", (AXES,)),
-        Field("raw", "f8", "N, N m", "as the sensor gives it, in the sensor's frame", (AXES,)),
+        Field("sample", "f8", "N, N m", "as the sensor gives it, in the sensor's frame", (AXES,)),
         Field("saturated", "u1", "1", "1: the sensor is at the end of its range"),
         Field("exceeded", "u4", "1", "cycles in which the contact was beyond the arm's force limits"),
     ),

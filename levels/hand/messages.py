@@ -22,8 +22,20 @@ class FingerMode(IntEnum):
     """Modes in which a finger is controlled."""
 
     JOINTS = 0  # its joints go to positions
-    POINT = 1  # its tip goes to a point, as a spring of given stiffness
-    FORCE = 2  # its tip exerts a force, and is damped
+    POINT = 1  # its joints go to where its tip is at a point
+    FORCE = 2  # its tip exerts a force, and is a spring of given stiffness about a point
+
+
+class GraspKind(IntEnum):
+    """Kinds of steps of a grasp."""
+
+    NONE = 0
+    PRESHAPE = 1  # joints go to a posture
+    CLOSE = 2  # tips go to an object until they touch it
+    SQUEEZE = 3  # forces rise
+    SHIFT = 4  # the object is moved within the hand
+    HOLD = 5  # the object is kept
+    RELEASE = 6  # tips let go and withdraw
 
 
 TENSION_COMMAND = command(
@@ -73,7 +85,7 @@ FINGER_TARGET = command(
     Field("active", "u1", "1", "0: no target yet, hold"),
     Field("position", "f8", "rad", "joint positions", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
-    Field("stiff", "f8", "1", "part of the joint loop's stiffness that acts, 0 to 1", ("joints",)),
+    Field("stiff", "f8", "1", "part of the joint loop's stiffness that acts, 0 to 1; its damping acts", ("joints",)),
     Field("torque", "f8", "N m", "in addition to that of the joint loop: for tip forces", ("joints",)),
 )
 """From the fingertip loop to the joint loop."""
@@ -88,10 +100,22 @@ GRASP_TARGET = command(
     Field("velocity", "f8", "rad/s", "joint velocities, for JOINTS", ("joints",)),
     Field("tip", "f8", "m", "points of the tips, for POINT and FORCE", ("fingers", 3)),
     Field("tip_velocity", "f8", "m/s", "their velocities", ("fingers", 3)),
-    Field("stiffness", "f8", "N/m", "of each tip about its point", ("fingers",)),
-    Field("force", "f8", "N", "of each tip on the surroundings, for FORCE", ("fingers", 3)),
+    Field("stiffness", "f8", "N/m", "of each tip about its point, for FORCE", ("fingers",)),
+    Field("force", "f8", "N", "of each tip on the surroundings, at its point, for FORCE", ("fingers", 3)),
 )
 """From the grasp loop to the fingertip loop, or to the boards of fingers."""
+
+LOOP_STATUS = status(
+    "loop_status",
+    1,
+    *ANSWER,
+    Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
+    Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
+    Field("clipped", "u4", "1", "cycles in which a torque was cut to what tendons can give"),
+    Field("holding", "u1", "1", "1: no fresh command from above: what was commanded last is kept"),
+    Field("stopped", "u1", "1", "1: commands are not followed: the hand is stopped, or an operator holds the loop"),
+)
+"""From the tendon loop to the joint loop, and from that to the fingertip loop."""
 
 FINGER_STATUS = status(
     "finger_status",
@@ -100,13 +124,28 @@ FINGER_STATUS = status(
     Field("driven", "u1", "1", "1: the finger is one of this board's", ("fingers",)),
     Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
     Field("position", "f8", "rad", "joint positions, from the hand's status", ("joints",)),
+    Field("target", "f8", "rad", "joint positions wanted", ("joints",)),
     Field("tip", "f8", "m", "points of the tips", ("fingers", 3)),
     Field("force", "f8", "N", "of the surroundings on the tips", ("fingers", 3)),
-    Field("tension", "f8", "N", "least and largest tension of its tendons", (2,)),
-    Field(
-        "astray", "f8", "rad", "largest distance of a joint of a finger in mode JOINTS from its target", ("fingers",)
-    ),
     Field("holding", "u1", "1", "1: no fresh target: the fingers stay"),
-    Field("stopped", "u1", "1", "1: targets are not followed: the hand is stopped, or an operator holds the loop"),
+    Field("stopped", "u1", "1", "1: targets are not followed: the hand is stopped, or an operator holds a loop"),
 )
-"""From every loop of a hand, and from a board that runs all loops of a finger, to the level above."""
+"""From the fingertip loop, or from a board that runs all loops of a finger, to the grasp loop."""
+
+GRASP_STATUS = status(
+    "grasp_status",
+    1,
+    *ANSWER,
+    Field("step", "u2", "1", "steps of the program that are done"),
+    Field("steps", "u2", "1", "steps of the program"),
+    Field("kind", "u1", GraspKind, "of the step under way"),
+    Field("passed", "f8", "s", "time for which that step is under way"),
+    Field("object", "i2", "1", "row of the object grasped, in the world model; -1: none"),
+    Field("touching", "u1", "1", "1: the finger touches the object", ("fingers",)),
+    Field("grip", "f8", "N", "internal force of each finger but the opposing one, which bears their sum"),
+    Field("load", "f8", "N", "that the grasp makes up for: weight and pull", (3,)),
+    Field("anchor", "f8", "m", "where the object is to be", (3,)),
+    Field("moved", "f8", "m", "distance of the object from there"),
+    Field("farthest", "f8", "m", "largest such distance since the object was gripped"),
+)
+"""From the grasp loop."""

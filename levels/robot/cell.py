@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
 from rack.levels.robot import lookup
+from rack.levels.robot.hand import Hand, find_hand, fit_tendons
 from rack.levels.robot.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
+from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import RobotConfig, SceneConfig
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -26,11 +28,11 @@ class Cell:
     """A compiled cell. Indices are addresses in `model`."""
 
     model: mujoco.MjModel
-    """Torque motors on every joint of the arm, a force motor on the gripper. Keyframe 0 is the start: the arm at home,
-    the gripper open."""
+    """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons. Keyframe 0 is the
+    start: the arm at home, the gripper open."""
     qpos: NDArray[np.int_]  # (joints,), the arm's joints in qpos
     dof: NDArray[np.int_]  # (joints,), the same in qvel
-    actuators: NDArray[np.int_]  # (joints,), their motors in ctrl
+    actuators: NDArray[np.int_]  # (joints,), their motors in ctrl; of a hand, its flexors
     home: NDArray[np.float64]  # (joints,), rad: positions at the start
     tool: int  # site
     gripper_qpos: int | None  # None, here and below, for an arm without a gripper
@@ -50,6 +52,8 @@ class Cell:
     bounds: Bounds  # that the arm never exceeds
     limits: Limits  # of planned motion
     encoders: Encoders  # resolution and noise of its sensors
+    wrist: Wrist | None  # force/torque sensor; None: there is none
+    hand: Hand | None  # None for an arm
 
     def start(self) -> mujoco.MjData:
         """Return data of the start: the arm at home, the gripper open, objects where the model puts them."""
@@ -75,7 +79,10 @@ def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
 def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     spec = load_spec(robot.model)
     check_joints(robot, spec)
-    motors, torque = fit_motors(spec, robot)
+    if robot.hand is None:
+        motors, torque = fit_motors(spec, robot)
+    else:
+        motors, torque = fit_tendons(spec, robot, robot.hand, clock_ns * 1e-9 / robot.substeps)
     prepare(spec, robot, clock_ns)
     cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
     cell.model.key_qpos[0] = start_qpos(cell)
@@ -84,35 +91,41 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
 
 
 def sizes(cell: Cell) -> dict[str, int]:
-    """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state."""
-    return {
+    """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state; fingers of a hand."""
+    found = {
         "joints": len(cell.qpos),
         "bodies": max(1, len(cell.bodies)),
         "state": mujoco.mj_stateSize(cell.model, STATE),
     }
+    return found if cell.hand is None else {**found, "fingers": len(cell.hand.names)}
 
 
 def index(
     model: mujoco.MjModel, robot: RobotConfig, scene: SceneConfig, motors: list[str], torque: NDArray[np.float64]
 ) -> Cell:
-    """Find everything that the config names in the compiled model. Raises `RobotError`."""
+    """Find everything that the config names in the compiled model, the torques of a hand there. Raises `RobotError`."""
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = lookup.below(model, model.jnt_bodyid[joints])
+    hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
+    tool = lookup.tool_site(model, robot.tool, moved if hand is None else None)
     gripper, joint = robot.gripper, lookup.gripper_joint(model, robot, moved)
     bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects, obstacles = bodies[: len(scene.objects)], bodies[len(scene.objects) :]
-    hand = lookup.hand(model, joint, joints)
-    arm_geoms, gripper_geoms = lookup.geoms_of(model, moved), lookup.geoms_of(model, hand)
+    linked = lookup.hand(model, joint, joints)
+    if hand is not None:  # the palm, which its joints do not move, is a part of a hand
+        linked = moved = lookup.below(model, model.site_bodyid[[tool]]) | moved
+    arm_geoms, gripper_geoms = lookup.geoms_of(model, moved), lookup.geoms_of(model, linked)
     object_geoms = lookup.geoms_of(model, lookup.below(model, objects))
     supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
-    bounds = joint_bounds(model, joints, robot, torque)
+    bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
+    wrist = find_wrist(model, robot.wrist, moved)
     return Cell(
         model=model,
         qpos=model.jnt_qposadr[joints].astype(int),
         dof=model.jnt_dofadr[joints].astype(int),
         actuators=np.array([model.actuator(name).id for name in motors]),
         home=np.array(robot.home),
-        tool=lookup.tool_site(model, robot.tool, moved),
+        tool=tool,
         gripper_qpos=None if joint is None else int(model.jnt_qposadr[joint]),
         gripper_dof=None if joint is None else int(model.jnt_dofadr[joint]),
         gripper_actuator=None if gripper is None else int(model.actuator(gripper.actuator).id),
@@ -121,17 +134,20 @@ def index(
         gripper_stiffness=None if gripper is None else gripper.stiffness,
         linkage=None
         if gripper is None or joint is None
-        else solve_linkage(model, joint, hand, (gripper.open, gripper.closed)),
+        else solve_linkage(model, joint, linked, (gripper.open, gripper.closed)),
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,
         object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
         mocap=lookup.mocap_ids(model, obstacles),
         supports=supports,
-        touch=unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports),
+        touch=unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports)
+        & ~pressed_pairs(model, wrist, supports),
         bounds=bounds,
         limits=planned_limits(bounds, robot),
         encoders=Encoders.of(robot),
+        wrist=wrist,
+        hand=hand,
     )
 
 
@@ -145,7 +161,8 @@ def unintended_pairs(
     """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
 
     Intended are an object on a support, an object in the gripper, the parts of one object and the fingers on each
-    other. Every other contact of arm or object is unintended; the rest of the cell is ignored.
+    other; and, see `pressed_pairs`, a tool on a support. Every other contact of arm or object is unintended; the rest
+    of the cell is ignored.
     """
     touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     ours = np.union1d(arm, objects)
@@ -155,6 +172,15 @@ def unintended_pairs(
     root = model.body_rootid[model.geom_bodyid]
     touch[np.ix_(objects, objects)] &= root[objects][:, None] != root[objects][None, :]
     return touch
+
+
+def pressed_pairs(model: mujoco.MjModel, wrist: Wrist | None, supports: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Return (ngeom, ngeom), True for a support and what hangs on the wrist sensor: their contact is measured."""
+    pressed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    if wrist is not None:
+        tool = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
+        pressed[np.ix_(tool, supports)] = pressed[np.ix_(supports, tool)] = True
+    return pressed
 
 
 def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArray[np.int32]:

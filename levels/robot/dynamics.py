@@ -88,6 +88,11 @@ class Dynamics:
             self._carry(float(payload.mass), *self._carrying)
         return self._terms
 
+    @property
+    def evaluated(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of the last evaluation."""
+        return self._model, self._data
+
     def friction(self, velocity: Array) -> Array:
         """Return dry friction, N m, that opposes motion at `velocity`, rad/s, (joints,)."""
         return np.asarray(self.dry * each(math.tanh, velocity / FRICTION_SPEED))

@@ -17,6 +17,7 @@ NOUNS = {
     mujoco.mjtObj.mjOBJ_BODY: "body",
     mujoco.mjtObj.mjOBJ_GEOM: "geom",
     mujoco.mjtObj.mjOBJ_JOINT: "joint",
+    mujoco.mjtObj.mjOBJ_ACTUATOR: "actuator",
 }
 
 
@@ -25,8 +26,8 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
     found = mujoco.mj_name2id(model, kind, name)
     if found >= 0:
         return int(found)
-    count = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom, "joint": model.njnt}[NOUNS[kind]]
-    have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
+    counts = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom, "joint": model.njnt, "actuator": model.nu}
+    have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(counts[NOUNS[kind]])])
     raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
 
 
@@ -44,6 +45,10 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
         wanted.append((kind.mjOBJ_SITE, robot.tool, "robot.tool"))
     if robot.gripper is not None:
         wanted.append((kind.mjOBJ_JOINT, robot.gripper.joint, "robot.gripper.joint"))
+    if robot.hand is not None:
+        wanted += [(kind.mjOBJ_SITE, finger.tip, "robot.hand.finger.tip") for finger in robot.hand.finger]
+        wanted += [(kind.mjOBJ_ACTUATOR, name, "robot.hand.flexors") for name in robot.hand.flexors]
+        wanted += [(kind.mjOBJ_ACTUATOR, name, "robot.hand.extensors") for name in robot.hand.extensors]
     wanted += [(kind.mjOBJ_BODY, name, "scene.objects") for name in scene.objects]
     wanted += [(kind.mjOBJ_BODY, name, "scene.obstacles") for name in scene.obstacles]
     wanted += [(kind.mjOBJ_GEOM, name, "scene.supports") for name in scene.supports]
@@ -54,10 +59,13 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
             yield str(error)
 
 
-def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_]) -> int:
-    """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm. Raises `RobotError`."""
+def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None) -> int:
+    """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm; None: on any.
+
+    Raises `RobotError`.
+    """
     tool = find(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
-    if not moved[model.site_bodyid[tool]]:
+    if moved is not None and not moved[model.site_bodyid[tool]]:
         raise RobotError(f"robot.tool: '{name}' is on a body that the arm does not move")
     return tool
 

@@ -43,8 +43,8 @@ class ArmExecutor(ArmDriver):
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = ArmParams
 
-    def __init__(self, context: LevelContext) -> None:
-        super().__init__(context, read_params(ArmParams, context.params))
+    def __init__(self, context: LevelContext, params: ArmParams | None = None) -> None:
+        super().__init__(context, read_params(ArmParams, context.params) if params is None else params)
         limits = self.cell.limits
         self.joints = JointTorques(context, len(limits.velocity))
         self.orders = Orders(self.commands)

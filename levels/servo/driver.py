@@ -135,6 +135,9 @@ class ArmDriver(Executor):
         """What the status says while there is nothing worse to say. Default: nothing."""
         return ""
 
+    def feel(self, tick: int) -> None:
+        """Sense more than the joints, before it is decided whether the arm stops. Default: nothing."""
+
     def started(self) -> None:
         """React to the start of a board whose arm was restored from its last state. Default: nothing."""
 
@@ -147,6 +150,7 @@ class ArmDriver(Executor):
         sensors.look(sensed, tick, None if missed or self.abandoned else self._wanted, contact is not None)
         if contact is not None:
             self.stopping.struck(contact, self.arm.named(contact), tick)
+        self.feel(tick)
         reaction = self.stopping.decide(self.demand, sensors, tick)
         if reaction is Reaction.BRAKE:
             self.brake()

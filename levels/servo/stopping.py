@@ -42,8 +42,8 @@ class Stopping:
     """Weighs the rack's demands, faults of sensors, motors and torques, and blows: the strongest reaction wins.
 
     A failed motor is retried after a while: the arm holds with it, and follows set points after `good_cycles` without a
-    fault. If it fails while the arm ramps or holds with it, the brakes engage. A struck arm stays braked until nothing
-    has touched it for the same time.
+    fault. If it fails while the arm ramps or holds with it, the brakes engage. An arm that was struck, or pressed too
+    hard, stays stopped until nothing has for the same time.
 
     Faults may keep the arm from its set points for `patience`. That time counts up during faults and down while the arm
     follows, so recurring faults use it up too. Then the fault is latched: the brakes stay engaged.
@@ -65,7 +65,8 @@ class Stopping:
         self._retry_at: int | None = None  # tick at which a failed motor is retried; None: none has failed
         self._on_failure = self._on_motors  # reaction until then
         self._motor = self._blow = Cause(Error.NONE, "")
-        self._struck_until: int | None = None  # tick until which a struck arm stays braked
+        self._struck_until: int | None = None  # tick until which a struck arm stays stopped
+        self._on_blow = Reaction.BRAKE  # reaction until then
 
     def recall(self, state: Message) -> None:
         """Continue from the state in an `ARM_STATE`."""
@@ -99,10 +100,18 @@ class Stopping:
 
     def struck(self, contact: tuple[int, int], named: str, tick: int) -> None:
         """Register an unintended contact of the arm."""
-        if self._struck_until is None:
-            self.findings.append(Finding(Alarm.COLLISION, *contact))
-        self._struck_until = tick + self._retry_ticks
-        self._blow = Cause(Error.TOUCHED, f"unintended contact: {named}")
+        blow = Cause(Error.TOUCHED, f"unintended contact: {named}")
+        self._stop_for(blow, Finding(Alarm.COLLISION, *contact), Reaction.BRAKE, tick)
+
+    def pressed(self, finding: Finding, text: str, reaction: Reaction, tick: int) -> None:
+        """Register a contact stronger than the arm's limits, with its text and the reaction to it."""
+        self._stop_for(Cause(Error.FORCE, text, value=finding.value), finding, reaction, tick)
+
+    def _stop_for(self, blow: Cause, finding: Finding, reaction: Reaction, tick: int) -> None:
+        if self._struck_until is None or blow.error is not self._blow.error:
+            self.findings.append(finding)
+        self._on_blow = reaction if self._struck_until is None else max(self._on_blow, reaction)
+        self._struck_until, self._blow = tick + self._retry_ticks, blow
 
     def decide(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
         """Return the reaction of this cycle."""
@@ -144,7 +153,7 @@ class Stopping:
             cause = self._motor if self._retry_at is not None else cause
         if self._struck_until is not None:
             if tick < self._struck_until:
-                return Reaction.BRAKE, self._blow
+                return max(reaction, self._on_blow), self._blow
             self._struck_until = None
         return reaction, cause
 

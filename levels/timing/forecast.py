@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.frames import CoreFrames, core_frames
+from rack.levels.timing.rack import CyclicSchedule, LevelTiming, RackTiming
 from rack.levels.timing.response_time import TaskResponse, task_responses
 from rack.levels.timing.system_response import Prediction, predict
 from rack.levels.timing.verdicts import EquationVerdict, verdicts
@@ -17,6 +18,7 @@ class Forecast:
     """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction.
 
     `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it.
+    `schedule` is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
     """
 
     system: Prediction
@@ -26,6 +28,9 @@ class Forecast:
     responses: tuple[TaskResponse, ...]
     loads: dict[int, float]
     inboxes: tuple[dict[str, Any], ...]
+    tick_ns: int
+    schedule: CyclicSchedule | None
+    frames: tuple[CoreFrames, ...]
     notes: tuple[str, ...]
 
     @classmethod
@@ -41,6 +46,9 @@ class Forecast:
             inboxes=tuple(
                 inbox.document(rack.slice_ticks(name) * rack.clock_ns) for name, inbox in rack.inboxes.items()
             ),
+            tick_ns=rack.tick_ns,
+            schedule=rack.schedule,
+            frames=core_frames(rack),
             notes=tuple(_notes(rack, has_cores)),
         )
 
@@ -59,9 +67,17 @@ class Forecast:
             "responses": [response.document() for response in self.responses],
             "loads": {str(core): load for core, load in self.loads.items()},
             "inboxes": list(self.inboxes),
+            "schedule": self._schedule(),
             "notes": list(self.notes),
             "holds": self.holds,
         }
+
+    def _schedule(self) -> dict[str, Any] | None:
+        """Return the static schedule as plain data; None: there is none."""
+        if self.schedule is None:
+            return None
+        sizes = {f"{name}_ms": ticks * self.tick_ns * 1e-6 for name, ticks in self.schedule._asdict().items()}
+        return {**sizes, "cores": [found.document() for found in self.frames]}
 
 
 def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from math import prod
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from rack.backplane.layout import TickGrid
 from rack.levels.timing.equations import communication_ns, grid_wait, residual_ns, response_ticks
@@ -17,6 +17,13 @@ from rack.levels.timing.response_time import load_of
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
 Coupling = Literal["tight", "loose", "none"]
+
+
+class CyclicSchedule(NamedTuple):
+    """A static cyclic schedule: the minor frame and the major one, a multiple of it, in ticks."""
+
+    minor: int
+    major: int
 
 
 @dataclass(frozen=True)
@@ -180,6 +187,7 @@ class RackTiming:
     small_share: float
     response_goal_ns: float | None = None
     inboxes: Mapping[str, InboxTiming] = field(default_factory=dict)
+    schedule: CyclicSchedule | None = None  # a static one, if the rack has it
 
     @property
     def tick_ns(self) -> int:

@@ -14,6 +14,7 @@ from typing import Any
 
 from rack.levels.timing import equations
 from rack.levels.timing.equations import Relation
+from rack.levels.timing.frames import core_frames
 from rack.levels.timing.rack import LevelTiming, ParallelChains, RackTiming
 from rack.levels.timing.response_time import response_times
 
@@ -21,10 +22,10 @@ SYSTEM = "system"
 """The subject of the system's response."""
 LOOSE_PLAN = "fig. 4"
 """A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation number."""
-PLAN_WITHIN, RESPONSE_TIME, LOAD, INBOX = "plan within", "response time", "load", "inbox"
+PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX = "plan within", "response time", "load", "frames", "inbox"
 """Criteria beyond the paper."""
 EQUATIONS = "3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.8", LOOSE_PLAN, "3.9", "3.10"
-BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, INBOX
+BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX
 ORDER = (*EQUATIONS, *BEYOND)
 """All equations and criteria, in the order of the verdicts."""
 
@@ -74,7 +75,8 @@ def verdicts(rack: RackTiming) -> list[EquationVerdict]:
     A response time without a bound is infinite.
     """
     levels = (level_verdicts(rack, level) for level in rack.levels.values())
-    found = chain(system_verdicts(rack), *levels, _of_tasks(rack), _of_cores(rack), _of_inboxes(rack))
+    beyond = _of_tasks(rack), _of_cores(rack), _of_frames(rack), _of_inboxes(rack)
+    found = chain(system_verdicts(rack), *levels, *beyond)
     return sorted(found, key=lambda verdict: ORDER.index(verdict.equation))
 
 
@@ -157,6 +159,15 @@ def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
     for core, load in rack.loads.items():
         relation = Relation(load, "<=", 1.0)
         yield EquationVerdict.of(LOAD, f"core {core}", relation, "share of its time that its tasks compute", "1")
+
+
+def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield the verdicts on the places of a static schedule: one for all frames in which a place is the same."""
+    for alike in core_frames(rack):
+        for place in alike.places:
+            relation = Relation(place.end_ns, "<=", place.limit_ns)
+            meaning = f"done before {place.limit}, in frame {alike.frames[0]}"
+            yield EquationVerdict.of(FRAMES, place.board, relation, meaning)
 
 
 def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:

@@ -169,3 +169,20 @@ def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(small: Path) -> No
     done = check(small, "--set", "board.upper.budget.plan_ms=6")
     assert done.returncode == 2
     assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; remove it, or add one\n"
+
+
+def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
+    done = check("cyclic", "--set", "schedule.major_ms=40", "--set", "board.even.budget.process_ms=3.1")
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert "static schedule, ms: 10 frames of 4, 4 ticks; every budget with two context switches:" in done.stdout
+    assert ["1", "0,", "2", "...", "8", "even", "1", "3.14", "-0.14", "end", "of", "frame", "FAILS"] in rows
+    assert ["1", "1,", "3", "...", "9", "fast", "0", "0.94", "0.06", "odd", "ok"] in rows
+    assert "core 1, frame 0: 'even' lacks 0.14 ms when the frame ends" in done.stdout
+    assert done.returncode == 1
+
+
+def test_the_static_schedule_is_in_the_json_document() -> None:
+    found = json.loads(check("cyclic", "--json").stdout)["timing"]["schedule"]
+    assert (found["minor_ms"], found["major_ms"]) == (4, 8)
+    assert [(core["core"], core["frames"]) for core in found["cores"]] == [(1, [0]), (1, [1])]
+    assert [place["board"] for place in found["cores"][1]["places"]] == ["fast", "odd"]

@@ -111,6 +111,14 @@ def test_any_rack_has_a_schedule_where_it_has_budgets(tmp_path: Path) -> None:
     assert {"servo": 1, "primitive": 0, "world": 0}.items() <= lanes.items()
 
 
+def test_a_static_schedule_is_drawn_with_its_frames(tmp_path: Path) -> None:
+    shown = rack("gantt", "cyclic", "--out", tmp_path, "--json")
+    (panel,) = json.loads(shown.stdout)["panels"]
+    assert (panel["frame_ms"], panel["to_ms"]) == (4, 8)
+    text = rack("gantt", "cyclic", "--out", tmp_path, "--from-ms", 4, "--to-ms", 16).stdout
+    assert [line.split() for line in text.splitlines() if line.startswith("frame")] == [["frame", "|1", "|2", "|3"]]
+
+
 def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
     shown = rack("gantt", "nasrem", "--figure", 5, "--out", tmp_path)
     assert (shown.returncode, shown.stderr) == (0, "")

@@ -101,6 +101,6 @@ def gantt_of(
     still = f"{name} ran in lockstep: time stood still while its tasks computed"
     if schedule is None:
         raise Failure(f"{still}; {NO_BUDGET}" if run is not None else f"{name}: {NO_BUDGET}", 2)
-    start, end = options.window(options.task(schedule.tasks), None, 0)
+    start, end = options.window(options.task(schedule.tasks), None, 0, schedule.shown_ns)
     notes = () if run is None else (f"{still}; only the schedule is shown",)
     return Gantt(name, (schedule.panel(start, end),), notes, column_for(end - start, schedule.shortest_ns))

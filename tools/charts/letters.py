@@ -29,6 +29,9 @@ def lines(panel: Panel, column_ns: int) -> Iterator[str]:
     chart = panel.chart
     yield f"{panel.kind}, {ms(chart.start_ns)} to {ms(chart.end_ns)} ms, a column is {ms(column_ns)} ms"
     margin = max(len(lane.title) for lane in panel.lanes) + 2
+    if panel.frames:
+        starts = [((start - chart.start_ns) // column_ns, f"|{number}") for number, start in panel.frames.items()]
+        yield f"{'frame':{margin}}{label_row(starts)}"
     for lane in panel.lanes:
         yield f"{lane.title:{margin}}{_row(chart, lane, column_ns)}"
         marks = _marks(panel, lane, column_ns)

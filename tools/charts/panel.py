@@ -38,7 +38,8 @@ class Count:
 class Panel:
     """A chart cut to a window of time, with its lanes.
 
-    `patterns` by lane, and `counts` by task, cover the whole run, or a longer schedule.
+    `patterns` by lane, and `counts` by task, cover the whole run, or a longer schedule. `frame_ns` is the minor frame
+    of a static schedule; 0: there is none.
     """
 
     kind: Literal["schedule", "measured"]
@@ -46,6 +47,15 @@ class Panel:
     lanes: tuple[Lane, ...]
     patterns: Mapping[str, Patterns] = field(default_factory=dict)
     counts: Mapping[str, Count] = field(default_factory=dict)
+    frame_ns: int = 0
+
+    @property
+    def frames(self) -> dict[int, int]:
+        """The start of every minor frame that begins in the window, ns, by number from the start of the run."""
+        if not self.frame_ns:
+            return {}
+        numbers = range(-(-self.chart.start_ns // self.frame_ns), -(-self.chart.end_ns // self.frame_ns))
+        return {number: number * self.frame_ns for number in numbers}
 
     def late(self, lane: Lane) -> list[Job]:
         """Return the jobs of a lane that were late in the window, by deadline."""
@@ -63,6 +73,7 @@ class Panel:
             "kind": self.kind,
             "from_ms": self.chart.start_ns / NS_PER_MS,
             "to_ms": self.chart.end_ns / NS_PER_MS,
+            "frame_ms": self.frame_ns / NS_PER_MS or None,
             "lanes": [_lane(lane) for lane in self.lanes],
             "spans": [
                 {

@@ -38,7 +38,7 @@ NAMES = {
     Unit.UPDATE: "U  update of the plan",
 }
 EDGE = 0.2
-LATE, GRID, FLOOR = "#CC3311", "#555555", "#F3F3F3"
+LATE, GRID, FLOOR, FRAME = "#CC3311", "#555555", "#F3F3F3", "#999999"
 WIDTH_IN, LANE_IN, BAR = 10.0, 0.55, 0.66
 LABELS = 16
 """Most numbers along the axis."""
@@ -67,6 +67,11 @@ def _draw(axes: Axes, panel: Panel) -> None:
     chart, count = panel.chart, len(panel.lanes)
     for row, lane in enumerate(panel.lanes):
         _draw_lane(axes, panel, lane, count - 1 - row)
+    if panel.frames:
+        starts = [start / NS_PER_MS for start in panel.frames.values()]
+        axes.vlines(starts, -0.5, count - 0.5, colors=FRAME, linewidth=0.8, linestyles="dashed")
+        for number, start in panel.frames.items():
+            axes.annotate(f"frame {number}", (start / NS_PER_MS, count - 0.5), fontsize=7, va="bottom", color=GRID)
     axes.set_xlim(chart.start_ns / NS_PER_MS, chart.end_ns / NS_PER_MS)
     axes.set_ylim(-0.5, count - 0.5)
     step = step_for(panel, (chart.end_ns - chart.start_ns) // LABELS)
@@ -74,7 +79,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_xticks(labels)
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
-    axes.set_title(panel.kind, fontsize=9, loc="left")
+    axes.set_title(panel.kind, fontsize=9, loc="left", pad=14 if panel.frames else None)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
 

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
+from rack.levels.timing.frames import core_frames
 from rack.levels.timing.schedule import Chart, Job, Span, simulate
 from rack.levels.timing.tasks import Part, Unit
 from rack.tools.charts.panel import Count, Panel
@@ -17,6 +18,8 @@ from rack.tools.console.answer import Failure
 
 SLICES = 10
 """Fewest slices of the slowest task over which patterns are counted."""
+MOST_FRAMES = 24
+"""Most minor frames of a static schedule in a default chart."""
 MOST_CYCLES = 1_000_000
 """Most cycles of all tasks that are simulated: a minute of work."""
 T = TypeVar("T", Span, Job)
@@ -30,7 +33,12 @@ class Schedule:
     """
 
     def __init__(self, config: RackConfig, layout: Layout, process_ns: Mapping[str, Sequence[int]]) -> None:
-        self.tasks = rack_timing(config, layout).tasks
+        timing = rack_timing(config, layout)
+        self.tasks = timing.tasks
+        self.frame_ns = 0 if timing.schedule is None else timing.schedule.minor * timing.tick_ns
+        # The frames of a static schedule up to the last that differs from those before it.
+        alike = [found.frames[0] for found in core_frames(timing)]
+        self.shown_ns = min(max(alike) + 1, MOST_FRAMES) * self.frame_ns if alike else None
         self.switch_ns = round(config.timing.context_switch_ms * 1e6)
         self._variants = {name: self._variant(name, times) for name, times in process_ns.items()}
 
@@ -66,6 +74,7 @@ class Schedule:
             lanes=lanes,
             patterns={lane.name: patterns(chart, lane, (0, counted_ns), detail) for lane in lanes},
             counts={task.name: Count.of(chart, task.name, 0, counted_ns) for task in self.tasks},
+            frame_ns=self.frame_ns,
         )
 
     def _variant(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:

@@ -27,17 +27,20 @@ class WindowOptions:
     cycles: tuple[int, int] | None = None
     level: str | None = None
 
-    def window(self, level: TimedTask, extent_ns: int | None, start_ns: int) -> tuple[int, int]:
+    def window(
+        self, level: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None
+    ) -> tuple[int, int]:
         """Return start and end of the window, ns, in a run of `extent_ns`, or, with None, in an endless schedule.
 
-        `level` is the task whose cycles count, `start_ns` the default start. Raises `Failure` for an empty window, one
-        that is too long, or one outside the run.
+        `level` is the task whose cycles count, `start_ns` the default start, `length_ns` the default length: None, two
+        plans of the level. Raises `Failure` for an empty window, one that is too long, or one outside the run.
         """
         if self.cycles is not None:
             start, end = (level.phase_ns + at * level.every_ns for at in (self.cycles[0], self.cycles[1] + 1))
         else:
             start = start_ns if self.from_ns is None else self.from_ns
-            end = start + SLICES * level.period_ns if self.to_ns is None else self.to_ns
+            length_ns = SLICES * level.period_ns if length_ns is None or self.level is not None else length_ns
+            end = start + length_ns if self.to_ns is None else self.to_ns
         if extent_ns is not None:
             if start >= extent_ns or (end > extent_ns and (self.to_ns is not None or self.cycles is not None)):
                 raise Failure(f"{_window(start, end)}: outside the run, which lasts from 0 to {ms(extent_ns)} ms", 2)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.frames import CoreFrames
 from rack.levels.timing.rack import LevelTiming, spanned
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
-from rack.levels.timing.verdicts import INBOX, LOAD, RESPONSE_TIME, EquationVerdict
+from rack.levels.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
 from rack.tools.console.tables import ms, table
+
+TABLED = {*BEYOND} - {PLAN_WITHIN}
+"""Criteria that have a table of their own."""
 
 
 def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:
@@ -19,7 +24,7 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
     if forecast.levels:
         yield from ("", f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:", "")
         yield from _levels(forecast.levels, width)
-    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in (RESPONSE_TIME, LOAD, INBOX)]:
+    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
         yield from _verdicts(paper, width)
     if forecast.responses:
@@ -31,7 +36,51 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
         yield from _inboxes(forecast.inboxes, width)
+    yield from _schedule_lines(forecast, width)
     yield from forecast.notes
+
+
+def _schedule_lines(forecast: Forecast, width: int | None) -> Iterator[str]:
+    """Yield a line per board of every distinct frame of a static schedule, and those that are late in theirs."""
+    if forecast.schedule is None:
+        return
+    minor, major = forecast.schedule
+    count, ticks = major // minor, "a tick" if minor == 1 else f"{minor} ticks"
+    sizes = f"{count} frames of {ms(minor * forecast.tick_ns)}, {ticks}"
+    yield ""
+    yield f"static schedule, ms: {sizes}; every budget with two context switches:"
+    yield ""
+    head = ["core", "frames", "board", "offset", "budget", "slack", "until", ""]
+    rows = [
+        [
+            *(str(alike.core), _numbers(alike.frames, count), place.board),
+            *(ms(place.offset_ns), ms(place.job_ns), ms(place.slack_ns)),
+            *(place.until or "end of frame", _result(place.slack_ns >= 0)),
+        ]
+        for alike in forecast.frames
+        for place in alike.places
+    ]
+    yield from table(head, rows, width, ("until",))
+    for alike in forecast.frames:
+        yield from _late_lines(alike)
+
+
+def _late_lines(alike: CoreFrames) -> Iterator[str]:
+    for place in alike.places:
+        if place.slack_ns < 0:
+            where = f"core {alike.core}, frame {alike.frames[0]}"
+            yield f"{where}: '{place.board}' lacks {ms(-place.slack_ns)} ms when {place.limit}"
+
+
+def _numbers(frames: Sequence[int], count: int) -> str:
+    """Return the numbers of frames as text, those at equal distances by the first two and the last."""
+    if len(frames) == count:
+        return "all"
+    first, second, last = frames[0], frames[min(1, len(frames) - 1)], frames[-1]
+    if len(frames) <= 3:
+        return ", ".join(map(str, frames))
+    even = all(later - earlier == second - first for earlier, later in pairwise(frames))
+    return f"{first}, {second} ... {last}" if even else f"{first}, {second}, {frames[2]} ... {last}: {len(frames)}"
 
 
 def _prediction_lines(system: Prediction) -> Iterator[str]:

@@ -1,0 +1,104 @@
+"""The law of the joints: torques that make every joint's error that of a damped oscillator, as stiff as is wanted.
+
+torque = M(q) (2 d w (qd_wanted - qd) + s w^2 (q_wanted - q)) + weight(q) + friction(qd_wanted) + torque of tip forces
+
+`s`, 0 to 1 a joint, is the part of the stiffness that acts; the damping always acts, so a finger that only exerts a
+force is still slow. The weight of a finger is small, but at a joint that is soft it would cost degrees. Viscous
+friction is fed forward for the velocity wanted, not for the one sensed: what damps is not cancelled. The sample is
+taken on to when the torque acts, a valve's lag included, at the velocity sensed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
+from rack.levels.servo.driver import numbers
+from rack.levels.tables import NotNegative, Positive, Table
+
+
+class JointGains(Table):
+    """Gains of the joint loop."""
+
+    bandwidth: Positive = Field(40.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
+    damping: Positive = Field(1.0, le=5.0, description="damping ratio of the error at whole stiffness")
+    ahead: NotNegative = Field(0.006, le=0.1, description="time from a command of tensions until they have come, s")
+
+
+class JointLaw:
+    """Sets the torques of some joints of a hand."""
+
+    def __init__(self, cell: Cell, driven: NDArray[np.bool_], gains: JointGains) -> None:
+        """Drive the joints `driven`, (joints,)."""
+        self._dynamics = Dynamics(cell)
+        self._still = np.zeros(len(driven))
+        self._constants = np.zeros((4, len(driven)))  # in the rows of `set_joint_torques`
+        self._constants[:] = self._dynamics.dry, cell.model.dof_damping[cell.dof], cell.bounds.torque, driven
+        self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
+        self._ahead = gains.ahead
+        self._state: Array = np.zeros(0)  # numbers of a status of the hand, and of a target
+        self._wanted: Array = np.zeros(0)
+        self._set = set_joint_torques.load()
+        self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
+
+    def start(self, hand: Message, target: Message) -> None:
+        """Read the `HAND_STATUS` and the `FINGER_TARGET` from these messages from now on."""
+        self._state = numbers(hand, "position", "velocity").reshape(2, -1)
+        self._wanted = numbers(target, "position", "torque").reshape(4, -1)
+
+    def torques(self, age_s: float, ahead_s: float, out: Array) -> None:
+        """Set `out`, (joints,), N m, for when the sample is `age_s` old; the target is taken on by `ahead_s`."""
+        terms = self._dynamics.terms(self._state[0], self._still)
+        times = age_s + self._ahead, ahead_s
+        state, wanted = self._state, self._wanted
+        if self._set(self._gains, times, self._constants, state, wanted, terms.inertia, terms.bias, out):
+            self.clipped += 1
+
+
+@compiled
+def set_joint_torques(
+    gains: tuple[float, float],  # stiffness, 1/s2, and damping, 1/s
+    times: tuple[float, float],  # s: by which the sample, and the target, are taken on
+    constants: Array,  # (4, joints): rows as below
+    state: Array,  # (2, joints): rad, rad/s
+    wanted: Array,  # (4, joints): rad, rad/s, part of the stiffness, N m
+    inertia: Array,  # (joints, joints), kg m2
+    weight: Array,  # (joints,), N m
+    torque: Array,  # (joints,), N m: set; 0 for joints of other boards
+) -> bool:
+    """Set the torques; return whether a limit cut one."""
+    dry, viscous, limit, driven = constants[0], constants[1], constants[2], constants[3]  # N m, N m s/rad, N m, 1
+    joints, clipped = len(torque), False
+    for j in range(joints):
+        torque[j] = 0.0
+        if driven[j] != 0.0:
+            friction = viscous[j] * wanted[1, j] + dry[j] * math.tanh(wanted[1, j] / FRICTION_SPEED)
+            torque[j] = weight[j] + wanted[3, j] + friction
+    for k in range(joints):
+        if driven[k] == 0.0:
+            continue
+        away = wanted[0, k] + times[1] * wanted[1, k] - state[0, k] - times[0] * state[1, k]
+        acceleration = gains[0] * wanted[2, k] * away + gains[1] * (wanted[1, k] - state[1, k])
+        for j in range(joints):
+            if driven[j] != 0.0:
+                torque[j] += inertia[j, k] * acceleration
+    for j in range(joints):
+        if driven[j] != 0.0:
+            needed = torque[j]
+            torque[j] = np.minimum(np.maximum(needed, -limit[j]), limit[j])  # NaN stays
+            clipped = clipped or needed != torque[j]
+    return clipped
+
+
+def preload() -> None:
+    """Load this module's compiled function."""
+    joint, table = np.zeros(1), np.zeros((4, 1))
+    set_joint_torques.load()((0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], joint, joint)

@@ -1,0 +1,113 @@
+"""The law of the tendons: tensions for a torque, early enough for slow valves, and corrected by what is sensed.
+
+A pair turns its joint with torque = a (Tf - Te), a being its moment arm. Of all tensions that give a torque, those
+about a mean T0 are Tf = T0 + torque / 2a and Te = T0 - torque / 2a: the statics of a symmetric pair. Tendons only pull:
+where one would go slack, the mean is raised; where the other could then not pull enough, the torque is clipped.
+
+A valve follows its command with a lag [assumed: of first order]. `lead` commands more than is wanted while the tension,
+by a model of the valve, has not arrived: it is then there (1 + lead) times as soon, and nothing sensed is fed back, so
+the delays on the way to and from the hand cannot make it unstable. What the model lacks, gain and offset of a valve, is
+an error that lasts: `trim` integrates the difference of the sensed tension from that of the model, far slower than the
+lag. The model for this runs on the commands that the hand reports with each sample: both are of the same time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled
+from rack.levels.robot.hand import Hand
+from rack.levels.servo.driver import numbers
+from rack.levels.tables import NotNegative, Positive, Table
+
+
+class TendonGains(Table):
+    """What the law knows of the valves, and its gains."""
+
+    lag: Positive = Field(0.008, le=1.0, description="time constant of a valve, s")
+    lead: NotNegative = Field(1.0, le=4.0, description="part of the tension still missing that is commanded in excess")
+    trim: NotNegative = Field(4.0, le=20.0, description="rate at which a valve's lasting error is corrected, 1/s")
+    most_trim: NotNegative = Field(10.0, description="largest such correction, N")
+    margin: NotNegative = Field(1.0, description="tension kept above the hand's least, for a valve's error, N")
+
+
+class TendonLaw:
+    """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew after a restart."""
+
+    def __init__(self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, period_s: float) -> None:
+        """Drive the joints `driven`, (joints,), every `period_s`."""
+        joints = len(driven)
+        self._constants = np.zeros((4, joints))  # in the rows of `set_tensions`
+        self._constants[0], self._constants[1] = hand.arms, hand.least + gains.margin
+        self._constants[2], self._constants[3] = hand.most, driven
+        self._numbers = hand.rest, gains.lead, 1.0 - math.exp(-period_s / gains.lag), gains.most_trim
+        self._lag, self._trim = gains.lag, gains.trim
+        self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
+        self._sensed: Array = np.zeros(0)  # numbers of a status of the hand
+        self._elapsed_s, self._shares = 0.0, (0.0, 0.0)
+        self._set = set_tensions.load()
+        self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
+
+    def start(self, status: Message) -> None:
+        """Begin with the tensions of a `HAND_STATUS`, whose later contents are read from the same place."""
+        self._valves[0], self._valves[1], self._valves[2] = status.wanted, status.tension, 0.0
+        self._sensed = numbers(status, "tension", "wanted")
+
+    def tensions(self, torque: Array, elapsed_s: float, out: Array) -> None:
+        """Set `out`, (2, joints), N, for `torque`, (joints,), N m; the sample before was `elapsed_s` older."""
+        if elapsed_s != self._elapsed_s:
+            self._elapsed_s = elapsed_s
+            self._shares = 1.0 - math.exp(-elapsed_s / self._lag), min(self._trim * elapsed_s, 0.5)
+        if self._set(self._numbers, self._shares, self._constants, self._valves, self._sensed, torque, out):
+            self.clipped += 1
+
+
+@compiled
+def set_tensions(
+    numbers: tuple[float, float, float, float],  # mean tension, N, lead, share of a cycle in the lag, largest trim, N
+    shares: tuple[float, float],  # of the time since the sample before: in the lag, and in the trim
+    constants: Array,  # (4, joints): rows as below
+    valves: Array,  # (3, 2, joints), N: rows as below
+    sensed: Array,  # (4 joints,), N: tensions as sensed, then as they were commanded; flexors first
+    torque: Array,  # (joints,), N m
+    tension: Array,  # (2, joints), N: set; 0 for joints of other boards
+) -> bool:
+    """Set the tensions; return whether a torque had to be clipped."""
+    rest, lead, share, most_trim = numbers
+    arm, least, most, driven = constants[0], constants[1], constants[2], constants[3]  # m, N, N, 1
+    reached, expected, trim = valves[0], valves[1], valves[2]  # model now, model at the sample, correction
+    joints, clipped = len(arm), False
+    for j in range(joints):
+        if driven[j] == 0.0:
+            continue
+        room = 0.5 * (most[j] - least[j])
+        half = 0.5 * torque[j] / arm[j]
+        if abs(half) > room:
+            clipped = True
+        half = np.minimum(np.maximum(half, -room), room)  # NaN stays
+        mean = min(max(rest, least[j] + abs(half)), most[j] - abs(half))
+        for row in range(2):
+            wanted = mean + half if row == 0 else mean - half
+            commanded = sensed[(2 + row) * joints + j] - trim[row, j]
+            expected[row, j] += shares[0] * (commanded - expected[row, j])
+            learned = trim[row, j] + shares[1] * (expected[row, j] - sensed[row * joints + j])
+            if abs(learned) < np.inf:  # a NaN that was sensed teaches nothing
+                trim[row, j] = min(max(learned, -most_trim), most_trim)
+            early = wanted + lead * (wanted - reached[row, j])
+            early = np.minimum(np.maximum(early, least[j]), most[j])
+            reached[row, j] += share * (early - reached[row, j])
+            tension[row, j] = np.minimum(np.maximum(early + trim[row, j], least[j]), most[j])
+    return clipped
+
+
+def preload() -> None:
+    """Load this module's compiled function."""
+    numbers = np.zeros(4)
+    pair = np.zeros((2, 1))
+    set_tensions.load()((0.0,) * 4, (0.0,) * 2, np.zeros((4, 1)), np.zeros((3, 2, 1)), numbers, numbers[:1], pair)

@@ -1,0 +1,146 @@
+"""The wrist sensor of the simulated arm, and the contact that follows from its samples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.arm import SimulatedArm
+from rack.levels.arm.wrist import ContactWrench
+from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import Cell, build_cell, sizes
+from tests.levels.force.pad import pad
+
+CLOCK_NS = 1_000_000
+STILL = np.zeros(6)
+
+
+def arm_of(folder: Path, home: tuple[float, ...] | None = None, **wrist: float) -> SimulatedArm:
+    robot, scene = pad(folder, **wrist)
+    robot = robot if home is None else robot.model_copy(update={"home": home})
+    return SimulatedArm(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS, seed=7)
+
+
+def contact_of(arm: SimulatedArm) -> ContactWrench:
+    assert arm.cell.wrist is not None
+    return ContactWrench(arm.cell, arm.cell.wrist, arm.dynamics)
+
+
+def felt(arm: SimulatedArm) -> Array:
+    sample = arm.feel()
+    assert sample is not None
+    return sample
+
+
+def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
+    """Push the tool, at the tool's site, with a force, N, and a torque, N m, from the next step on."""
+    cell, data = arm.cell, arm._data
+    applied = np.zeros(cell.model.nv)
+    body = cell.model.site_bodyid[cell.tool]
+    centre, site = data.xipos[body], data.site_xpos[cell.tool]
+    mujoco.mj_applyFT(cell.model, data, force, torque, site, body, applied)
+    data.xfrc_applied[body, :3], data.xfrc_applied[body, 3:] = force, torque + np.cross(site - centre, force)
+
+
+def test_a_free_arm_at_rest_senses_the_weight_upwards_and_no_contact(tmp_path: Path) -> None:
+    arm = arm_of(tmp_path)
+    arm.step(20)
+    weight = 1.1 * 9.81
+    turned = arm._data.site_xmat[arm.cell.wrist.site].reshape(3, 3)
+    assert np.allclose((turned * felt(arm)[:3]).sum(axis=1), [0.0, 0.0, weight], atol=1e-3)
+    contact = contact_of(arm)
+    contact.take(felt(arm), np.array(arm._state), STILL)
+    assert np.abs(contact.wrench).max() < 1e-3
+
+
+def test_before_its_first_step_an_arm_rests(tmp_path: Path) -> None:
+    arm = arm_of(tmp_path)
+    contact = contact_of(arm)
+    contact.take(felt(arm), np.array(arm._state), STILL)
+    assert np.abs(contact.wrench).max() < 1e-3
+
+
+@pytest.mark.parametrize("home", [(0.0, 1.4, -3.1, 0.0, -1.4416, 0.0), (0.6, 1.0, -2.6, 0.7, -0.9, 1.1)])
+def test_a_push_on_the_tool_is_the_wrench_of_the_contact(tmp_path: Path, home: tuple[float, ...]) -> None:
+    arm, force, torque = arm_of(tmp_path, home), np.array([5.0, -9.0, 12.0]), np.array([0.4, 0.3, -0.2])
+    for _ in range(200):
+        push(arm, force, torque)
+        arm.step(1)
+    contact = contact_of(arm)
+    contact.take(felt(arm), np.array(arm._state), STILL)
+    assert np.allclose(contact.wrench, (*force, *torque), atol=0.02)
+    jacobian = np.zeros((6, arm.cell.model.nv))
+    mujoco.mj_jacSite(arm.cell.model, arm._data, jacobian[:3], jacobian[3:], arm.cell.tool)
+    expected = jacobian[:, arm.cell.dof].T @ np.concatenate((force, torque))
+    assert np.allclose(contact.torque, expected, atol=0.02)
+
+
+def test_inertia_of_the_tool_is_no_contact(tmp_path: Path) -> None:
+    arm = arm_of(tmp_path)
+    contact, before = contact_of(arm), np.zeros(6)
+    wrenches = []
+    for tick in range(300):
+        velocity = 0.4 * np.sin(4.0 * np.pi * tick * 1e-3) * np.ones(6)
+        acceleration = 4.0 * (velocity - arm._state[1]) / 0.02
+        terms = arm.dynamics.terms(*arm._state)
+        arm.drive((terms.inertia * acceleration).sum(axis=1) + terms.bias + arm.dynamics.friction(velocity), 0.0)
+        arm.step(1)
+        state = np.array(arm._state)
+        contact.take(felt(arm), state, np.zeros(6))
+        ignored = contact.wrench.copy()
+        contact.take(felt(arm), state, (state[1] - before) / 1e-3)
+        wrenches.append((ignored, contact.wrench.copy()))
+        before = state[1]
+    off = np.abs(wrenches[50:])[:, :, :3].max(axis=(0, 2))
+    assert off[0] > 2.0
+    assert off[1] < 0.3
+
+
+def test_noise_is_that_of_the_tick_and_has_its_standard_deviation(tmp_path: Path) -> None:
+    arm, exact = arm_of(tmp_path, noise=0.5), arm_of(tmp_path)
+    samples = []
+    for _ in range(300):
+        arm.step(1)
+        exact.step(1)
+        assert np.array_equal(felt(arm), felt(arm))
+        samples.append(felt(arm) - felt(exact))
+    spread = np.std(samples, axis=0)
+    assert np.allclose(spread[:3], 0.5, rtol=0.2)
+    assert np.allclose(spread[3:], 0.05, rtol=0.2)
+
+
+def test_a_sample_beyond_the_range_is_cut_and_says_nothing_of_the_contact(tmp_path: Path) -> None:
+    arm = arm_of(tmp_path, reach=60.0)
+    contact = contact_of(arm)
+    for _ in range(50):
+        push(arm, np.array([0.0, 0.0, 100.0]), STILL[:3])
+        arm.step(1)
+    assert np.abs(felt(arm)).max() == 60.0
+    contact.take(felt(arm), np.array(arm._state), STILL)
+    assert contact.saturated
+    contact.take(np.full(6, np.nan), np.array(arm._state), STILL)
+    assert contact.saturated
+
+
+def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
+    arms = [arm_of(tmp_path, noise=0.2) for _ in range(2)]
+    state = Message(ARM_STATE.dtype(sizes(arms[0].cell)))
+    for _ in range(40):
+        arms[0].drive(arms[0].dynamics.terms(*arms[0]._state).bias, 0.0)
+        arms[0].step(1)
+    arms[0].save(state)
+    arms[1].restore(state)
+    for arm in arms:
+        arm.step(1)
+    assert felt(arms[0]).tobytes() == felt(arms[1]).tobytes()
+
+
+def test_an_arm_without_a_sensor_senses_nothing(tmp_path: Path) -> None:
+    robot, scene = pad(tmp_path)
+    cell: Cell = build_cell(robot.model_copy(update={"wrist": None}), scene, CLOCK_NS)
+    assert SimulatedArm(cell, scene, CLOCK_NS).feel() is None

@@ -1,0 +1,152 @@
+"""A hand, from its description alone; every mistake in it is reported in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.levels.errors import RobotError
+from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.tables import RobotConfig
+from tests.levels.arms import ROBOTS, config
+
+CLOCK_NS = 2_000_000
+FLEXOR = '<general class="tendon" name="index0_flexor" tendon="index0_flexor"/>'
+TENDON = '<fixed name="index0_flexor"><joint joint="index0" coef="-.012"/></fixed>'
+EXTENSOR = '<fixed name="index0_extensor"><joint joint="index0" coef=".012"/></fixed>'
+
+
+def build(robot: RobotConfig) -> Cell:
+    return build_cell(robot, config("utah_mit")[1], CLOCK_NS)
+
+
+def changed(folder: Path, old: str, new: str) -> RobotConfig:
+    """Return the hand with `old` in its model replaced."""
+    text = (ROBOTS / "utah_mit.xml").read_text()
+    assert text.count(old) == 1, old
+    (folder / "hand.xml").write_text(text.replace(old, new))
+    return config("utah_mit")[0].model_copy(update={"model": folder / "hand.xml"})
+
+
+def retold(**hand: Any) -> RobotConfig:
+    """Return the hand with keys of `[robot.hand]` replaced."""
+    robot = config("utah_mit")[0]
+    assert robot.hand is not None
+    return robot.model_copy(update={"hand": robot.hand.model_copy(update=hand)})
+
+
+def test_the_hand_has_four_fingers_and_sixteen_joints_with_two_tendons_each() -> None:
+    made = build(config("utah_mit")[0])
+    hand = made.hand
+    assert hand is not None
+    assert sizes(made)["fingers"] == 4
+    assert sizes(made)["joints"] == 16
+    assert len(np.unique(hand.actuators)) == 32 == made.model.nu
+    assert (hand.fingers.sum(axis=0) == 1).all()
+    assert (hand.fingers.sum(axis=1) == 4).all()
+    assert hand.arms == pytest.approx([0.012, 0.012, 0.010, 0.008] * 4)
+    assert made.bounds.torque == pytest.approx(hand.arms * 98.0)
+
+
+def test_a_tension_turns_its_joint_and_no_other() -> None:
+    made = build(config("utah_mit")[0])
+    assert made.hand is not None
+    data = made.start()
+    for row, sign in enumerate((1.0, -1.0)):
+        for joint, actuator in enumerate(made.hand.actuators[row]):
+            data.act[:] = 0.0
+            data.act[made.model.actuator_actadr[actuator]] = 10.0
+            mujoco.mj_forward(made.model, data)
+            torque = np.zeros(16)
+            torque[joint] = sign * 10.0 * made.hand.arms[joint]
+            assert data.qfrc_actuator[made.dof] == pytest.approx(torque)
+
+
+def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
+    made = build(config("utah_mit")[0])
+    geom = {name: made.model.geom(name).id for name in ("palm", "can", "stand", "index_pad", "thumb_pad")}
+    assert not made.touch[geom["palm"], geom["can"]]
+    assert not made.touch[geom["index_pad"], geom["thumb_pad"]]
+    assert not made.touch[geom["can"], geom["stand"]]
+    assert made.touch[geom["index_pad"], geom["stand"]]
+
+
+def test_a_valve_remembers_its_controls_for_as_long_as_it_delays_them() -> None:
+    fine = config("utah_mit")[0].model_copy(update={"substeps": 40})
+    assert build(fine).model.actuator_history[0, 0] == 21
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        (FLEXOR, FLEXOR.replace("/>", ' ctrlrange="-100 100"/>'), "pushes as well: its control is -100 to 100 N"),
+        (FLEXOR, FLEXOR.replace("/>", ' gear="1"/>'), "cannot pull: its gear is 1; -1, which shortens"),
+        (FLEXOR, FLEXOR.replace("/>", ' ctrlrange="0 2"/>'), "cannot pull: its largest tension is 2 N; above"),
+        (FLEXOR, FLEXOR.replace("/>", ' ctrllimited="false"/>'), "pushes as well: its control has no range"),
+        (FLEXOR, FLEXOR.replace("/>", ' gainprm="2"/>'), "must have its tension as its control"),
+        (FLEXOR, FLEXOR.replace("/>", ' ctrlrange="0 90"/>'), "joint 'index0' pull at most 90 and 100 N"),
+        (FLEXOR, FLEXOR.replace(' tendon="index0_flexor"', ' joint="index0"'), "'index0_flexor' drives no tendon"),
+        (TENDON, TENDON.replace("-.012", "0"), "'index0_flexor' has no moment arm on joint 'index0'"),
+        (TENDON, TENDON.replace("-.012", ".012"), "'index0_flexor' turns joint 'index0' the wrong way"),
+        (EXTENSOR, EXTENSOR.replace(".012", "-.012"), "'index0_extensor' turns joint 'index0' the wrong way"),
+        (EXTENSOR, EXTENSOR.replace(".012", ".010"), "arms on joint 'index0' are 0.012 and 0.01 m"),
+        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "turns joint 'index1'"),
+    ],
+)  # fmt: skip
+def test_a_tendon_that_is_no_half_of_a_pair_is_refused(tmp_path: Path, old: str, new: str, why: str) -> None:
+    with pytest.raises(RobotError, match=r"robot\.hand") as refused:
+        build(changed(tmp_path, old, new))
+    assert why in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("what", "why"),
+    [
+        ({"least": 15.0}, "robot.hand.rest: 15 N; above robot.hand.least = 15 N is valid"),
+        ({"rest": 100.0}, "robot.hand.rest: 100 N; below the largest tension, 100 N, is valid"),
+        ({"flexors": ("index0_flexor",)}, "robot.hand.flexors: 1 values; one per joint: 16"),
+    ],
+)
+def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], why: str) -> None:
+    with pytest.raises(RobotError, match=why):
+        build(retold(**what))
+
+
+def test_every_joint_must_be_of_one_finger() -> None:
+    robot = config("utah_mit")[0]
+    assert robot.hand is not None
+    index, middle, *rest = robot.hand.finger
+    for joints, why in (
+        (index.joints[1:], "joint 'index0' must be of one finger; it is of none"),
+        ((*index.joints, "ring0"), "joint 'ring0' must be of one finger; it is of 'index', 'ring'"),
+        ((*index.joints, "index4"), "'index4' of 'index' is not in robot.joints"),
+    ):
+        with pytest.raises(RobotError, match=why):
+            build(retold(finger=(index.model_copy(update={"joints": joints}), middle, *rest)))
+    with pytest.raises(RobotError, match="2 fingers are named 'index'"):
+        build(retold(finger=(index, middle.model_copy(update={"name": "index"}), *rest)))
+
+
+def test_what_the_model_lacks_is_named() -> None:
+    robot = config("utah_mit")[0]
+    assert robot.hand is not None
+    index, *rest = robot.hand.finger
+    for tip, why in (("nail", "robot.hand.finger.tip: no site 'nail'"), ("palm", "does not move the tip 'palm'")):
+        with pytest.raises(RobotError, match=why):
+            build(retold(finger=(index.model_copy(update={"tip": tip}), *rest)))
+    names = ("muscle", *robot.hand.extensors[1:])
+    with pytest.raises(RobotError, match=r"robot\.hand\.extensors: no actuator 'muscle' in the model; it has"):
+        build(retold(extensors=names))
+    with pytest.raises(RobotError, match="actuator 'index0_flexor' is named 2 times"):
+        build(retold(extensors=("index0_flexor", *robot.hand.extensors[1:])))
+
+
+def test_a_hand_has_neither_gripper_nor_torque_limits_of_its_own() -> None:
+    robot = config("utah_mit")[0]
+    with pytest.raises(RobotError, match=r"robot\.torque: torques of a hand follow from its tendons"):
+        build(robot.model_copy(update={"torque": (1.0,) * 16}))

@@ -1,0 +1,66 @@
+"""The wrist sensor in a model, and what is wrong with one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.levels.errors import RobotError
+from rack.levels.robot.cell import build_cell
+from tests.levels.force.pad import pad
+
+CLOCK_NS = 1_000_000
+
+
+def test_range_limits_and_noise_are_those_of_model_and_config(tmp_path: Path) -> None:
+    wrist = build_cell(*pad(tmp_path, noise=0.3), CLOCK_NS).wrist
+    assert wrist is not None
+    assert (wrist.range, wrist.most, wrist.noise) == ((150.0, 20.0), (60.0, 8.0), (0.3, 0.03))
+    assert np.array_equal(wrist.addresses, np.arange(6))
+
+
+def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: Path) -> None:
+    model = (cell := build_cell(*pad(tmp_path), CLOCK_NS)).model
+    tip, flange, table, floor = (model.geom(name).id for name in ("pad", "flange", "table", "pedestal"))
+    assert not cell.touch[tip, table]
+    assert cell.touch[tip, floor]
+    assert cell.touch[flange, table]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        (
+            {"force": "wrist"},
+            "robot.wrist.force: no sensor 'wrist' in the model; it has these force sensors: wrist_force",
+        ),
+        (
+            {"torque": "wrist_force"},
+            "robot.wrist.torque: sensor 'wrist_force' is no torque sensor; it has these torque sensors: wrist_torque",
+        ),
+        (
+            {"sites": ("sensor", "tcp")},
+            "robot.wrist: force and torque are sensed at two sites, 'sensor' and 'tcp'; one is valid",
+        ),
+        (
+            {"sites": ("base", "base")},
+            "robot.wrist: site 'base' is on a body that the arm does not move",
+        ),
+        ({"reach": 0.0}, "robot.wrist.force: sensor 'wrist_force' has no range; give it a cutoff, N"),
+        (
+            {"most_force": 151.0},
+            "robot.wrist.most_force: 151 N is beyond the sensor's range; at most 150 is valid",
+        ),
+        (
+            {"most_torque": 25.0},
+            "robot.wrist.most_torque: 25 N m is beyond the sensor's range; at most 20 is valid",
+        ),
+    ],
+)
+def test_every_mistake_is_one_line(tmp_path: Path, changes: dict[str, Any], line: str) -> None:
+    with pytest.raises(RobotError) as caught:
+        build_cell(*pad(tmp_path, **changes), CLOCK_NS)
+    assert str(caught.value) == line
