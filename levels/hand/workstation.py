@@ -138,7 +138,7 @@ class Workstation(HostProgram):
             kind = GraspKind(int(status.kind)).name.lower()
             yield f"step {min(status.step + 1, status.steps)} of {status.steps}: {kind}, plan {status.plan or 'none'}"
             moved = f"moved {1e3 * status.moved:.1f} mm, at most {1e3 * status.farthest:.1f}"
-            yield f"grip {status.grip.max():.1f} N, {moved}"
+            yield f"grip {status.grip:.1f} N, {moved}"
             yield str(status.reason)
         if self._planned is not None:
             margin = f"{100 * self._planned.margin:.0f} % of their ranges"
