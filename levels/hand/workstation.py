@@ -141,8 +141,8 @@ class Workstation(HostProgram):
             yield f"grip {status.grip:.1f} N, {moved}"
             yield str(status.reason)
         if self._planned is not None:
-            margin = f"{100 * self._planned.margin:.0f} % of their ranges"
-            yield f"planned: grip {self._planned.grip:.1f} N, joints {margin} from their ends"
+            margin = f"joints {100 * self._planned.margin:.0f} % from their ends"
+            yield f"planned: grip {self._planned.grip:.1f} N, {margin}"
         robot = self.context.robot.hand
         for finger, force in zip(robot.finger if robot is not None else (), hand.force, strict=True):
             rows = [self.context.robot.joints.index(joint) for joint in finger.joints]
