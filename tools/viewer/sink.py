@@ -17,6 +17,7 @@ from rack.backplane.words import System
 from rack.boards.config import RackConfig, loads, rack_timing
 from rack.boards.config.timing import tick_ns
 from rack.levels.force.messages import SERVER_STATUS
+from rack.levels.hand.messages import HAND_STATUS
 from rack.levels.joint_messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.messages import (
     ARM_STATE,
@@ -28,10 +29,12 @@ from rack.levels.messages import (
 )
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.trajectory.messages import MOTION_STATUS
+from rack.tools.viewer.arrows import Pushes
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses, RecorderLoad
+from rack.tools.viewer.hand import HandCurves, TipForces
 from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Modes, Moves, Requests
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
@@ -192,7 +195,7 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         parts.append(Requests(stream, mailbox).write)
     if mailbox.message == SERVER_STATUS.name:
         parts.append(Modes(stream, mailbox).write)
-    if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name):
+    if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name, HAND_STATUS.name):
         parts.append(Fields(stream, mailbox).write)
     return parts
 
@@ -202,7 +205,14 @@ def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ARM_STATE.name:
-            return [Poses(stream, cell, config.clock_ns).write]
+            pushes = [Pushes(stream, cell, config.clock_ns).write] if config.scene.push else []
+            return [Poses(stream, cell, config.clock_ns).write, *pushes]
+        case HAND_STATUS.name if cell.hand is not None:
+            curves, forces = (
+                HandCurves(stream, robot.joints, cell.hand),
+                TipForces(stream, cell, cell.hand, config.clock_ns),
+            )
+            return [curves.write, forces.write]
         case driving if driving in DRIVING:
             return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
         case MOVE_PLAN.name:
