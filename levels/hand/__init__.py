@@ -2,7 +2,8 @@
 
 from rack.levels.hand.finger import FingerExecutor
 from rack.levels.hand.fingertip_loop import FingertipLoop
+from rack.levels.hand.grasp import GraspExecutor
 from rack.levels.hand.joint_loop import JointLoop
 from rack.levels.hand.tendon_loop import TendonLoop
 
-__all__ = ["FingerExecutor", "FingertipLoop", "JointLoop", "TendonLoop"]
+__all__ = ["FingerExecutor", "FingertipLoop", "GraspExecutor", "JointLoop", "TendonLoop"]
