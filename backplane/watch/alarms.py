@@ -64,6 +64,8 @@ class Alarm(IntEnum):
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]
     CLOCK_LATE = 32  # [-1; lateness, ns]
+    # Raised by boards: what interrupts them.
+    INBOX_FULL = 33  # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
     # Raised by the servo level: the arm.
     SENSOR_RANGE = 40  # [joint; value]  NaN, or beyond the joint's range
     SENSOR_STUCK = 41  # [joint; cycles]  no change while the arm is driven
@@ -80,6 +82,9 @@ class Alarm(IntEnum):
     MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
     FORCE_LIMIT = 53  # [-1; N]  a contact's force beyond the arm's limit, or the end of the wrist sensor's range
     MOMENT_LIMIT = 54  # [-1; N m]  a contact's torque, likewise
+    # Raised by the board of a hand.
+    TENSION_INVALID = 55  # [joint; -]  rejected: a tension is NaN or infinite
+    TENSION_LIMIT = 56  # [joint; N]  a tension beyond its limits was cut
     # Raised by the network adapter: other racks, and those who ask from other machines.
     PEER_LOST = 60  # [number among the level's `names`; -]
     PEER_BACK = 61  # [number; ticks it was away]  the same launch as before

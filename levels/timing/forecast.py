@@ -18,6 +18,7 @@ class Forecast:
     """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction.
 
     `schedule` is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
+    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it.
     """
 
     system: Prediction
@@ -29,6 +30,7 @@ class Forecast:
     tick_ns: int
     schedule: CyclicSchedule | None
     frames: tuple[CoreFrames, ...]
+    inboxes: tuple[dict[str, Any], ...]
     notes: tuple[str, ...]
 
     @classmethod
@@ -44,6 +46,9 @@ class Forecast:
             tick_ns=rack.tick_ns,
             schedule=rack.schedule,
             frames=core_frames(rack),
+            inboxes=tuple(
+                inbox.document(rack.slice_ticks(name) * rack.clock_ns) for name, inbox in rack.inboxes.items()
+            ),
             notes=tuple(_notes(rack, has_cores)),
         )
 
@@ -62,6 +67,7 @@ class Forecast:
             "responses": [response.document() for response in self.responses],
             "loads": {str(core): load for core, load in self.loads.items()},
             "schedule": self._schedule(),
+            "inboxes": list(self.inboxes),
             "notes": list(self.notes),
             "holds": self.holds,
         }

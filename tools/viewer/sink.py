@@ -16,6 +16,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, loads, rack_timing
 from rack.boards.config.timing import tick_ns
+from rack.levels.force.messages import SERVER_STATUS
 from rack.levels.joint_messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.messages import (
     ARM_STATE,
@@ -31,7 +32,7 @@ from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses, RecorderLoad
-from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Moves, Requests
+from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Modes, Moves, Requests
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
@@ -187,8 +188,10 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         parts.append(FiredRows(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
         parts.append(Moves(stream, mailbox).write)
-    if mailbox.message == MOTION_STATUS.name:
+    if mailbox.message in (MOTION_STATUS.name, SERVER_STATUS.name):
         parts.append(Requests(stream, mailbox).write)
+    if mailbox.message == SERVER_STATUS.name:
+        parts.append(Modes(stream, mailbox).write)
     if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name):
         parts.append(Fields(stream, mailbox).write)
     return parts
