@@ -69,7 +69,12 @@ class HandPicture:
             parts.append(f'<svg x="{GAP + number * (SIDE + GAP)}" y="{GAP}" width="{SIDE}" height="{SIDE}">')
             parts.append(f'<rect width="{SIDE}" height="{SIDE}" fill="#f6f7f9" stroke="{REST}"/>')
             parts += self._view(scene, (right, up))
-            parts += [f'<text x="8" y="18" font-size="13" fill="{HAND}">from {name}</text>'.replace("from front", "from the front"), "</svg>"]
+            parts += [
+                f'<text x="8" y="18" font-size="13" fill="{HAND}">from {name}</text>'.replace(
+                    "from front", "from the front"
+                ),
+                "</svg>",
+            ]
         left = GAP + len(VIEWS) * (SIDE + GAP)
         for row, line in enumerate(text):
             parts.append(f'<text x="{left}" y="{GAP + LINE * (row + 1)}" font-size="13">{escape(line)}</text>')
@@ -131,7 +136,10 @@ class HandPicture:
 
     def _surface(self, geom: int) -> Array:
         """Return points, (n, 3), m, whose hull is that of a geom."""
-        return self._data.geom_xpos[geom] + local_points(self._cell.model, geom) @ self._data.geom_xmat[geom].reshape(3, 3).T
+        return (
+            self._data.geom_xpos[geom]
+            + local_points(self._cell.model, geom) @ self._data.geom_xmat[geom].reshape(3, 3).T
+        )
 
     def _is_solid(self, geom: int) -> bool:
         return self._cell.model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE
@@ -152,7 +160,9 @@ def local_points(model: mujoco.MjModel, geom: int) -> Array:
     if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
         size = np.array([a, a, a] if kind == kinds.mjGEOM_SPHERE else [a, b, c])
         return size * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]])
-    centre, half = (model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]) if kind == kinds.mjGEOM_MESH else (0.0, (a, b, c))
+    centre, half = (
+        (model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]) if kind == kinds.mjGEOM_MESH else (0.0, (a, b, c))
+    )
     corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
     return np.asarray(centre + corners * np.array(half))
 
