@@ -15,8 +15,8 @@ from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
 
 ARROWS, FORCES = ("cell", "forces"), "forces"
-TASK, CONTACT, TIPS = "task_frame", "contact", "fingertips"
-"""Groups of curves: along the axes of a task frame, of the whole contact against its limits, of a hand."""
+TASK, CONTACT = "task_frame", "contact"
+"""Groups of curves: along the axes of a task frame, of the whole contact against its limits."""
 ARROW_COLOUR = (0, 230, 255)
 ARROW_S = 0.02
 """Time between arrows: the rate of a screen."""
@@ -56,7 +56,7 @@ def contacts_of(cell: Cell) -> list[ContactPlace]:
     return [] if cell.wrist is None else [ContactPlace("tool", cell.tool, None)]
 
 
-class Arrows:
+class ContactArrows:
     """Writes the forces of the surroundings on tool or fingertips as arrows."""
 
     def __init__(self, stream: Stream, cell: Cell, field: str, clock_ns: int) -> None:
@@ -118,18 +118,3 @@ class ContactForces:
             size = np.sqrt((halves[:, at] ** 2).sum(axis=1))
             curves = np.column_stack((np.full(len(size), most), size))
             self._stream.scalars((FORCES, CONTACT, what), block.times, curves)
-
-
-class TipForces:
-    """Writes the size of the force on each fingertip of `HAND_STATUS`es."""
-
-    def __init__(self, stream: Stream, cell: Cell) -> None:
-        self._stream = stream
-        names = [] if cell.hand is None else [f"{name}, N" for name in cell.hand.names]
-        colours = [of_joint(at) for at in range(len(names))]
-        stream.static((FORCES, TIPS), rr.SeriesLines(names=names, colors=colours))
-
-    def write(self, block: RowBlock) -> None:
-        """Write every cycle of the hand."""
-        size = np.sqrt((block.messages["force"] ** 2).sum(axis=2))
-        self._stream.scalars((FORCES, TIPS), block.times, size)

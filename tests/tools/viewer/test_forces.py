@@ -15,7 +15,7 @@ from rack.levels.force.messages import FORCE_STATUS, WRENCH
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.tools.viewer.cell import Poses
-from rack.tools.viewer.forces import Arrows, ContactForces, TaskForces, contacts_of
+from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from tests.levels.force.pad import pad
@@ -53,7 +53,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     force = np.zeros((ROWS, 6))
     force[:, 2] = np.arange(ROWS)
     written = Written(tmp_path)
-    written.write(WRENCH, cell, Arrows(written.stream, cell, "wrench", CLOCK_NS).write, wrench=force)
+    written.write(WRENCH, cell, ContactArrows(written.stream, cell, "wrench", CLOCK_NS).write, wrench=force)
     arrows = read(written.file, "/cell/forces/tool", "Arrows3D:vectors")
     assert arrows.ticks.tolist() == [0, 20, 40]
     assert arrows.values[:, 0] == pytest.approx(np.array([[0.0, 0.0, tick / 60.0] for tick in (0, 20, 40)]))
