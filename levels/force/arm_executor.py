@@ -43,8 +43,8 @@ class ForceArmExecutor(ArmExecutor):
 
     Weight and inertia of the tool are taken off, by the acceleration that the joints' velocities show or, where
     encoders are coarse, by that of the set points. At the limits of acceleration a tool of 1.1 kg would otherwise seem
-    to be pushed by 7 N; with the first, at 1 kHz, by 0.2 N, with the second by 2.3 N at most, where dry friction changes
-    sign. (With encoders of 1 mrad it is 2.6 N; their velocities would make 10 N of noise.)
+    to be pushed by 7 N; with the first, at 1 kHz, by 0.2 N, with the second by 2.3 N at most, where dry friction
+    changes sign. (With encoders of 1 mrad that is 2.6 N; their velocities would make 10 N of noise.)
     """
 
     inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
