@@ -13,6 +13,7 @@ from rack.levels.hand.messages import EXTENSOR
 from rack.levels.level import Demand, Fault, LevelContext
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation
+from rack.levels.servo import ArmExecutor, ServoExecutor
 from rack.levels.tables import PushConfig
 from tests.levels.arms import config
 from tests.levels.box import mute
@@ -250,6 +251,13 @@ def test_board_of_a_hand_needs_a_hand() -> None:
     assert [misfit[2] for misfit in HandExecutor.misfits(own, others, [])] == [
         "this board drives a hand; [robot.hand] is missing"
     ]
+
+
+@pytest.mark.parametrize("kind", [ArmExecutor, ServoExecutor])
+def test_board_of_an_arm_drives_no_hand(kind: type[ArmExecutor | ServoExecutor]) -> None:
+    own, *_ = context({})
+    first, *_ = kind.misfits(own, [], [])
+    assert first == ("executor", kind.__name__, "it drives an arm with motors; [robot.hand] is a hand of tendons")
 
 
 def test_rig_swings_by_what_the_hand_has_sensed() -> None:
