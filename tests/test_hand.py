@@ -13,7 +13,7 @@ from rack.tools.analysis.report import report_of
 from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
-from rack.tools.viewer.arrows import LENGTH_M
+from rack.tools.viewer.pushes import LENGTH_M
 from rack.tools.viewer.reading import read
 from tests.levels.arms import ROBOTS
 from tests.tools.command_line import rack
