@@ -25,11 +25,11 @@ from tests.levels.lockstep import BoardSpec, Lockstep
 
 CLOCK_NS, EVERY = 500_000, 4
 FINGERS = ("index", "middle", "ring", "thumb")
-OPEN = {**dict.fromkeys(FINGERS[:3], [0.0, 0.17, 0.26, 0.17]), "thumb": [0.0, 0.05, 0.17, 0.17]}
-AROUND = {**dict.fromkeys(FINGERS[:3], [0.0, 0.60, 0.70, 0.64]), "thumb": [0.0, 0.08, 0.90, 0.96]}
+OPEN = {**dict.fromkeys(FINGERS, (0.0, 0.17, 0.26, 0.17)), "thumb": (0.0, 0.05, 0.17, 0.17)}
+AROUND = {**dict.fromkeys(FINGERS, (0.0, 0.60, 0.70, 0.64)), "thumb": (0.0, 0.08, 0.90, 0.96)}
 POINTS = {"index": [0.014, 0.0, 0.03], "middle": [0.014, 0.0, 0.0], "ring": [0.014, 0.0, -0.03]}
-CLOSE = {"do": "close", "object": "can", "points": {**POINTS, "thumb": [-0.014, 0.0, 0.0]}, "speed": 0.06}
-PRESHAPE = {"do": "preshape", "posture": "around", "seconds": 0.5}
+CLOSE: dict[str, Any] = {"do": "close", "object": "can", "points": {**POINTS, "thumb": [-0.014, 0.0, 0.0]}, "speed": 0.06}
+PRESHAPE: dict[str, Any] = {"do": "preshape", "posture": "around", "seconds": 0.5}
 SQUEEZE = {"do": "squeeze", "grip": 6.0, "seconds": 0.3}
 LIFT = {"do": "shift", "by": [0.0, 0.0, 0.006], "seconds": 0.5}
 
@@ -80,7 +80,7 @@ class GraspRig(Lockstep):
         return self.read("grasp.status")
 
     def go(self, seconds: float, steps: int | None = None) -> bool:
-        """Run until the program has ended, or `steps` of it are done, or the time is over; return whether it was not."""
+        """Run until the program has ended, or `steps` of it are done; return False if the time is over before."""
 
         def ended(rack: Lockstep) -> bool:
             hand = rack.read("hand.status")
