@@ -48,6 +48,8 @@ class Error(IntEnum):
     TABLE = 16  # a state table came to a row with status error
     GIVEN_UP = 17  # the program of several racks was given up, for a reason in another one
     FORCE = 18  # a contact stronger than the arm's limits
+    CLIENT = 19  # a server's client is lost or silent
+    CONTACT = 20  # a contact was not made, or was lost
 
 
 class Verb(IntEnum):

@@ -33,10 +33,12 @@ class Table(BaseModel):
     @classmethod
     def _with_tuples(cls, table: Any) -> Any:
         """Turn TOML's lists into tuples, which are frozen."""
-        return {key: _tuple(value) for key, value in table.items()} if isinstance(table, dict) else table
+        return _tuple(table) if isinstance(table, dict) else table
 
 
 def _tuple(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tuple(item) for key, item in value.items()}
     return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
 
 

@@ -2,51 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Literal
 
 import typer
 
-from rack.tools.console.answer import Failure, print_json
+from rack.tools.benches.options import Against, Config, Plot, Rates, Rounds, Share, print_found, show
+from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, config_names
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
-
-Config = Annotated[
-    str,
-    typer.Option(
-        "--config", metavar="CONFIG", help="config by name, or path to a .toml file", autocompletion=config_names
-    ),
-]
-
-Plot = Annotated[Path | None, typer.Option(metavar="DIR", help="write the figures as PNG and SVG into this folder")]
-Against = Annotated[
-    Path | None, typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one")
-]
-Share = Annotated[
-    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
-]
-Rates = Annotated[
-    list[float] | None,
-    typer.Option("--rate", metavar="HZ", min=1, max=10_000, help="rate; may be given several times"),
-]
-Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
-
-
-class BenchResult(Protocol):
-    """What a bench has found, as far as it is shown."""
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield it as text for people, fitted to `width`."""
-
-    def plot(self, folder: Path) -> list[Path]:
-        """Write its pictures into `folder`; return their paths."""
 
 
 @bench.callback()
@@ -72,7 +39,7 @@ def mailbox(
 
     with progress_for(as_json) as progress:
         found = measure(CASES, rounds, progress)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
 
 
 @bench.command()
@@ -95,7 +62,7 @@ def cycle(
 
     with progress_for(as_json) as progress:
         found = measure(against, seconds, rounds, progress, share)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
 
 
 @bench.command()
@@ -119,7 +86,7 @@ def lockstep(
     racks = {name: min(filter(None, (own, seconds)), default=None) for name, own in RACKS.items()}
     with progress_for(as_json) as progress:
         found = measure(against, racks, rounds, progress)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
 
 
 @bench.command()
@@ -132,7 +99,7 @@ def recording(config: Config = "nasrem", as_json: Json = False) -> None:
     from rack.tools.console.tables import terminal_width
 
     costs = measure(config)
-    _print({"recording": [asdict(cost) for cost in costs]}, lines_of(costs, terminal_width()), as_json)
+    print_found({"recording": [asdict(cost) for cost in costs]}, lines_of(costs, terminal_width()), as_json)
 
 
 @bench.command()
@@ -146,7 +113,7 @@ def switch(as_json: Json = False) -> None:
     from rack.tools.benches.switch import measure
 
     cost = measure()
-    _print(asdict(cost), cost.lines(), as_json)
+    print_found(asdict(cost), cost.lines(), as_json)
 
 
 @bench.command()
@@ -169,7 +136,7 @@ def partition(
     with progress_for(as_json) as progress:
         found = compare(config, seconds, rounds, progress)
     document = {"config": config, "seconds": seconds, "rounds": rounds, "partitions": [asdict(p) for p in found]}
-    _print(document, lines_of(found, terminal_width()), as_json)
+    print_found(document, lines_of(found, terminal_width()), as_json)
 
 
 @bench.command()
@@ -197,7 +164,7 @@ def response(
 
     with progress_for(as_json) as progress:
         measured = ResponseRuns(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)
-    _print(measured.document(), measured.lines(terminal_width()), as_json)
+    print_found(measured.document(), measured.lines(terminal_width()), as_json)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         paths = plot(measured.response, out)
@@ -227,7 +194,7 @@ def clock(
 
     with progress_for(as_json) as progress:
         found = measure(tuple(rate or RATES_HZ), Runs(seconds, rounds, share), progress)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
 
 
 @bench.command()
@@ -252,7 +219,7 @@ def rate(
 
     with progress_for(as_json) as progress:
         found = measure(config, rate or RATES_HZ, Runs(seconds, rounds, share), progress)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
 
 
 @bench.command()
@@ -282,7 +249,7 @@ def boards(
         raise Failure(f"--count {max(count or COUNTS)}: a crate takes up to {LONGEST} boards and the clock", 2)
     with progress_for(as_json) as progress:
         found = measure(sorted(set(count or COUNTS)), Runs(seconds, rounds, share), against, progress)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
     raise typer.Exit(0 if found.exact else 1)
 
 
@@ -308,7 +275,7 @@ def launch(
 
     with progress_for(as_json) as progress:
         found = measure(config, LaunchCounts(rounds, kills), against, share, progress)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
 
 
 @bench.command()
@@ -319,38 +286,45 @@ def systems(
             metavar="CONFIG", help="config by name, or path to a .toml file; several", autocompletion=config_names
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e6, help="simulated time of one run")] = 10.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e6, help="time of the run in real time")] = 6.0,
     share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Compare racks with each other: what their configs promise, and what one short run each shows.
+    """Compare racks with each other: what their configs promise, and what their runs show.
 
-    Without CONFIG these are nasrem and the bundled racks that model other systems. Of each config: the levels of its
-    longest chain, boards, processes, rates, the longest cycle R_max, the response R_s by eqs 3.2 and 3.3 and on the
-    clock's grid, the loads of its cores, and whether it fits.
+    Without CONFIG these are nasrem and the bundled racks that model other systems: about six minutes on two quiet
+    cores, 40 seconds a rack.
 
-    Of a run in lockstep: how many times faster than real time. Of a run in real time: the cycles of the fastest boards
-    missed, next to those of `cyclictest` at that rate on those cores; the response down and up, measured by what each
-    message rests on; the age of commands when the lowest level reads them, and of its statuses when they are read; and
-    the response to an operator's hold of the highest level that takes one and responds within the run, from giving it
-    to the end of the cycle that acts on it.
+    Of each config: the levels of its longest chain, boards, processes, cores, rates, the longest cycle R_max, the
+    response R_s by eqs 3.2 and 3.3 and on the clock's grid, and whether it fits.
+
+    Of a run in real time: R_s down and up, measured by what each message rests on; the age of commands when the lowest
+    level reads them, and of its statuses when they are read; the response to an operator's hold, from giving it to the
+    end of the cycle that acts on it; missed cycles next to those of `cyclictest` at that rate on those cores; how long
+    plans take; accesses to the bus, and processor time.
+
+    Of a run in lockstep in which every process is killed once: the ticks until the Rack and a neighbour detect it.
+
+    Of three runs in lockstep of the same motion, if the rack has a config for it (three-poses.toml next to it, or
+    NAME-three-poses.toml): the tracking error, its time, and the time from an operator's hold of the highest level that
+    takes one, and from an emergency stop, until the arm rests.
 
     Exit status: 0 all racks ran; 1 a run failed; 2 a bad config.
 
     \b
     Examples:
       rack bench systems
-      rack bench systems nasrem fig2 --seconds 5 --plot pictures
+      rack bench systems nasrem rccl --seconds 10 --plot pictures
     """
     from rack.tools.benches.observed import Runs
-    from rack.tools.benches.systems import measure
-    from rack.tools.benches.systems import systems as bundled
+    from rack.tools.benches.systems.bench import measure
+    from rack.tools.benches.systems.bench import systems as bundled
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
         found = measure(configs or bundled(), Runs(seconds, 1, share), progress)
-    _show(found, plot, as_json)
+    show(found, plot, as_json)
     raise typer.Exit(0 if found.worked else 1)
 
 
@@ -379,22 +353,4 @@ def lan(
     runs = LanRuns(sorted(set(racks or COUNTS)), sorted(set(rate or RATES_HZ)), seconds, rounds, loss)
     with progress_for(as_json) as progress:
         found = measure(runs, progress)
-    _show(found, plot, as_json)
-
-
-def _show(found: BenchResult, plot: Path | None, as_json: bool) -> None:
-    """Print what a bench has found and, if asked for, plot it."""
-    from rack.tools.console.tables import terminal_width
-
-    _print(found.document(), found.lines(terminal_width()), as_json)
-    if plot is not None:
-        plot.mkdir(parents=True, exist_ok=True)
-        paths = found.plot(plot)
-        if not as_json:
-            print(f"pictures: {', '.join(map(str, paths))}")
-
-
-def _print(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
-    from rack.tools.console.tables import print_wrapped
-
-    print_json(document) if as_json else print_wrapped("\n".join(lines))
+    show(found, plot, as_json)

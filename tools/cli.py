@@ -50,6 +50,7 @@ COMMANDS = (
     ("campaign", "rack.tools.campaign:campaign", "Inject random faults into many runs, and judge each."),
     ("lan", "rack.tools.lan.group:app", "Prepare racks that work together over a network."),
     ("bench", "rack.tools.bench:bench", "Measure costs on this machine."),
+    ("reproduce", "rack.tools.reproduce:reproduce", "Reproduce the paper, claim by claim, as one page."),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 MAX_ARGUMENT = 4096

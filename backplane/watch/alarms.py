@@ -82,6 +82,9 @@ class Alarm(IntEnum):
     MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
     FORCE_LIMIT = 53  # [-1; N]  a contact's force beyond the arm's limit, or the end of the wrist sensor's range
     MOMENT_LIMIT = 54  # [-1; N m]  a contact's torque, likewise
+    # Raised by the board of a hand.
+    TENSION_INVALID = 55  # [joint; -]  rejected: a tension is NaN or infinite
+    TENSION_LIMIT = 56  # [joint; N]  a tension beyond its limits was cut
     # Raised by the network adapter: other racks, and those who ask from other machines.
     PEER_LOST = 60  # [number among the level's `names`; -]
     PEER_BACK = 61  # [number; ticks it was away]  the same launch as before

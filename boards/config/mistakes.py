@@ -290,6 +290,10 @@ def _scene(config: RackConfig) -> Iterator[Mistake]:
         if motion.body not in scene.obstacles:
             why = f"no such obstacle; scene.obstacles: {', '.join(scene.obstacles) or 'none'}"
             yield Mistake(f"scene.motion[{at}].body", motion.body, why)
+    for at, push in enumerate(scene.push):
+        if push.body not in scene.objects:
+            why = f"no such object; scene.objects: {', '.join(scene.objects) or 'none'}"
+            yield Mistake(f"scene.push[{at}].body", push.body, why)
     yield from _repeated("scene.objects and scene.obstacles", scene.bodies)
 
 

@@ -72,6 +72,8 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.ACTUATOR: ("joint", "actuator {subject} does not produce its commanded torque: off by {value:.3g}"),
     Alarm.COMMAND_INVALID: ("joint", "rejected: torque of {subject} is NaN"),
     Alarm.COMMAND_LIMIT: ("joint", "torque of {subject} cut to its limit: {value:.3g} N m was commanded"),
+    Alarm.TENSION_INVALID: ("joint", "rejected: a tension of {subject} is NaN"),
+    Alarm.TENSION_LIMIT: ("joint", "tension of {subject} cut to its limit: {value:.3g} N was commanded"),
     Alarm.BRAKES_OPENED: ("nothing", "brakes released after {span}"),
     Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),

@@ -17,7 +17,7 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
-from rack.levels.arm.poses import poses, show
+from rack.levels.arm.plant import Plant
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -52,7 +52,7 @@ class Link(Protocol):
         """
 
 
-class Arm(ABC):
+class Arm(Plant, ABC):
     """An arm with torque-driven joints that have brakes, and a force-driven gripper. Implements `Link`.
 
     Subclasses write `sense`, `drive`, `brake` and `step`, and keep the attributes below up to date. All else has a
@@ -61,26 +61,12 @@ class Arm(ABC):
 
     def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
         """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is for random noise."""
-        self.cell = cell
+        super().__init__(cell)
         self.patience = PATIENCE_CYCLES * every  # ticks without a command after which the brakes must engage
-        self.tick = 0  # tick of the arm's state
-        self.waited = self.patience  # ticks since the last command
-        self.braked = True  # the brakes are engaged
+        self.waited = self.patience
         self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
         self.grip_force = 0.0  # N: given to the gripper last
-        self.fault = ""  # why the arm has failed and moves no more; empty: it has not
-        self.clipped = 0  # cycles in which a command was refused or cut
-        self.contact: tuple[int, int] | None = None  # geoms of an unintended contact of arm or load in the last `step`
-        self.touches = 0  # unintended contacts so far
-        self.first_touch = ""  # the first of them, readable: which geoms, and when
-        self.violations = 0  # steps in which the drives broke a limit of position, velocity or torque
-        self.struck = 0  # ticks for which the motion is still blamed on a blow
-        self.pushed = 0  # steps in which a blow pushed a joint beyond a limit of position or velocity
-        self.first_violation = ""  # the first violation, readable: which limit, by how much, and when
         self.dynamics = Dynamics(cell)  # for the level that drives the arm; one that senses exactly shares it with it
-        self._saved: tuple[Message, tuple[int, ...]] | None = None  # last message filled, with what seldom changes
-        self._data = cell.start()
-        self._poses, self._fill = poses(cell, self._data), show.load()
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
     @abstractmethod
@@ -139,28 +125,6 @@ class Arm(ABC):
         """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the tool as sensed."""
         self._data.qpos[self.cell.qpos] = self.sense().position
         self._show(scene)
-
-    def _show(self, scene: Message) -> None:
-        """Fill a `SCENE` from `_data`."""
-        self._fill(*self._poses, np.frombuffer(scene.raw))
-
-    def save(self, state: Message) -> None:
-        """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
-
-        A simulation adds its state: `state.state` has room for MuJoCo's integration state of the cell.
-        """
-        state.tick = self.tick
-        seldom = self.waited, self.braked, self.clipped, self.touches, self.violations, self.pushed, self.struck
-        if (state, seldom) != self._saved:
-            state.waited, state.braked, state.clipped, state.touches = seldom[:4]
-            state.violations, state.pushed, state.struck = seldom[4:]
-            self._saved = state, seldom
-
-    def restore(self, state: Message) -> None:
-        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted board."""
-        self.tick, self.waited, self.braked = state.tick, state.waited, bool(state.braked)
-        self.clipped, self.touches = state.clipped, state.touches
-        self.violations, self.pushed, self.struck = state.violations, state.pushed, state.struck
 
 
 def find_arm(reference: str) -> type[Arm]:

@@ -7,8 +7,11 @@ torque, N m, or velocity, m/s, and angular velocity, rad/s. A wrench is what the
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 from rack.backplane.message import Field, MessageType, command, status
 from rack.levels.operator import ANSWER, RESTS_ON
+from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, state_of
 
 AXES = 6
 """Axes of a task frame: translations along x, y, z, then rotations about them."""
@@ -52,3 +55,56 @@ FORCE_STATUS = status(
     Field("axis", "i2", "1", "axis on which that was; -1: none"),
 )
 """From the level of hybrid control to the motion server."""
+
+SERVER_REQUEST = MessageType(
+    "server_request",
+    1,
+    (
+        *MOTION_REQUEST.fields,
+        Field("frame", "f8", "1", "task frame of COMPLY and GUARD, as in COMPLIANCE", (4,)),
+        Field("selected", "u1", "1", "of COMPLY, 1: an axis of force; none: motion alone, no guard", (AXES,)),
+        Field("wrench", "f8", "N, N m", "of COMPLY: wanted of the tool on the surroundings", (AXES,)),
+        Field("speed", "f8", "m/s, rad/s", "of COMPLY: most on the axes of force; 0: the level's default", (AXES,)),
+        Field("guard", "f8", "N, N m", "of GUARD: wrench, either way, that ends a segment; 0: not guarded", (AXES,)),
+    ),
+)
+"""From a client to a server of force and motion: a `MOTION_REQUEST`, or
+
+- COMPLY: what follows is done with these axes of force. It is done when their forces are as wanted, or, without any,
+  when the arm rests where compliance left it.
+- GUARD: the next of these wrenches ends the request under way, GUARDED; the guard ends with it. Those after it go on.
+
+Kind NONE with id 0 is a sign of life: without one, or a request, the server's client counts as lost.
+"""
+
+SERVER_STATE = state_of("server_state", SERVER_REQUEST)
+"""See `MOTION_STATE`; what is in force says the level's own `COMPLIANCE`."""
+
+
+class Mode(IntEnum):
+    """What a server of force and motion does."""
+
+    MOTION = 0
+    FORCE = 1  # some axes are of force
+    HELD = 2  # the same without its client: at rest on the axes of motion, for a bounded time
+    RELEASING = 3  # the time is over: the forces go to zero
+    RELEASED = 4  # and the arm holds its position; a CANCEL ends this, as it ends HELD and RELEASING
+
+
+SERVER_STATUS = MessageType(
+    "server_status",
+    1,
+    (
+        *MOTION_STATUS.fields,
+        Field("mode", "u1", Mode, "motion, force, or what is left of it without a client"),
+        Field("place", "f8", "m", "tool position as sensed", (3,)),
+        Field("quaternion", "f8", "1", "tool orientation as sensed, w, x, y, z", (4,)),
+        Field("frame", "f8", "1", "orientation of the task frame, w, x, y, z", (4,)),
+        Field("wrench", "f8", "N, N m", "of the tool on the surroundings, in the task frame", (AXES,)),
+        Field("wanted", "f8", "N, N m", "the same as wanted, on the axes of force; others 0", (AXES,)),
+        Field("selected", "u1", "1", "1: an axis of force", (AXES,)),
+        Field("guarded", "u4", "1", "newest request that a guard has ended; 0: none yet"),
+        Field("axis", "i2", "1", "axis on which that was; -1: none yet"),
+    ),
+)
+"""Requests as the server keeps them, from taking to end, and the contact."""

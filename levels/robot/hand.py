@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from rack.levels.errors import RobotError
 from rack.levels.robot import lookup
 from rack.levels.robot.model import drives_arm, listed, remove
-from rack.levels.tables import HandConfig, RobotConfig
+from rack.levels.tables import FingerConfig, HandConfig, RobotConfig
 
 SAME_ARM = 1e-6
 """Part of a moment arm by which it may vary: rounding."""
 ROWS = ("flexors", "extensors")
+NET_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1
+"""Parameters of a contact sensor: its data are the force, net of all contacts, once."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class Hand:
 
     names: tuple[str, ...]  # of the fingers
     tips: NDArray[np.int_]  # (fingers,), sites at their tips
+    forces: NDArray[np.int_]  # (fingers, 3), in sensordata: of contacts on the body of the tip, in the world's frame
     fingers: NDArray[np.bool_]  # (fingers, joints), True where a joint is the finger's
     actuators: NDArray[np.int_]  # (2, joints), of the tendons, in ctrl
     arms: NDArray[np.float64]  # (joints,), m: of both tendons of a joint, without sign
@@ -81,7 +84,7 @@ def fit_tendons(
     """Remove the drives of the hand's joints other than its tendons; return the flexors and the joints' torque limits.
 
     The limits, (joints,), N m, are not known before the model is compiled: those of the `Hand` replace them. Actuators
-    that delay their controls get room to remember them, in steps of `step_s`.
+    that delay their controls get room to remember them, in steps of `step_s`. Each tip gets a sensor of force.
     """
     check_hand(robot, hand)
     tendons = hand.flexors + hand.extensors
@@ -92,7 +95,18 @@ def fit_tendons(
     for actuator in spec.actuators:
         if actuator.delay > 0.0:
             actuator.nsample = max(actuator.nsample, math.ceil(actuator.delay / step_s) + 1)
+    for finger in hand.finger:
+        site = spec.site(finger.tip)
+        if site is not None:
+            site.parent.name = site.parent.name or f"tip of {finger.name}"
+            kind, body = mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtObj.mjOBJ_BODY
+            sensor = spec.add_sensor(name=_force_of(finger), type=kind, reftype=body, refname=site.parent.name)
+            sensor.intprm[:3] = NET_FORCE
     return list(hand.flexors), np.full(len(robot.joints), np.inf)
+
+
+def _force_of(finger: FingerConfig) -> str:
+    return f"force on {finger.name}"
 
 
 def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Hand:
@@ -123,6 +137,7 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
         names=tuple(finger.name for finger in hand.finger),
         tips=tips,
         fingers=np.array([[joint in finger.joints for joint in robot.joints] for finger in hand.finger]),
+        forces=np.array([model.sensor(_force_of(finger)).adr[0] + np.arange(3) for finger in hand.finger]),
         actuators=actuators,
         arms=_arms(model, robot, actuators),
         least=hand.least,

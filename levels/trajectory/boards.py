@@ -45,6 +45,10 @@ class JointBoards:
         self.in_step, self._cycles = True, 0
         return True
 
+    def leave(self, why: str) -> None:
+        """Let all fall out of step: they come to rest by themselves, and motion begins again from where they hold."""
+        self.in_step, self.awaited = False, why
+
     def _kept(self, statuses: Mapping[str, Reading]) -> str:
         """Return the board that does not follow, and why; empty: all do, or could."""
         for board, reading in statuses.items():

@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -40,6 +40,20 @@ class Motions:
 
     What a former process of the board has left in the queue is cancelled first.
     """
+
+    calls: ClassVar[tuple[str, ...]] = (
+        "move",
+        "line",
+        "stay",
+        "grip",
+        "release",
+        "cancel",
+        "done",
+        "wait",
+        "end_of",
+        "where",
+    )
+    """Those that scripts and prompts have by name."""
 
     def __init__(self, bus: Bus, robot: RobotConfig, scene: SceneConfig) -> None:
         self._bus, self._robot, self._bodies = bus, robot, scene.bodies
@@ -164,7 +178,10 @@ class CommandEnvironment(HostProgram):
         runpy.run_path(str(found), {"bus": bus, "program": self, **self.names(bus)}, "__main__")
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return the calls of `Motions`, by name."""
-        motions = Motions(bus, self.context.robot, self.context.scene)
-        calls = ("move", "line", "stay", "grip", "release", "cancel", "done", "wait", "end_of", "where")
-        return {"motions": motions, **{name: getattr(motions, name) for name in calls}}
+        """Return the calls, by name."""
+        motions = self.motions(bus)
+        return {"motions": motions, **{name: getattr(motions, name) for name in motions.calls}}
+
+    def motions(self, bus: Bus) -> Motions:
+        """Return what makes requests of calls."""
+        return Motions(bus, self.context.robot, self.context.scene)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from rack.backplane.message import Message, State
 from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.level import Executor, Input, LevelContext, Output, Ports
@@ -45,11 +47,13 @@ class TrajectoryExecutor(Executor):
     }
     outputs = {"command": JOINT_REFERENCE, "status": Output(MOTION_STATUS, rests_on="boards"), "state": MOTION_STATE}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
-    params = TrajectoryParams
+    params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
+    work: ClassVar[type[RequestWork]] = RequestWork
+    """Does the requests."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params, robot = read_params(TrajectoryParams, context.params), context.robot
+        params, robot = read_params(self.params, context.params), context.robot
         cell = build_cell(robot, context.scene, context.clock_ns)
         self._ik = InverseKinematics(cell, context.seed)
         self._sight = WorldSight(context.scene.bodies, params.blind, context.tick_s)
@@ -57,7 +61,7 @@ class TrajectoryExecutor(Executor):
         self._agenda = Agenda()
         self._motion = SampledMotion(cell.limits, robot.joints, context.period_s)
         self._motion.rest_at(cell.home)
-        self._work = RequestWork(self._agenda, self._motion, tools)
+        self._work = self.work(self._agenda, self._motion, tools)
         self._boards = JointBoards(robot.joints)
         self._orders = Orders(self.commands)
         self._dynamics = Dynamics(cell)
@@ -88,10 +92,10 @@ class TrajectoryExecutor(Executor):
         self._follow_boards(read)
         if cancelled:
             self._work.cancel()
-        if self._boards.in_step:
-            hold = self._orders.standing is Operation.HOLD
-            # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the boards hold.
-            for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
+        hold = self._orders.standing is Operation.HOLD
+        # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the boards hold.
+        for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
+            if self._boards.in_step:
                 self._work.step((self._due(tick) - late * self.context.every) * self.context.tick_s, hold)
         self._write_reference(write.command, tick)
         self._write_status(write.status)

@@ -22,6 +22,8 @@ class MotionKind(IntEnum):
     STAY = 3  # stay at the goal before it for `segment`
     CANCEL = 4  # end the request under way and drop all queued before this one; the arm ramps to rest
     GRIP = 5  # bring the gripper to `opening` with at most `force`, at rest
+    COMPLY = 6  # of a server of force and motion alone, like GUARD: see `rack.levels.force.messages`
+    GUARD = 7
 
 
 class RequestEnd(IntEnum):
@@ -32,6 +34,7 @@ class RequestEnd(IntEnum):
     CANCELLED = 2
     REFUSED = 3  # see the status' reason
     FAILED = 4  # given up on the way
+    GUARDED = 5  # a guard was struck on the way
 
 
 MOTION_REQUEST = command(
@@ -51,18 +54,24 @@ MOTION_REQUEST = command(
 )
 """`id` numbers requests, rising by one from 1 in the order of the queue; one not above those taken is a repetition."""
 
-MOTION_STATE = MessageType(
-    "motion_state",
-    1,
-    (
-        Field("begun", "u1", "1", "1: the first of `requests` is under way"),
-        Field("passed", "f8", "s", "time that it has stayed or gripped"),
-        Field("goal", MOTION_REQUEST, "", "the request at whose goal the arm is, or to which it goes; id 0: none"),
-        Field("count", "u2", "1", "requests that follow"),
-        Field("requests", MOTION_REQUEST, "", "taken and not ended, oldest first", (HELD,)),
-    ),
-)
-"""What a restarted trajectory level needs, in addition to its status, to neither repeat nor lose a request."""
+
+def state_of(name: str, request: MessageType) -> MessageType:
+    """Return the type of what a restarted level needs, with its status, to neither repeat nor lose a request."""
+    return MessageType(
+        name,
+        1,
+        (
+            Field("begun", "u1", "1", "1: the first of `requests` is under way"),
+            Field("passed", "f8", "s", "time that it has stayed or gripped"),
+            Field("goal", request, "", "the request at whose goal the arm is, or to which it goes; id 0: none"),
+            Field("count", "u2", "1", "requests that follow"),
+            Field("requests", request, "", "taken and not ended, oldest first", (HELD,)),
+        ),
+    )
+
+
+MOTION_STATE = state_of("motion_state", MOTION_REQUEST)
+"""Of a trajectory level."""
 
 MOTION_STATUS = status(
     "motion_status",

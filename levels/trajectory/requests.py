@@ -17,6 +17,8 @@ from rack.levels.trajectory.messages import ENDED, HELD, MotionKind, RequestEnd
 
 MOTIONS = (MotionKind.JOINTS, MotionKind.POSE)
 """Kinds that may be blended into each other."""
+KINDS = range(MotionKind.JOINTS, MotionKind.GRIP + 1)
+"""Kinds that any trajectory level can do."""
 
 
 class MotionRequest(NamedTuple):
@@ -51,8 +53,8 @@ class MotionRequest(NamedTuple):
 
     def misfit(self, ranges: Array) -> str:
         """Return why no arm could do it; empty: it may be possible. `ranges` (joints, 2), rad."""
-        if self.kind not in set(MotionKind) - {MotionKind.NONE}:
-            return f"kind {self.kind}; permitted: {MotionKind.JOINTS.value} to {MotionKind.GRIP.value}"
+        if self.kind not in KINDS:
+            return f"kind {self.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
         numbers = self.record["acceleration"], self.record["segment"], self.record["opening"], self.record["force"]
         if not np.isfinite(numbers).all() or self.acceleration < 0.0 or self.segment < 0.0:
             return f"times {self.acceleration:g} and {self.segment:g} s; permitted: finite, 0 or more"

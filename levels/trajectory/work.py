@@ -97,8 +97,8 @@ class RequestWork:
             return 1.0 - self._left
         return 1.0 - self._left * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
 
-    def _fail(self, how: RequestEnd, reason: str) -> None:
-        self.agenda.fail(how, Error.UNREACHABLE if how is RequestEnd.REFUSED else Error.LIMIT, reason)
+    def _fail(self, how: RequestEnd, reason: str, code: Error = Error.NONE) -> None:
+        self.agenda.fail(how, code or (Error.UNREACHABLE if how is RequestEnd.REFUSED else Error.LIMIT), reason)
         self.goal, self._left, self._interrupted = None, 1.0, False
 
     def _go_on(self) -> None:
@@ -154,13 +154,22 @@ class RequestWork:
     def _begin(self, request: MotionRequest, half_s: float) -> None:
         self.agenda.begin()
         self.passed_s, self._left = 0.0, 1.0
-        reason = request.misfit(self._tools.limits.position) or self._tools.sight.misfit(request.body)
+        reason = self._misfit(request)
         if reason:
             self._fail(RequestEnd.REFUSED, reason)
             self.motion.stop()
         elif request.moves:
             self._move(request, half_s, request.segment)
-        elif request.kind == MotionKind.GRIP:
+        else:
+            self._start(request)
+
+    def _misfit(self, request: MotionRequest) -> str:
+        """Return why a request cannot be done; empty: it may be possible."""
+        return request.misfit(self._tools.limits.position) or self._tools.sight.misfit(request.body)
+
+    def _start(self, request: MotionRequest) -> None:
+        """Begin a request that does not move the arm."""
+        if request.kind == MotionKind.GRIP:
             self.grip = request.opening, request.force
 
     def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:

@@ -88,6 +88,10 @@ MISTAKES = {
     ),
     "no class name": ("board.upper.executor=two_levels", "package.module:Class"),
     "moving what is not there": ("scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]", "no such obstacle"),
+    "pushing what is not there": (
+        "scene.push=[{ body = 'bar', at = 1, seconds = 1, force = [0, 0, 1] }]",
+        "no such object",
+    ),
     "no module": ("board.upper.executor='no_levels:Upper'", "cannot import 'no_levels': ModuleNotFoundError"),
     "no method": ("board.upper.executor='two_levels:Unfinished'", "class 'Unfinished' lacks the method 'process'"),
     "no class": (

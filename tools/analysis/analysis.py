@@ -171,19 +171,26 @@ def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
 
 
 def core_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTiming) -> dict[int, float]:
-    """Return by core the part of its time that tasks used, without the clock's own.
+    """Return by core the part of its time that tasks used, as `task_loads`."""
+    loads: dict[int, float] = {}
+    for name, load in task_loads(recording, found, rack).items():
+        loads[found[name].core] = loads.get(found[name].core, 0.0) + load
+    return dict(sorted(loads.items()))
+
+
+def task_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTiming) -> dict[str, float]:
+    """Return by task the part of its core's time that it used, without the clock's own.
 
     An executor counts at all its releases, skipped ones too: so the load of an overloaded core exceeds 1.
     """
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())
     lasted_ns = (last - first + 1) * rack.tick_ns
-    loads: dict[int, float] = {}
+    loads: dict[str, float] = {}
     for name, cycles in found.items():
         used_ns = recording.cycles[name]["processor_ns"]
         if cycles.task.role == "executor":
-            load = float(used_ns.mean()) / cycle_ns(rack, cycles.task)
+            loads[name] = float(used_ns.mean()) / cycle_ns(rack, cycles.task)
         else:
-            load = int(used_ns.sum()) / lasted_ns
-        loads[cycles.core] = loads.get(cycles.core, 0.0) + load
-    return dict(sorted(loads.items()))
+            loads[name] = int(used_ns.sum()) / lasted_ns
+    return loads

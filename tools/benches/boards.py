@@ -130,13 +130,13 @@ class _ChainRuns:
             processor_us=sum(float(np.median(trace["processor_ns"])) for trace in rows if len(trace)) * 1e-3,
             missed=missed_share(counts),
             late=None if late is None else overdue(late, self._grid.period_ns),
-            responses=_responses([run.messages[self._last] for run in self._runs]),
-            lockstep_responses=_responses([lockstep.messages[self._last]]),
+            responses=responses_of([run.messages[self._last] for run in self._runs]),
+            lockstep_responses=responses_of([lockstep.messages[self._last]]),
             lockstep_us={name: float(np.median(costs)) for name, costs in self._lockstep_us.items()},
         )
 
 
-def _responses(runs: Sequence[np.ndarray]) -> dict[int, int]:
+def responses_of(runs: Sequence[np.ndarray]) -> dict[int, int]:
     """Return how many messages took how many cycles to the end of the chain; one that a miss repeats counts once."""
     counts: Counter[int] = Counter()
     for rows in runs:

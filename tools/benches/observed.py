@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,10 +11,13 @@ import numpy as np
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.ring import Drained, Ring
+from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Outcome
+from rack.boards.wiring import Entries
 from rack.levels.timing.trace_times import is_missed
 
 READ_S = {"realtime": 0.5, "lockstep": 0.02}
@@ -29,6 +32,13 @@ class Runs(NamedTuple):
     seconds: float
     rounds: int
     share: bool = False
+
+
+class Deed(NamedTuple):
+    """Something that the host side does to a rack in lockstep, exactly before `tick`."""
+
+    tick: int
+    does: Callable[[Segment], None]
 
 
 class CycleCount(NamedTuple):
@@ -68,21 +78,33 @@ class Observed:
         return CycleCount(due - int(in_time), due)
 
 
-def observe(config: RackConfig, seconds: float, share: bool, mailboxes: Sequence[str] = ()) -> Observed:
+def observe(
+    config: RackConfig,
+    seconds: float,
+    share: bool,
+    mailboxes: Sequence[str] = (),
+    entries: Mapping[str, Entries] | None = None,
+    deeds: Sequence[Deed] = (),
+) -> Observed:
     """Run a rack for `seconds` of simulated time, or until its task ends.
 
-    `share` is as in `Rack`, which raises if another rack holds a core.
+    `deeds` are in the order of their ticks. `share` and `entries` are as in `Rack`, which raises if another rack holds
+    a core.
     """
-    with Rack(config, share=share) as rack:
-        segment = rack.segment
+    with Rack(config, share=share, entries=entries) as rack:
+        segment, ahead = rack.segment, list(deeds)
         tasks = [task.name for task in segment.layout.tasks]
         rings: dict[str, Ring] = {name: trace_ring(segment, name) for name in tasks}
         rings |= {name: MailboxRing(segment, name) for name in mailboxes}
         drained: dict[str, list[Drained]] = {name: [] for name in rings}
+        _hold_before(segment, ahead)
         rack.start(seconds)
         is_on = True
         while is_on:
             is_on = rack.watch(READ_S[config.clock.mode])
+            if ahead and segment.words[System.HELD] == ahead[0].tick + 1:
+                ahead.pop(0).does(segment)
+                _hold_before(segment, ahead)
             for name, ring in rings.items():
                 drained[name].append(ring.drain())
         assert rack.outcome is not None, "the run is over"
@@ -91,6 +113,11 @@ def observe(config: RackConfig, seconds: float, share: bool, mailboxes: Sequence
         layout = segment.layout
     traces, messages = {name: rows[name] for name in tasks}, {name: rows[name] for name in mailboxes}
     return Observed(traces, lost, messages, layout, rack.outcome)
+
+
+def _hold_before(segment: Segment, deeds: Sequence[Deed]) -> None:
+    """Let lockstep hold before the tick of the first of these."""
+    segment.words[System.HOLD_AT] = deeds[0].tick + 1 if deeds else 0
 
 
 def missed_share(counts: Iterable[CycleCount]) -> float:

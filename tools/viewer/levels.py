@@ -10,6 +10,7 @@ import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State
+from rack.levels.force.messages import Mode
 from rack.levels.messages import Verb
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
@@ -110,6 +111,17 @@ class Requests:
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
         self._requests.write(block, block.messages["current"], lambda serial: f"request {serial}" if serial else "")
+
+
+class Modes:
+    """Writes the mode of `SERVER_STATUS`es."""
+
+    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
+        self._modes = ValueLane(stream, mailbox.name.partition(".")[0], "mode")
+
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        self._modes.write(block, block.messages["mode"], lambda mode: Mode(mode).name.lower())
 
 
 def verb_name(verb: int) -> str:

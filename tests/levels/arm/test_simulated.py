@@ -14,7 +14,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm, substeps
 from rack.levels.arm.arm import PATIENCE_CYCLES
-from rack.levels.arm.simulated import ObstacleMotion
+from rack.levels.arm.simulation import ObstacleMotion
 from rack.levels.messages import ARM_STATE, SCENE
 from rack.levels.robot.cell import Cell, sizes
 from rack.levels.robot.dynamics import Dynamics

@@ -14,13 +14,13 @@ PAD = """
   <site name="sensor"/>
   <site name="tcp" pos="0 0 .13"/>
   <geom class="link" name="stem" type="cylinder" fromto="0 0 0 0 0 .10" size=".015"/>
-  <geom name="pad" type="sphere" size=".03" pos="0 0 .10" density="0" friction="{friction}" {contact}/>
+  <geom name="pad" type="sphere" size=".03" pos="0 0 .10" density="0" priority="1" friction="{friction}" {contact}/>
 </body>
 """
 WORLD = """
 <body name="stand"><site name="base"/><geom name="stand" size=".01"/></body>
-<geom name="table" type="box" size=".4 .6 .02" pos=".60 0 .43" {contact}/>
-<geom name="wall" type="box" size=".02 .3 .3" pos=".78 0 .75" {contact}/>
+<geom name="table" type="box" size=".4 .6 .02" pos=".60 0 .43"/>
+<geom name="wall" type="box" size=".02 .3 .3" pos=".78 0 .75"/>
 """
 SOFT = 'solref="-1000 -20" solimp=".5 .5 .001"'
 """A rubber pad. In MuJoCo a contact at rest has the stiffness m k d / (1 - d), with the inertia m that it sees, the

@@ -14,7 +14,7 @@ from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.tables import RobotConfig
 from tests.levels.arms import ROBOTS, config
 
-CLOCK_NS = 2_000_000
+CLOCK_NS = 500_000
 FLEXOR = '<general class="tendon" name="index0_flexor" tendon="index0_flexor"/>'
 TENDON = '<fixed name="index0_flexor"><joint joint="index0" coef="-.012"/></fixed>'
 EXTENSOR = '<fixed name="index0_extensor"><joint joint="index0" coef=".012"/></fixed>'
@@ -76,7 +76,7 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
 
 
 def test_a_valve_remembers_its_controls_for_as_long_as_it_delays_them() -> None:
-    fine = config("utah_mit")[0].model_copy(update={"substeps": 40})
+    fine = config("utah_mit")[0].model_copy(update={"substeps": 10})
     assert build(fine).model.actuator_history[0, 0] == 21
 
 

@@ -26,6 +26,9 @@ PERIOD_S = EVERY * CLOCK_NS * 1e-9
 class TrajectoryRig:
     """Runs the level cycle by cycle. Boards follow its set points exactly, and hold without."""
 
+    level_class: type[TrajectoryExecutor] = TrajectoryExecutor
+    request_type = MOTION_REQUEST
+
     def __init__(self, arm: str = "puma560_crossing", boards: int = 2, **params: Any) -> None:
         robot, scene = config(arm)
         self.cell = build_cell(robot, scene, CLOCK_NS)
@@ -46,7 +49,7 @@ class TrajectoryRig:
             below=paces,
             params=params,
         )
-        self.level = TrajectoryExecutor(self.context)
+        self.level = self.level_class(self.context)
         self.write = Ports(**{port: self._output(kind) for port, kind in self.level.outputs.items()})
         self.statuses = {name: self.message(JOINT_STATUS) for name in paces}
         for k, status in enumerate(self.statuses.values()):
@@ -76,7 +79,7 @@ class TrajectoryRig:
     def request(self, kind: MotionKind, **fields: Any) -> int:
         """Queue a request; return its id."""
         self.ids += 1
-        request = self.message(MOTION_REQUEST)
+        request = self.message(self.request_type)
         request.id, request.kind, request.body, request.quaternion = self.ids, kind, -1, (0.0, 0.0, 1.0, 0.0)
         for name, value in fields.items():
             setattr(request, name, value)
@@ -93,7 +96,7 @@ class TrajectoryRig:
 
     def restart(self) -> None:
         """Replace the level, as after the death of its board: its set points end, and the boards hold."""
-        self.level = TrajectoryExecutor(self.context)
+        self.level = self.level_class(self.context)
         self.brake()
 
     def brake(self) -> None:
@@ -103,7 +106,7 @@ class TrajectoryRig:
 
     def _read(self) -> Ports:
         taken, self.queue = self.queue[: self.level.room("requests")], self.queue[self.level.room("requests") :]
-        empty = self.message(MOTION_REQUEST)
+        empty = self.message(self.request_type)
         requests = Reading(taken[-1], Verdict.NEW, False, tuple(taken[:-1])) if taken else Reading(empty, Verdict.OLD)
         boards = {
             name: Reading(status, Verdict.OLD if name in self.lost else Verdict.NEW, name in self.lost)
@@ -113,7 +116,11 @@ class TrajectoryRig:
         own = {port: self._last(source) for port, source in self.level.inputs.items() if source.source[:4] == "own."}
         own["operator"] = Reading(self.order, Verdict.NEW if ordered else Verdict.OLD)
         world = Reading(self.world, Verdict.NEW)
-        return Ports(requests=requests, boards=boards, world=world, **own)
+        return Ports(requests=requests, boards=boards, world=world, **own, **self.others())
+
+    def others(self) -> dict[str, Reading]:
+        """Return what else the level reads."""
+        return {}
 
     def _last(self, source: Input) -> Reading:
         name = source.source.partition(".")[2]
@@ -123,14 +130,18 @@ class TrajectoryRig:
             message.copy_from(getattr(self.write, name))
         return Reading(message, Verdict.OLD if there else Verdict.NONE)
 
-    def cycle(self) -> Message:
-        """Run one cycle; return the status."""
+    def obey(self) -> None:
+        """Let the boards do what the last cycle commanded."""
         before = self.write.command
         for status in self.statuses.values():
             if before.due and not status.stopped:
                 status.holding, status.target, status.target_velocity = 0, before.position, before.velocity
             else:
                 status.holding, status.target_velocity = 1, 0.0
+
+    def cycle(self) -> Message:
+        """Run one cycle; return the status."""
+        self.obey()
         self.level.process(self._read(), self.write, self.tick)
         self.tick += EVERY
         if self.write.command.due:

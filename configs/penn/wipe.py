@@ -1,0 +1,52 @@
+"""Wipes along a surface at a force, over an edge that the script does not know, as far as a wall, and back.
+
+The rack runs it as its host board `coordinator`. If that was not done it ends with an error, and the run with status 1.
+By hand, at any time:
+    rack run penn --set host.coordinator.external=true
+    rack prompt penn coordinator configs/penn/wipe.py
+"""
+
+from rack.levels.trajectory.messages import RequestEnd
+
+X, DOWN = 0.50, (0.0, 0.0, 1.0, 0.0)
+ABOVE, SURFACE = 0.62, 0.50  # m: a free height, and where the surface should be
+START, END, BEYOND = -0.25, 0.12, 0.30  # m, along y; the wall is somewhere before BEYOND
+PRESS = 15.0  # N
+
+
+def expect(request, end, what):
+    """Wait for a request; raise unless it ended so."""
+    wait(request)
+    if end_of(request) is not end:
+        raise RuntimeError(f"{what}: {end_of(request).name.lower()}, not {end.name.lower()}")
+
+
+def wipe(y, seconds, end, what):
+    """Move along the surface to y, pressing; raise if the force was off for most of the way."""
+    pressed = []
+
+    def look():
+        pressed.append(abs(wrench()["z"] - PRESS) < 0.3 * PRESS)
+        return False
+
+    request = line((X, y, SURFACE), DOWN, segment=seconds)
+    wait(request, until=look)
+    expect(request, end, what)
+    if sum(pressed) < 0.8 * len(pressed):
+        raise RuntimeError(f"{what}: the force was off for {1 - sum(pressed) / len(pressed):.0%} of the time")
+
+
+expect(free(), RequestEnd.DONE, "beginning")
+x, y, _ = where()
+line((x, y, ABOVE), DOWN)  # after a former process the tool may be anywhere
+line((X, START, ABOVE), DOWN)
+guard("touch")
+expect(line((X, START, SURFACE - 0.02), DOWN, segment=3.0), RequestEnd.GUARDED, "touching the surface")
+expect(comply("wipe", force={"z": PRESS}), RequestEnd.DONE, "pressing")
+wipe(END, 6.0, RequestEnd.DONE, "wiping over the edge")
+guard("wall")
+wipe(BEYOND, 5.0, RequestEnd.GUARDED, "touching the wall")
+wipe(START, 8.0, RequestEnd.DONE, "wiping back")
+expect(free(), RequestEnd.DONE, "ending compliance")
+line((X, START, ABOVE), DOWN)
+expect(move(), RequestEnd.DONE, "going home")

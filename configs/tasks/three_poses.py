@@ -1,0 +1,11 @@
+"""The poses of three-poses.toml for a command environment: its script."""
+
+POSES = (
+    (0.8691, 1.367, -2.9103, 0.0, -1.5983, 0.8691),
+    (-0.2018, 1.0053, -2.5063, 0.0, -1.6406, -0.2018),
+    (0.629, 1.6189, -3.0661, 0.0, -1.6945, 0.629),
+)
+
+for pose in POSES:
+    # It would blend the motions: each ends before the next begins.
+    wait(move(pose))

@@ -1,0 +1,160 @@
+"""The simulation of a cell: the ticks of a plant in MuJoCo, judged at every step, and what moves by itself in it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array, norm
+from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
+from rack.levels.arm.plant import Plant
+from rack.levels.arm.substeps import advance, copy_state, substeps
+from rack.levels.robot.cell import STATE
+from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
+
+STRUCK_TICKS = 40
+"""Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the blow."""
+
+
+class Simulation(Plant):
+    """A plant in MuJoCo: `substeps` steps a tick; simulated time is tick times period, always.
+
+    Subclasses call `begin` when the plant is made, and give the drives their commands before each `_simulate`.
+    """
+
+    def begin(self, scene: SceneConfig, clock_ns: int) -> None:
+        """Prepare the steps of a tick of `clock_ns`, and what judges them."""
+        cell, d = self.cell, self._data
+        self._model, self._clock_ns = cell.model, clock_ns
+        self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
+        self._state = self._steps.seen[-1, 0], self._steps.seen[-1, 1]  # (joints,): true positions and velocities
+        self._refresh()
+        self._addresses = self._steps.model, self._steps.data
+        self._contacts, self._limits = ContactMonitor(cell), LimitMonitor(cell, self._steps)
+        obstacles = zip(cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True)
+        self._motions = [
+            (mocap, ObstacleMotion(cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name)))
+            for mocap, body, name in obstacles
+        ]
+        self._pushes = [
+            (int(body), pushes)
+            for body, name in zip(cell.bodies, scene.objects, strict=False)
+            if (pushes := tuple(push for push in scene.push if push.body == name))
+        ]
+        self._advance, self._copy_state = advance.load(), copy_state.load()
+        # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the working directory.
+        mujoco.set_mju_user_warning(lambda _: None)
+
+    def _refresh(self) -> None:
+        """Take positions and velocities of the joints from MuJoCo's state, after it was set other than by a step."""
+        position, velocity = self._state
+        position[:], velocity[:] = self._data.qpos[self.cell.qpos], self._data.qvel[self.cell.dof]
+
+    def named(self, contact: tuple[int, int]) -> str:
+        """Return a `contact` in words: the names of the geoms."""
+        return self._contacts.named(contact)
+
+    def look(self, scene: Message) -> None:
+        """Fill a `SCENE` with the poses as simulated."""
+        self._show(scene)
+
+    def save(self, state: Message) -> None:
+        """Fill an `ARM_STATE`."""
+        super().save(state)
+        self._copy_state(*self._addresses, state.state)
+
+    def restore(self, state: Message) -> None:
+        """Continue, bit for bit, from an `ARM_STATE`."""
+        super().restore(state)
+        mujoco.mj_setState(self._model, self._data, state.state, STATE)
+        self._contacts.count = state.touches
+        self._limits.count, self._limits.pushed = state.violations, state.pushed
+        self._refresh()
+
+    @property
+    def _now_s(self) -> float:
+        return self.tick * self._clock_ns * 1e-9
+
+    @property
+    def _after_s(self) -> float:
+        return (self.tick + 1) * self._clock_ns * 1e-9
+
+    def _simulate(self) -> None:
+        """Simulate one tick."""
+        for mocap, motion in self._motions:
+            self._data.mocap_pos[mocap] = motion.position(self._now_s)
+        for body, pushes in self._pushes:
+            self._data.xfrc_applied[body, :3] = push_force(pushes, self._now_s)
+        made = self._advance(0, (self.tick + 1) * self._clock_ns * 1e-9, *self._steps)
+        if made < 0:
+            self._look_closer(-made)
+        elif self.struck:
+            self.struck -= 1
+
+    def _look_closer(self, made: int) -> None:
+        """Finish a tick in which step `made` failed a check; on a fault, restore the state before the tick."""
+        touches, self._contacts.struck = self._contacts.count, self.contact
+        self._contacts.look(self._data)
+        while made < len(self._steps.seen):
+            made = self._advance(made, self._after_s, *self._steps)
+            if made < 0:
+                made = -made
+                self._contacts.look(self._data)
+        if self._contacts.count > touches and self._contacts.struck is not None:
+            self.struck = STRUCK_TICKS
+        broken = self._limits.judge(self._now_s, self.struck > 0)
+        if self.struck:
+            self.struck = STRUCK_TICKS if broken else self.struck - 1
+        self.fault = self._broken()
+        if self.fault:
+            mujoco.mj_setState(self._model, self._data, self._steps.states[0], STATE)
+            self._refresh()
+        self._data.time = self._after_s
+        contacts, limits = self._contacts, self._limits
+        self.contact, self.touches, self.first_touch = contacts.struck, contacts.count, contacts.first
+        self.violations, self.pushed, self.first_violation = limits.count, limits.pushed, limits.first
+
+    def _broken(self) -> str:
+        """Return the fault of the simulation; empty: none."""
+        d = self._data
+        warned = np.flatnonzero(d.warning.number)
+        if warned.size:
+            return f"MuJoCo warning {mujoco.mjtWarning(warned[0]).name} at {self._now_s:.4f} s"
+        if not (np.isfinite(d.qpos).all() and np.isfinite(d.qvel).all()):
+            return f"the simulated state is not finite at {self._now_s:.4f} s"
+        return ""
+
+
+class ObstacleMotion:
+    """The moves of one obstacle; a move that starts before the last one has ended cuts it short."""
+
+    def __init__(self, start: Array, moves: tuple[MotionConfig, ...]) -> None:
+        """Start at the place `start`, (3,), m."""
+        self._start = np.array(start)
+        self._moves = tuple(sorted(moves, key=lambda move: move.at))
+        self._ends = (*(later.at for _, later in pairwise(self._moves)), np.inf)
+
+    def position(self, time_s: float) -> Array:
+        """Return the obstacle's origin (3,), m, at simulated `time_s`."""
+        place = self._start
+        for move, end in zip(self._moves, self._ends, strict=False):
+            if time_s <= move.at:
+                break
+            way = np.array(move.to) - place
+            length = norm(way)
+            driven = move.speed * (min(time_s, end) - move.at)
+            place = np.array(move.to) if driven >= length else place + way * (driven / length)
+        return place
+
+
+def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
+    """Return the sum of the pushes on an object, (3,), N, at simulated `time_s`."""
+    total = np.zeros(3)
+    for push in pushes:
+        since, left = time_s - push.at, push.at + push.seconds - time_s
+        if since >= 0.0 and left > 0.0:
+            total += np.array(push.force) * (min(1.0, since / push.rise, left / push.rise) if push.rise > 0.0 else 1.0)
+    return total

@@ -1,0 +1,71 @@
+"""The tensions of several boards as those of one hand, while all of them are fresh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rack.backplane.watch.alarms import Alarm
+from rack.levels.arm.arm import PATIENCE_CYCLES
+from rack.levels.hand.messages import EXTENSOR
+from rack.levels.level import Finding, LevelContext, Reading, Verdict
+from rack.levels.robot.hand import Hand
+
+MARGIN = 1e-3
+"""Part of its largest tension by which one may miss its limits without count: rounding of whoever kept them."""
+
+
+class Tensions:
+    """Joins the `TENSION_COMMAND`s of the boards above, each for the joints that it drives."""
+
+    def __init__(self, context: LevelContext, hand: Hand) -> None:
+        # A tension rests on a status of a cycle ago and takes a cycle of its board; then the valves keep it.
+        self.oldest = {  # ticks, by board
+            board: context.every + (1 + PATIENCE_CYCLES) * pace.every for board, pace in context.above.items()
+        }
+        self._joints, self._low, self._high = context.robot.joints, hand.least, hand.most
+        self._margin = MARGIN * hand.most
+        self.tension = np.zeros((2, len(hand.most)))  # N
+        self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
+
+    def missing(self, tensions: Mapping[str, Reading], tick: int, since: int) -> str:
+        """Return why tensions are missing at `tick`; empty: all are fresh, and rest on a status of `since` or later."""
+        all_know = True
+        for board, oldest in self.oldest.items():
+            value, verdict, is_lost, _ = tensions[board]
+            if is_lost:
+                return f"board '{board}' is lost: valves closed until it is back"
+            sampled = -1 if verdict is Verdict.NONE else value.sampled
+            if sampled < 0:
+                return f"no tensions from board '{board}' yet"
+            if tick - sampled > oldest:
+                return f"tensions of board '{board}' are stale: they rest on a status more than {oldest} ticks old"
+            all_know = all_know and sampled >= since
+        return "" if all_know else "valves closed until the boards above have seen it"
+
+    def join(self, tensions: Mapping[str, Reading]) -> None:
+        """Set `tension` and `rests_on`, while nothing is `missing`."""
+        self.rests_on = 0
+        for board in self.oldest:
+            value = tensions[board].value
+            self.rests_on = max(self.rests_on, value.operator)
+            np.copyto(self.tension, value.tension, where=value.driven != 0)
+
+    def check(self) -> tuple[Finding | None, str]:
+        """Cut `tension` to its limits. Return what was cut, or refused, and why it is refused; empty: it is not."""
+        tension, low, high = self.tension, self._low, self._high
+        within = (tension >= low - self._margin) & (tension <= high + self._margin)  # NaN is not
+        if within.all():
+            np.clip(tension, low, high, out=tension)
+            return None, ""
+        if not np.isfinite(tension).all():
+            row, joint = np.argwhere(~np.isfinite(tension))[0].tolist()
+            return Finding(Alarm.TENSION_INVALID, joint), f"rejected: tension of {self._named(row, joint)} is NaN"
+        row, joint = np.argwhere(~within)[0].tolist()
+        found = Finding(Alarm.TENSION_LIMIT, joint, float(tension[row, joint]))
+        np.clip(tension, low, high, out=tension)
+        return found, ""
+
+    def _named(self, row: int, joint: int) -> str:
+        return f"'{self._joints[joint]}', {'extensor' if row == EXTENSOR else 'flexor'}"

@@ -1,0 +1,44 @@
+"""The paper's other systems: each rack measured by itself, as `rack bench systems` does."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from rack.boards.config import load
+from rack.tools.benches.observed import Runs
+from rack.tools.benches.system_figures import SystemFigures, Systems
+from rack.tools.benches.systems import measure, systems
+from rack.tools.console.progress import Progress
+from rack.tools.reproduction.experiments.experiment import Document, Experiment, Workshop
+
+SECONDS = 4.0
+LASTS_S = 3 * SECONDS + 8.0
+PREFIX = "system-"
+
+
+def system_experiment(name: str) -> Experiment:
+    """Return the figures of one rack, in lockstep and in real time."""
+    return Experiment(
+        f"{PREFIX}{name}", f"{name} next to the other systems", LASTS_S, partial(_inputs, name), partial(_run, name)
+    )
+
+
+def _inputs(name: str) -> Any:
+    return {"config": load(name).text(), "seconds": SECONDS}
+
+
+def _run(name: str, workshop: Workshop) -> Document:
+    found = measure([name], Runs(SECONDS, 1, workshop.share), Progress())
+    return TypeAdapter(Systems).dump_python(found, mode="json")
+
+
+def figures_of(found: Document) -> SystemFigures:
+    """Return the figures of a rack as they were measured."""
+    return TypeAdapter(Systems).validate_python(found).figures[0]
+
+
+SYSTEMS = tuple(system_experiment(name) for name in systems())
+"""Every rack that models a system, NASREM first."""
