@@ -65,20 +65,17 @@ class ForceProgram(Program):
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
         """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and sensor."""
-        for name, frame in self.frame.items():
-            if reason := frame.objection():
-                yield f"frame.{name}", frame.model_dump(), reason
+        bent = {name: reason for name, frame in self.frame.items() if (reason := frame.objection())}
+        for name, reason in bent.items():
+            yield f"frame.{name}", self.frame[name].model_dump(), reason
         for name, contact in self.contact.items():
-            if reason := self.objection(contact, robot):
+            if contact.frame not in bent and (reason := self.objection(contact, robot)):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
     def objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
         """Return why a contact is impossible; empty: it is not."""
-        frame = self.frame.get(contact.frame)
-        if frame is None:
+        if contact.frame not in self.frame:
             return f"frame '{contact.frame}' is not in [task.frame]; permitted: {', '.join(self.frame) or 'none'}"
-        if reason := frame.objection():
-            return f"frame '{contact.frame}': {reason}"
         if robot is None or robot.wrist is None:
             return "the arm has no wrist sensor"
         if idle := [axis for axis in contact.speed if axis not in contact.force]:
