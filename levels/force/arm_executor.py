@@ -38,7 +38,8 @@ class ForceArmExecutor(ArmExecutor):
     """Writes the wrench of the contact in every cycle; stops the arm when it is beyond `[robot.wrist]` most_*.
 
     A contact stops the arm for as long as it is too strong and for `retry` longer; after `patience` the fault is
-    latched, as others are. A sensor at the end of its range counts as beyond: what it senses is not known.
+    latched, as others are. Brakes let the arm spring back a little; an arm that holds keeps pressing. A sensor at the
+    end of its range counts as beyond: what it senses is not known. What a gripper holds counts as contact.
 
     Weight and inertia of the tool are taken off by the acceleration that the joints' velocities show. At the limits of
     acceleration a tool of 1.1 kg would otherwise seem to be pushed by 7 N; by that acceleration by 0.2 N at most, where

@@ -112,8 +112,7 @@ class HybridExecutor(Executor):
         payload = Payload(command.payload_mass, command.payload_offset)
         joints = self._law.step(motion, watch.task, passed_s, payload)
         command.due = tick + LEAD_CYCLES * self.context.every
-        command.position, command.velocity, command.inertia, command.load = joints
-        command.acceleration[:] = 0.0
+        command.position, command.velocity, command.acceleration, command.inertia, command.load = joints
         self._target, self._moving[:] = joints.position, motion.velocity
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
             self._begin(self._target, tick)
