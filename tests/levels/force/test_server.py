@@ -134,9 +134,9 @@ def test_a_force_that_swings_about_the_wanted_one_has_not_settled() -> None:
     rig.floor = HEIGHT + 0.0355  # at home the pad presses there
     press = rig.comply(20.0)
     for cycle in range(100):
-        rig.floor += 0.004 if cycle % 10 == 0 else -0.004 if cycle % 10 == 5 else 0.0
+        rig.floor += 0.003 if cycle % 12 == 0 else -0.003 if cycle % 12 == 6 else 0.0
         rig.cycle()
-    assert any(abs(force - 20.0) < 5.0 for force in rig.pressed)
+    assert sum(abs(force - 20.0) < 5.0 for force in rig.pressed) > 10
     assert rig.ends() == {press: RequestEnd.FAILED}
     assert rig.mode is Mode.MOTION
 
