@@ -25,7 +25,7 @@ line((0.5, -0.02, 0.54), DOWN)
 guard("touch")
 line((0.5, -0.02, 0.49), DOWN, segment=1.0)
 try:
-    comply("wipe", force={"z": 1000.0})
+    comply("wipe", wrench={"z": 1000.0})
 except LevelError:
     wait(comply("wipe"))
 wait(line((0.5, 0.09, 0.5), DOWN, segment=2.0))

@@ -25,7 +25,7 @@ class ServerParams(TrajectoryParams):
 
     speed: Positive = Field(0.05, description="most on an axis of force, where a request gives none, m/s")
     turning: Positive = Field(0.2, description="the same about an axis, rad/s")
-    tolerance: Positive = Field(0.3, lt=1.0, description="part of a wanted force by which it may be off")
+    tolerance: Positive = Field(0.3, le=1.0, description="part of a wanted force by which it may be off")
     settle: Positive = Field(
         0.2, description="time for which forces are within it when they are settled, and a COMPLY is done, s"
     )
