@@ -31,10 +31,11 @@ PASSED = ("opening", "force", "payload_mass", "payload_offset", "operator")
 class HybridExecutor(Executor):
     """Hands the references of the level above on, later by `LEAD_CYCLES`; on axes of force it moves for the force.
 
-    A guard that is struck ends the motion: the arm ramps to rest and holds, until the level above has another command;
-    axes of force keep their forces. Without a fresh wrench, or while the level above is lost, the arm rests on all of
-    them. References after that, after the brakes, and after a restart of this board, begin where `status` says that the
-    arm is held; those that go on are followed with the same difference as before.
+    A guard that is struck ends the motion: the arm ramps to rest and holds until the level above has another command;
+    axes of force keep their forces. Without a fresh wrench, or while the level above is lost, all axes rest.
+
+    References after that, after the brakes, and after a restart of this board, begin where `status` says that the arm
+    is held. References that go on when axes cease to be of force are followed at the distance that force has left.
     """
 
     inputs = {
