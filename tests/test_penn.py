@@ -40,6 +40,7 @@ SETTINGS = (
     "host.coordinator.restarts=0",
     "host.coordinator.params.script=press.py",
     "board.bridge.ends_run=false",
+    "board.server.params.silence=1.0",
     "board.server.params.hold=0.4",
 )
 

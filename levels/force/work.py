@@ -30,7 +30,7 @@ class ServerParams(TrajectoryParams):
         0.2, description="time for which forces are within it when they are settled, and a COMPLY is done, s"
     )
     reach: Positive = Field(4.0, description="longest time without settled forces, s: then compliance ends")
-    silence: Positive = Field(1.0, description="time without a sign of life after which the client is lost, s")
+    silence: Positive = Field(2.0, description="time without a sign of life after which the client is lost, s")
     hold: Positive = Field(3.0, description="time for which forces are held without a client, s")
 
 
