@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -15,6 +16,7 @@ from rack.levels.errors import LevelError
 from rack.levels.force.client import ForceMotions
 from rack.levels.force.messages import SERVER_STATUS, Mode
 from rack.levels.force.program import ForceProgram
+from rack.levels.force.server import ForceServer
 from rack.levels.level import LevelContext
 from rack.levels.trajectory.messages import MotionKind
 from tests.levels.arms import config
@@ -167,3 +169,11 @@ def test_an_impossible_contact_is_refused_at_once(
 def test_a_program_that_is_impossible_is_found_before_the_launch(table: Any, key: str, reason: str) -> None:
     found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))
     assert [(place, why) for place, _, why in found] == [(key, reason)]
+
+
+def test_an_arm_without_a_sensor_has_no_contacts_and_no_server() -> None:
+    bare = ROBOT.model_copy(update={"wrist": None})
+    reasons = [reason for _, _, reason in ForceProgram.model_validate(TASK).misfits(bare, SCENE)]
+    assert reasons == ["the arm has no wrist sensor"] * 2
+    ((key, server, _),) = ForceServer.misfits(replace(CONTEXT, robot=bare), (), ())
+    assert (key, server) == ("executor", "ForceServer")
