@@ -53,10 +53,6 @@ class FingertipLaw:
         """Begin with targets, and a posture, at `position`, (joints,), rad."""
         self.wanted[:] = self._rest[:] = position
 
-    def yield_to(self, position: Array) -> None:
-        """Let the targets be where the joints are, at `position`, (joints,), rad: these do not follow."""
-        self.wanted[:] = position
-
     def sense(self, position: Array) -> Array:
         """Take the joint positions sensed, (joints,), rad; return the tips, (fingers, 3), m, of this law's fingers."""
         self.kinematics.look(position)

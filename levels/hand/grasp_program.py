@@ -36,7 +36,7 @@ class CloseStep(Table):
         {}, description="where the tips would go if nothing were in the way, in the object's frame, m, by finger"
     )
     depth: Positive = Field(0.01, le=0.2, description="distance of such a point from a planned contact, inwards, m")
-    speed: Positive = Field(0.04, le=1.0, description="of the tip with the longest way, m/s")
+    speed: Positive = Field(0.03, le=1.0, description="of the tip with the longest way, m/s")
     touch: Positive = Field(0.3, description="force at which a tip touches the object, N")
     seconds: Positive = Field(3.0, description="time by which all must touch it, s")
 

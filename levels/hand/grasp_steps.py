@@ -185,6 +185,7 @@ class Held(StepWork):
         away = grasp.object_at - grasp.anchor
         grasp.moved = norm(away)
         grasp.farthest = max(grasp.farthest, grasp.moved)
+        grasp.grip.follow(grasp.target.tip, fingers.tip)
         grasp.grip.recover(away)
         grasp.grip.adapt(grasp.base, fingers.force)
         self.press()

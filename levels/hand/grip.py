@@ -4,8 +4,9 @@ The fingers that share one task are taken as one virtual finger (Arbib, Iberall 
 presses along the line from its tip to the mean of the other tips, those press back along the same line, in equal parts.
 Forces so chosen have neither sum nor moment, wherever the tips are. Against weight and pull the springs at the tips act
 at once, and give way; an integral of the object's distance from its anchor brings it back, half of it at the opposing
-tip, half at the others. Friction bears more the harder the grip is: it rises at once with the load sensed at the tips,
-and falls slowly after it.
+tip, half at the others. What the springs bear together for long it takes over: the points of all tips follow where
+these have crept or slipped to, and the forces stay. Friction bears more the harder the grip is: the grip rises at once
+with the load sensed at the tips, and falls slowly after it.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ class GripGains(Table):
         300.0, le=5000.0, description="of each tip about its point, N/m; of the opposing one, as of all others together"
     )
     recover: NotNegative = Field(4000.0, description="rise of the force on an object, for its distance, N/(m s)")
+    creep: NotNegative = Field(0.5, le=5.0, description="rate at which points follow tips that have crept, 1/s")
     most_load: NotNegative = Field(8.0, description="largest such force, N")
-    reserve: NotNegative = Field(0.6, le=5.0, description="rise of the grip with the load sensed, N/N")
+    reserve: NotNegative = Field(0.5, le=5.0, description="rise of the grip with the load sensed, N/N")
     most_grip: Positive = Field(14.0, description="largest force of the opposing finger, N")
 
 
@@ -63,6 +65,14 @@ class Grip:
         excess = norm(self.load)
         if excess > self._gains.most_load:
             self.load *= self._gains.most_load / excess
+
+    def follow(self, points: Array, tips: Array) -> None:
+        """Let the `points` of the springs, (fingers, 3), m, follow the tips, all by the same way."""
+        stiffness = self.stiffness[:, None]
+        whole = float(self.stiffness.sum())
+        way = self._gains.creep * self._period_s * (stiffness * (tips - points)).sum(axis=0) / whole
+        points[self.fingers] += way
+        self.load -= whole * way
 
     def forces(self, tips: Array) -> Array:
         """Return the force of every finger with its tip at `tips`, (fingers, 3), m: (fingers, 3), N."""

@@ -19,6 +19,7 @@ from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
 from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
 from rack.tools.viewer.events import EVENTS, RECORDER
+from rack.tools.viewer.forces import AXES, CONTACT, FORCES, TASK
 from rack.tools.viewer.hand import BY_FINGER, HAND, TIPS
 from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
@@ -116,7 +117,20 @@ class RackViews:
             for quantity in QUANTITIES
         ]
         error = _curves("tracking error, mrad", [self.path(ERROR)])
-        return rrb.Grid(*views, rrb.Tabs(error, _curves("gripper", [self.all(GRIPPER)])), grid_columns=2)
+        gripper = _curves("gripper", [self.all(GRIPPER)])
+        return rrb.Grid(*views, rrb.Tabs(*self._forces(), error, gripper), grid_columns=2)
+
+    def _forces(self) -> list[rrb.View]:
+        """Return the views of forces, of an arm or hand that senses them."""
+        cell = self._cell
+        if cell is None or cell.wrist is None:
+            return []
+        task = [[self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit] for unit in ("N", "N m")]
+        return [
+            _curves("force wanted and exerted, N", task[0]),
+            _curves("torque wanted and exerted, N m", task[1]),
+            _curves("contact, with limits", [self.all(FORCES, CONTACT)]),
+        ]
 
     def _fingers(self, hand: Hand) -> rrb.Container:
         """Return a view of every finger for tensions, joints and forces, each kind in a tab, and one of all tips."""

@@ -1,16 +1,12 @@
-"""A hand: joints, tensions and tip forces by finger as curves, and the forces on its tips as arrows in the cell."""
+"""A hand: joints, tensions and tip forces by finger, as curves."""
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import rerun as rr
 
 from rack.levels.hand.messages import EXTENSOR, FLEXOR
-from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
-from rack.tools.viewer.arrows import Arrows
-from rack.tools.viewer.cell import CELL
 from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, dimmed, of_joint
 
@@ -19,7 +15,6 @@ JOINTS, TENSIONS, FORCES = "joints", "tensions", "forces"
 BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FORCES: "N"}
 """Curves of a finger, and their units."""
 TIPS = (HAND, "tip_forces")
-ARROWS = (CELL, "tip_forces")
 
 
 class HandCurves:
@@ -56,21 +51,3 @@ class HandCurves:
             self._stream.scalars((HAND, finger, TENSIONS), times, np.hstack(tensions))
             self._stream.scalars((HAND, finger, FORCES), times, messages["force"][:, at])
         self._stream.scalars(TIPS, times, np.sqrt((messages["force"] ** 2).sum(axis=2)))
-
-
-class TipForces:
-    """Writes the forces of `HAND_STATUS`es as arrows at the fingertips."""
-
-    def __init__(self, stream: Stream, cell: Cell, hand: Hand, clock_ns: int) -> None:
-        self._cell, self._hand, self._data = cell, hand, cell.start()
-        self._palm = np.array(self._data.site_xmat[cell.tool]).reshape(3, 3)
-        self._arrows = Arrows(stream, ARROWS, clock_ns)
-
-    def write(self, block: RowBlock) -> None:
-        """Write the newest forces, one set every 20 ms of simulated time."""
-        for row in self._arrows.chosen(block):
-            message = block.messages[row]
-            self._data.qpos[self._cell.qpos] = message["position"]
-            mujoco.mj_kinematics(self._cell.model, self._data)
-            in_world = (message["force"][:, None, :] * self._palm).sum(axis=2)
-            self._arrows.write(block, row, self._data.site_xpos[self._hand.tips], in_world)
