@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import PATIENCE_CYCLES
@@ -79,6 +80,10 @@ class SimulatedHand(Simulation):
         """Open the valves, and let them follow tensions, (2, joints), N, which are within the limits."""
         self.waited, self.braked = 0, False
         self._data.ctrl[self.hand.actuators] = tension
+
+    def tear(self, torn: NDArray[np.bool_]) -> None:
+        """Let the tendons marked, (2, joints), give no tension, and all others theirs."""
+        self._model.actuator_gainprm[self.hand.actuators, 0] = np.where(torn, 0.0, 1.0)
 
     def close(self) -> None:
         """Close the valves."""

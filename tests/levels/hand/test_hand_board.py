@@ -7,8 +7,10 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
+from rack.boards.faults.kinds import KINDS
 from rack.levels.hand.executor import HandExecutor
-from rack.levels.level import Demand, LevelContext
+from rack.levels.hand.messages import EXTENSOR
+from rack.levels.level import Demand, Fault, LevelContext
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation
 from rack.levels.tables import PushConfig
@@ -174,6 +176,42 @@ def test_push_on_the_object_shows_as_an_error_only_when_something_is_struck() ->
     rig.cycles(150)
     assert rig.status.error == Error.NONE
     assert rig.read("hand.scene").position[0, 0] > 0.06
+
+
+def tear(rig: HandRig, joint: int, side: int) -> None:
+    kind = KINDS["tendon-torn"]
+    rig.executor.inject([Fault(kind.name, {"joint": joint, "side": side}, 1, rig.tick, kind.step)])
+
+
+def test_torn_tendon_is_found_within_its_bound_and_the_others_pull_on() -> None:
+    rig = swinging(())
+    tear(rig, 5, EXTENSOR)
+    assert str(KINDS["tendon-torn"].bound) == "6 cycles"
+    rig.cycles(6)
+    assert [(found.alarm, found.subject) for found in rig.executor.findings] == [(Alarm.TENDON, 5)]
+    assert rig.executor.acted
+    rig.cycles(2)
+    status = rig.status
+    assert (status.state, status.error) == (State.EXECUTING, Error.NONE)
+    assert status.reason == "slack: extensor of 'middle1'"
+    assert status.tension[EXTENSOR, 5] == 0.0
+    assert status.torque[5] > 0.0
+    assert np.delete(status.tension, 5, axis=1).min() >= 2.0
+    rig.executor.inject([])
+    rig.cycles(20)
+    assert rig.status.reason == ""
+    assert_follows(rig)
+
+
+def test_slack_that_closed_valves_bring_about_is_no_torn_tendon() -> None:
+    rig = swinging(())
+    rig.stop(Demand.STOP, ticks=40 * EVERY)
+    rig.cycles(2)
+    rig.executor.hand._data.ctrl[rig.executor.hand.hand.actuators[EXTENSOR]] = -5.0  # as of fingers that moved on
+    rig.cycles(30)
+    assert rig.status.tension[EXTENSOR].max() < 0.1
+    rig.cycles(30)
+    assert rig.executor.findings == []
 
 
 def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContext]:
