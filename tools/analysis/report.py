@@ -32,6 +32,7 @@ from rack.tools.analysis.report_markdown import markdown
 from rack.tools.faults.judge import faults
 from rack.tools.runs.history import counted, fired_rows, first_difference, frequency, holds, misses, steal
 from rack.tools.runs.host_side import entries_of
+from rack.tools.runs.interrupts import interrupts
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.queues import queues
 from rack.tools.runs.recording import Recording
@@ -82,6 +83,7 @@ def report_of(recording: Recording) -> Report:
         "motion": _motion(recording),
         "hand": _hand(recording, config),
         "queues": queues(recording),
+        "interrupts": interrupts(recording),
         "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
     }
@@ -91,7 +93,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
         *("misses", "steal", "frequency_mhz", "notes", "holds", "state_tables", "faults", "unexplained", "restarts"),
-        *("system_response", "entries", "network", "task", "motion", "hand", "queues", "rows_lost"),
+        *("system_response", "entries", "network", "task", "motion", "hand", "queues", "interrupts", "rows_lost"),
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}

@@ -86,6 +86,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _motion(report["motion"])
     yield from _hand(report["hand"])
     yield from _queues(report["queues"])
+    yield from _interrupts(report["interrupts"])
     yield from _holds(report)
     yield from _state_tables(report["state_tables"])
     yield from _times(report)
@@ -258,6 +259,18 @@ def _queues(queues: Sequence[Report]) -> Iterator[str]:
         yield (
             f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at most "
             f"{queue['waiting']} waiting, room for {queue['capacity']}{refused}."
+        )
+
+
+def _interrupts(boards: Sequence[Report]) -> Iterator[str]:
+    for board in boards:
+        lost, latency = f", {board['lost']} lost" if board["lost"] else "", board["latency_us"]
+        took = (
+            f"; {latency['p50']:g} us from sending to the end of service, at most {latency['max']:g}" if latency else ""
+        )
+        yield (
+            f"Interrupts of {board['board']}: {board['served']} messages served, at most {board['waiting']} waiting, "
+            f"room for {board['depth']}{lost}{took}."
         )
 
 
