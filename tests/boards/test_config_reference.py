@@ -17,9 +17,10 @@ from rack.levels.servo.control import ServoParams
 DIMENSIONLESS = {
     *("speed", "small_share", "phase", "damping", "braking", "quaternion", "direction"),  # ratios and directions
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
+    *("lead", "posture", "reserve"),  # of hands: parts and factors
     "for",  # s, or text with its unit
 }
-WHOLE = ("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit")
+WHOLE = ("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit", "posture", "points")
 """Keys whose tables hold names of the user's own."""
 
 
