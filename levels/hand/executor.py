@@ -10,7 +10,7 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
-from rack.levels.arm import preload
+from rack.levels.arm import poses, substeps
 from rack.levels.errors import LevelError
 from rack.levels.faults import TendonStep
 from rack.levels.hand.messages import HAND_STATUS, TENSION_COMMAND
@@ -67,7 +67,8 @@ class HandExecutor(Executor):
     @classmethod
     def preload(cls) -> None:
         """Load the compiled functions of the plant."""
-        preload()
+        for module in (substeps, poses):
+            module.preload()
 
     @classmethod
     def misfits(
