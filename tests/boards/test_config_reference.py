@@ -18,9 +18,13 @@ DIMENSIONLESS = {
     *("speed", "small_share", "phase", "damping", "braking", "tolerance"),  # ratios
     *("quaternion", "direction", "x", "z"),
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
+    *("lead", "posture", "reserve"),  # of hands: parts and factors
     "for",  # s, or text with its unit
 }
-WHOLE = ("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit", "wrench", "guard", "speed")
+WHOLE = (
+    *("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit", "posture", "points"),
+    *("wrench", "guard", "speed"),
+)
 """Keys whose tables hold names of the user's own."""
 
 
