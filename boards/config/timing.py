@@ -34,8 +34,8 @@ def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] 
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
         response_goal_ns=None if goal_ms is None else goal_ms * NS_PER_MS,
-        schedule=None if config.schedule is None else frames(config.schedule, config.clock_ns),
         inboxes=inboxes(layout),
+        schedule=None if config.schedule is None else frames(config.schedule, config.clock_ns),
     )
 
 

@@ -127,7 +127,7 @@ class GraspPlanner:
         """Return joint positions, (joints,), rad, at which the tips are at points of the world, (fingers, 3), m."""
         kinematics = self._kinematics
         position = (self._cell.home if start is None else start).copy()
-        wanted = [kinematics.in_palm(point) for point in tips]
+        wanted = [transposed_mat_vec(self._palm, point - self._origin) for point in tips]
         for _ in range(STEPS):
             kinematics.look(position)
             ways = [point - kinematics.tip(finger) for finger, point in enumerate(wanted)]

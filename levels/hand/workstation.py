@@ -138,11 +138,11 @@ class Workstation(HostProgram):
             kind = GraspKind(int(status.kind)).name.lower()
             yield f"step {min(status.step + 1, status.steps)} of {status.steps}: {kind}, plan {status.plan or 'none'}"
             moved = f"moved {1e3 * status.moved:.1f} mm, at most {1e3 * status.farthest:.1f}"
-            yield f"grip {status.grip.max():.1f} N, {moved}"
+            yield f"grip {status.grip:.1f} N, {moved}"
             yield str(status.reason)
         if self._planned is not None:
-            margin = f"{100 * self._planned.margin:.0f} % of their ranges"
-            yield f"planned: grip {self._planned.grip:.1f} N, joints {margin} from their ends"
+            margin = f"joints {100 * self._planned.margin:.0f} % from their ends"
+            yield f"planned: grip {self._planned.grip:.1f} N, {margin}"
         robot = self.context.robot.hand
         for finger, force in zip(robot.finger if robot is not None else (), hand.force, strict=True):
             rows = [self.context.robot.joints.index(joint) for joint in finger.joints]

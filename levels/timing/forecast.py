@@ -17,8 +17,8 @@ from rack.levels.timing.verdicts import EquationVerdict, verdicts
 class Forecast:
     """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction.
 
-    `schedule` is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
     `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it.
+    `schedule` is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
     """
 
     system: Prediction
@@ -27,10 +27,10 @@ class Forecast:
     verdicts: tuple[EquationVerdict, ...]
     responses: tuple[TaskResponse, ...]
     loads: dict[int, float]
+    inboxes: tuple[dict[str, Any], ...]
     tick_ns: int
     schedule: CyclicSchedule | None
     frames: tuple[CoreFrames, ...]
-    inboxes: tuple[dict[str, Any], ...]
     notes: tuple[str, ...]
 
     @classmethod
@@ -43,12 +43,12 @@ class Forecast:
             verdicts=tuple(verdicts(rack)),
             responses=task_responses(rack.tasks, rack.context_switch_ns),
             loads=rack.loads,
-            tick_ns=rack.tick_ns,
-            schedule=rack.schedule,
-            frames=core_frames(rack),
             inboxes=tuple(
                 inbox.document(rack.slice_ticks(name) * rack.clock_ns) for name, inbox in rack.inboxes.items()
             ),
+            tick_ns=rack.tick_ns,
+            schedule=rack.schedule,
+            frames=core_frames(rack),
             notes=tuple(_notes(rack, has_cores)),
         )
 
@@ -66,8 +66,8 @@ class Forecast:
             "verdicts": [verdict.document() for verdict in self.verdicts],
             "responses": [response.document() for response in self.responses],
             "loads": {str(core): load for core, load in self.loads.items()},
-            "schedule": self._schedule(),
             "inboxes": list(self.inboxes),
+            "schedule": self._schedule(),
             "notes": list(self.notes),
             "holds": self.holds,
         }

@@ -186,8 +186,8 @@ class RackTiming:
     context_switch_ns: int
     small_share: float
     response_goal_ns: float | None = None
-    schedule: CyclicSchedule | None = None  # a static one, if the rack has it
     inboxes: Mapping[str, InboxTiming] = field(default_factory=dict)
+    schedule: CyclicSchedule | None = None  # a static one, if the rack has it
 
     @property
     def tick_ns(self) -> int:

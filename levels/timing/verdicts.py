@@ -75,7 +75,8 @@ def verdicts(rack: RackTiming) -> list[EquationVerdict]:
     A response time without a bound is infinite.
     """
     levels = (level_verdicts(rack, level) for level in rack.levels.values())
-    found = chain(system_verdicts(rack), *levels, _of_tasks(rack), _of_cores(rack), _of_frames(rack), _of_inboxes(rack))
+    beyond = _of_tasks(rack), _of_cores(rack), _of_frames(rack), _of_inboxes(rack)
+    found = chain(system_verdicts(rack), *levels, *beyond)
     return sorted(found, key=lambda verdict: ORDER.index(verdict.equation))
 
 

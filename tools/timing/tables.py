@@ -11,8 +11,11 @@ from rack.levels.timing.frames import CoreFrames
 from rack.levels.timing.rack import LevelTiming, spanned
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
-from rack.levels.timing.verdicts import FRAMES, INBOX, LOAD, RESPONSE_TIME, EquationVerdict
+from rack.levels.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
 from rack.tools.console.tables import ms, table
+
+TABLED = {*BEYOND} - {PLAN_WITHIN}
+"""Criteria that have a table of their own."""
 
 
 def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:
@@ -21,8 +24,7 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
     if forecast.levels:
         yield from ("", f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:", "")
         yield from _levels(forecast.levels, width)
-    apart = (RESPONSE_TIME, LOAD, FRAMES, INBOX)
-    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in apart]:
+    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
         yield from _verdicts(paper, width)
     if forecast.responses:
@@ -31,10 +33,10 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
         yield ""
         loads = (f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}" for core, load in forecast.loads.items())
         yield f"load: {', '.join(loads)}"
-    yield from _schedule_lines(forecast, width)
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
         yield from _inboxes(forecast.inboxes, width)
+    yield from _schedule_lines(forecast, width)
     yield from forecast.notes
 
 
