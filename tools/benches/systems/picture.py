@@ -150,10 +150,9 @@ def _bars(axes: Axes, values: Sequence[Value], label: str, digits: int, others: 
     axes.barh(range(len(values)), [value or 0.0 for value in values], 0.6, color=GRID)
     for row, value in enumerate(values):
         if value is not None:
-            # Right of the bar, and of a mark that is beyond it.
-            end = max(value, others[row] or 0.0) if others else value
-            text = f"{value:.{digits}f}"
-            axes.annotate(text, (end, row), (6, 0), textcoords="offset points", va="center", fontsize=7)
+            # In a column: next to a bar it would run into the marks.
+            place = axes.get_yaxis_transform()
+            axes.text(0.99, row, f"{value:.{digits}f}", transform=place, ha="right", va="center", fontsize=7)
     axes.set_xlim(0.0, 1.25 * max((value for value in (*values, *others) if value), default=0.8))
     axes.set_xlabel(label)
 
