@@ -150,6 +150,7 @@ class _System:
             missed=missed_share(counts),
             late=late,
             commanded="" if response is None else next(iter(response["command"]["levels"]), ""),
+            command_bound_ms=None if response is None else response["command"]["bound_ms"],
             command_ms=None if response is None else response["command"]["measured_ms"],
             status_ms=None if response is None else response["status"]["measured_ms"],
             command_age_ms=ages_ms(recording, self._timing, down=True),

@@ -60,12 +60,10 @@ def _answered(found: Systems, width: int | None) -> Iterator[str]:
     rows = []
     for one in found.figures:
         said, ran = one.predicted, one.realtime
-        cycle, bound, total, down, up = (
-            f"{time:g}" if said.levels else "-"
-            for time in (said.longest_cycle_ms, said.bound_ms, said.sum_ms, said.command_ms, said.status_ms)
-        )
+        promised = (said.longest_cycle_ms, said.bound_ms, said.sum_ms, ran.command_bound_ms, said.status_ms)
+        *cycles, down, up = ("-" if time is None or not said.levels else f"{time:g}" for time in promised)
         measured = (down, _span(ran.command_ms), up, _span(ran.status_ms))
-        rows.append([one.rack, cycle, bound, total, *measured, _span(ran.command_age_ms), _span(ran.status_age_ms)])
+        rows.append([one.rack, *cycles, *measured, _span(ran.command_age_ms), _span(ran.status_age_ms)])
     yield from table(head, rows, width, NARROW)
 
 

@@ -19,6 +19,7 @@ RAN = RealTimeFigures(
     missed=0.002,
     late=0.0015,
     commanded="top",
+    command_bound_ms=25.0,
     command_ms=TIMES,
     status_ms=TIMES,
     command_age_ms=TIMES,
@@ -47,7 +48,7 @@ def test_a_rack_has_a_row_in_the_table_of_each_theme() -> None:
     made, answered, stopped, first_plan, host, used, late, killed, moved = _rows(Systems((FOUND,), 1.0, None), "one")
     assert made == ["one", "2", "2", "0", "3", "1", "50", "400", "0.50", "yes"]
     spans = ["22.5/25"] * 2
-    assert answered == ["one", "20", "40", "22.5", "22.5", "22.5/25", "40", "22.5/25", *spans]
+    assert answered == ["one", "20", "40", "22.5", "25", "22.5/25", "40", "22.5/25", *spans]
     assert stopped == ["one", "top", "30.0", "42.5", "top", "0.80", "398", "-"]
     assert first_plan == ["one", "top.planner", "3", "22.5", "25.0", "22.5", "25.0"]
     assert host == ["one", "host", "2", "22.5", "25.0", "-", "-"]
@@ -58,7 +59,7 @@ def test_a_rack_has_a_row_in_the_table_of_each_theme() -> None:
 
 
 def test_what_a_rack_lacks_is_shown_as_such() -> None:
-    still = replace(RAN, commanded="", command_ms=None, hold=None, plans=(), late=None)
+    still = replace(RAN, commanded="", command_bound_ms=None, command_ms=None, hold=None, plans=(), late=None)
     none = replace(FOUND, rack="none", predicted=replace(PROMISED, levels=(), rates_hz=()), realtime=still, poses=None)
     lines = list(Systems((FOUND, none), 1.0, Absent("cyclictest", "no program", "apt-get install rt-tests")).lines())
     assert "one: top > low" in lines
