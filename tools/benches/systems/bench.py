@@ -157,7 +157,7 @@ class _System:
             status_age_ms=ages_ms(recording, self._timing, down=False),
             hold=None if self._hold is None else held(recording, self._hold),
             plans=plan_latencies(recording, cycles),
-            bus=bus_traffic(run, self._layout),
+            bus=bus_traffic(run.tasks, run.outcome.ticks, self._layout),
             loads=core_loads(recording, cycles, self._timing) if cycles else {},
             board_loads=board_loads(recording, cycles, self._timing) if cycles else {},
         )
