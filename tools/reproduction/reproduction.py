@@ -15,11 +15,23 @@ from rack.tools.console.progress import Progress
 from rack.tools.reproduction.experiments.experiment import Experiment, Kept, Workshop, kept, machine, made, program
 from rack.tools.reproduction.html import html
 from rack.tools.reproduction.markdown import markdown
-from rack.tools.reproduction.sections import gantt, timing
+from rack.tools.reproduction.sections import application, comparison, conclusion, gantt, model, opening, time, timing
 from rack.tools.reproduction.sections.page import Page, text
 from rack.tools.reproduction.sections.statement import Chapter
 
-CHAPTERS: tuple[Chapter, ...] = (timing.RESPONSE, timing.LOW, timing.HIGH, gantt.CHAPTER)
+CHAPTERS: tuple[Chapter, ...] = (
+    opening.ABSTRACT,
+    opening.INTRODUCTION,
+    model.CHAPTER,
+    time.CHAPTER,
+    timing.RESPONSE,
+    timing.LOW,
+    timing.HIGH,
+    gantt.CHAPTER,
+    application.CHAPTER,
+    comparison.CHAPTER,
+    conclusion.CHAPTER,
+)
 """The sections of the page, in the paper's order."""
 FILES = ("index.html", "README.md", "paper.json")
 PROJECT = (BackplaneError, BoardError, LevelError, Failure)
