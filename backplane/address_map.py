@@ -15,7 +15,7 @@ LINE = 64
 """Bytes of a cache line: blocks of two writers never share one."""
 
 HEAD_SIZE = PAGE
-BLOCK_WORDS = 24
+BLOCK_WORDS = 32
 BLOCK_SIZE = BLOCK_WORDS * 8
 TRACE_RECORD_SIZE = 88
 ALARM_RECORD_SIZE = 64

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-Sampled = Literal["time-slice", "double-buffer", "lock"]
+Sampled = Literal["time-slice", "double-buffer", "lock", "interrupt"]
 """Protocols whose readers sample the newest message."""
-PROTOCOLS: tuple[Sampled, ...] = ("time-slice", "double-buffer", "lock")
+PROTOCOLS: tuple[Sampled, ...] = ("time-slice", "double-buffer", "lock", "interrupt")
 Protocol = Literal[Sampled, "queue"]
 
-BY_TICKS: tuple[Protocol, ...] = ("time-slice", "queue")
+BY_TICKS: tuple[Protocol, ...] = ("time-slice", "queue", "interrupt")
 """Protocols under which messages become visible at ticks fixed in advance."""
 
 Role = Literal["executor", "planner", "host"]
@@ -58,6 +58,23 @@ class ExchangeSpec:
 
 
 @dataclass(frozen=True)
+class InterruptSpec:
+    """How the messages of a mailbox travel under protocol interrupt. Its times are of the rack's own clock.
+
+    A message is sent `sent_ns` after the release that writes it; it must be there before the tick `due` after that
+    release. It interrupts the boards in `slots`; at each a handler serves it for `service_ns`, and `depth` messages
+    wait at most. It is written in the cycles released `ahead` ticks before the multiples of the mailbox's period.
+    """
+
+    sent_ns: int
+    service_ns: int
+    depth: int
+    due: int
+    ahead: int
+    slots: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
 class FieldSpec:
     """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit, meaning.
 
@@ -84,7 +101,7 @@ class MailboxSpec:
     messages wait, are not among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
     `exchanges` are the readers that do not simply read it in every cycle. `max_age`, ticks: of a mailbox written only
     when there is something new, the age of its information from which readers take the writer for lost; 0: it is
-    written in every period.
+    written in every period. `interrupt`: of protocol interrupt; `delay` is then the time to the earliest visibility.
     """
 
     name: str
@@ -103,6 +120,12 @@ class MailboxSpec:
     phase: int = 0
     exchanges: tuple[ExchangeSpec, ...] = ()
     max_age: int = 0
+    interrupt: InterruptSpec | None = None
+
+    @property
+    def ahead(self) -> int:
+        """How long before a multiple of its period the cycle is released that writes it, ticks."""
+        return self.delay if self.interrupt is None else self.interrupt.ahead
 
     @property
     def is_by_ticks(self) -> bool:
@@ -174,6 +197,20 @@ class Layout:
     def task(self, name: str) -> TaskSpec:
         """Return the task, or the host board, of that name. Raises `KeyError`."""
         return {t.name: t for t in self.processes}[name]
+
+    def due(self, task: TaskSpec) -> int:
+        """Return the ticks from a release of a task until the first of its messages must be there."""
+        sent = [m.interrupt.due for m in self.mailboxes if m.writer == task.name and m.interrupt is not None]
+        return min([task.every, *sent])
+
+    def interrupting(self, slot: int) -> list[MailboxSpec]:
+        """Return the mailboxes whose messages interrupt the board in a slot, by the slot of their sender."""
+        found = [m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots]
+        return sorted(found, key=lambda mailbox: self.task(mailbox.writer).slot)
+
+    def handler(self, slot: int) -> str:
+        """Return the task that serves the interrupts of the board in a slot: its first one. Raises `StopIteration`."""
+        return next(task.name for task in self.tasks if task.slot == slot)
 
     def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
         """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises `KeyError`."""

@@ -21,12 +21,12 @@ import posix_ipc
 from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
 from rack.backplane.byte_lock import is_locked
 from rack.backplane.errors import SegmentError
-from rack.backplane.layout import ExchangeSpec, FieldSpec, Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import ExchangeSpec, FieldSpec, InterruptSpec, Layout, MailboxSpec, TaskSpec
 from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 12
+VERSION = 13
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -270,10 +270,12 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
 
 def mailbox_of(entry: dict[str, Any]) -> MailboxSpec:
     """Return a mailbox from plain data, its `fields` excepted."""
-    # Recordings of earlier versions lack the last two.
+    # Recordings of earlier versions lack `rests_on` and what follows it.
     names = {key: tuple(entry.get(key, ())) for key in ("readers", "rests_on")}
     exchanges = tuple(ExchangeSpec(**exchange) for exchange in entry.get("exchanges", ()))
-    return MailboxSpec(**{**entry, **names, "exchanges": exchanges})
+    how = entry.get("interrupt")
+    interrupt = None if how is None else InterruptSpec(**{**how, "slots": tuple(how["slots"])})
+    return MailboxSpec(**{**entry, **names, "exchanges": exchanges, "interrupt": interrupt})
 
 
 def layout_of(entry: dict[str, Any]) -> Layout:

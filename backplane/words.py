@@ -109,6 +109,9 @@ class Block(IntEnum):
     LOST = 19  # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
     LEVEL_SINCE = 20  # tick of the cycle in which the level entered that state
     AWAITS = 21  # of the network adapter in lockstep: the rack that its cycle awaits; 0: none. See boards.lan.awaited
+    INTERRUPTS = 22  # messages that have interrupted this board and were served, under protocol interrupt
+    INTERRUPTS_LOST = 23  # those lost because too many waited
+    INTERRUPTS_WAITING = 24  # the largest number that has waited
 
 
 class TaskState(IntEnum):

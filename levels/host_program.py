@@ -56,6 +56,10 @@ class Bus(Protocol):
     def sent(self, port: str) -> int:
         """Return the number of messages sent so far, by former processes of this board too."""
 
+    @property
+    def tasks(self) -> list[str]:
+        """Names of the crate's tasks."""
+
     def address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task. Raises `LookupError`."""
 

@@ -11,6 +11,7 @@ from rack.backplane import semaphores
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.mailbox.protocols import LockReader
 from rack.backplane.segment import SHM_FOLDER, Segment, unlink
 from rack.backplane.trace import FIELDS, Flag, TraceWriter
@@ -66,7 +67,9 @@ class ReadingTask:
 
     def __init__(self, segment: Segment) -> None:
         self.every = segment.layout.task("reader").every
-        self.ports = InputPorts(segment, {"point": NAME}, AlarmWriter(segment, "reader"))
+        self.ports = InputPorts(
+            segment, {"point": NAME}, AlarmWriter(segment, "reader"), inbox=open_inbox(segment, "reader")
+        )
         self.seen: list[Seen] = []
 
     def cycle(self, tick: int) -> Reading:

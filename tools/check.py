@@ -13,7 +13,7 @@ from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.config import load, shared_out
 from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
-from rack.boards.config.timing import with_budgets
+from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.rack import spanned
 from rack.tools.console.answer import Failure, print_json
@@ -103,7 +103,8 @@ def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     ran, asked = sorted({task.board for task in recording.layout.tasks}), sorted(config.board)
     if ran != asked:
         raise Failure(f"{run}: a run of other boards: {', '.join(ran)}; '{config.name}' has {', '.join(asked)}", 2)
-    return with_budgets(config, measured_budgets(recording, percentile))
+    ran_as = rack_timing(recording.rack_config, recording.layout)
+    return with_budgets(config, without_interrupts(ran_as, measured_budgets(recording, percentile)))
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:

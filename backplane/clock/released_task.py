@@ -32,8 +32,8 @@ class ReleasedTask:
     `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `is_posted`: it
     waits for its semaphore, which `wake()` posts. `done`: the semaphore that it posts in lockstep. `missed` counts
     releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
-    finishes none. `deadline`: tick before which its release, or plan, must be finished, as last seen; it only moves
-    later. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
+    finishes none. `deadline`: tick before which its release, or plan, must be finished, or its messages are sent,
+    as last seen; it only moves later. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -46,6 +46,7 @@ class ReleasedTask:
         self.is_stopped = False
         self.deadline = self.block[_DEADLINE]
         self._every, self._phase = spec.every, spec.phase
+        self._early = spec.every - segment.layout.due(spec)
         self._done = self.block[_DONE]
         self.wake: Callable[[], None] = wake_semaphore(segment.rack, spec.name).release
         self.done = done_semaphore(segment.rack, spec.name)
@@ -69,7 +70,8 @@ class ReleasedTask:
         else:
             self.missed += 1
         self._done = done
-        block[_DEADLINE] = self.deadline = release + every
+        block[_DEADLINE] = release + every
+        self.deadline = release + every - self._early
         block[_RELEASED] = release
 
     def is_settled(self) -> bool:
@@ -79,7 +81,7 @@ class ReleasedTask:
 
     def is_finished(self, tick: int) -> bool:
         """Say whether `tick` may begin without waiting for the task."""
-        self.deadline = self.block[_DEADLINE]
+        self.deadline = self.block[_DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 
     def check_stopped(self) -> None:

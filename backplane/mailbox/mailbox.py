@@ -109,6 +109,10 @@ class Writer:
         self.intruder = self._slots.publish(tick, visible_at, tick if basis is None else basis)
         return now is None or now < due
 
+    def is_in_time(self, tick: int, now: int | None) -> bool:
+        """Say whether a message released at `tick` and written now comes in time; `now` as in `write`."""
+        return now is None or now < tick + self._delay
+
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick from which a message released at `tick` and written now is visible."""
         in_time = tick + self._delay

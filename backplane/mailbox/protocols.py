@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Protocol
+from rack.backplane.mailbox.interrupt import BoardInbox, InterruptReader, InterruptWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, DoubleBufferWriter, Reader, Reading, Writer
 from rack.backplane.mailbox.queue import QueueReader, QueueWriter
 from rack.backplane.process import GONE, STOPPED, state_of
@@ -130,12 +131,15 @@ WRITERS: dict[Protocol, type[Writer]] = {
     "double-buffer": DoubleBufferWriter,
     "lock": LockWriter,
     "queue": QueueWriter,
+    "interrupt": InterruptWriter,
 }
 READERS: dict[Protocol, type[Reader]] = {
     "time-slice": Reader,
     "double-buffer": DoubleBufferReader,
     "lock": LockReader,
     "queue": QueueReader,
+    # Of a board that its messages do not interrupt: the writer's own, or the host side.
+    "interrupt": Reader,
 }
 OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader, "queue": Reader}
 """Readers that never take a lock, nor a message out of a queue."""
@@ -146,8 +150,13 @@ def open_writer(segment: Segment, name: str) -> Writer:
     return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
 
 
-def open_reader(segment: Segment, name: str, asynchronous: bool = False) -> Reader:
-    """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is whole."""
+def open_reader(segment: Segment, name: str, asynchronous: bool = False, inbox: BoardInbox | None = None) -> Reader:
+    """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is whole.
+
+    `inbox`: that of the reading board, if anything interrupts it.
+    """
+    if inbox is not None and name in inbox.lines:
+        return InterruptReader(segment, name, inbox)
     protocol = segment.layout.mailbox(name).protocol
     return READERS["double-buffer" if asynchronous and protocol == "time-slice" else protocol](segment, name)
 

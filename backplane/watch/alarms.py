@@ -64,6 +64,8 @@ class Alarm(IntEnum):
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]
     CLOCK_LATE = 32  # [-1; lateness, ns]
+    # Raised by boards: what interrupts them.
+    INBOX_FULL = 33  # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
     # Raised by the servo level: the arm.
     SENSOR_RANGE = 40  # [joint; value]  NaN, or beyond the joint's range
     SENSOR_STUCK = 41  # [joint; cycles]  no change while the arm is driven

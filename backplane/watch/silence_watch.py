@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import NOT_YET, Reader
 from rack.backplane.mailbox.slots import pid_of
 from rack.backplane.process import GONE, STOPPED, state_of
@@ -29,10 +30,12 @@ class ReadingTask:
     """The task that reads: the tick `since` which it has read without a pause, and which writers are dead or stopped.
 
     After a pause of this task or of the clock, all messages are old but no writer is silent. `troubles` counts reads
-    that failed or found a bad message. `now` returns the clock's tick; None: no read is ever late.
+    that failed or found a bad message. `now` returns the clock's tick; None: no read is ever late. `inbox` is that of
+    its board, None if nothing interrupts it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, inbox: BoardInbox | None = None) -> None:
+        self.inbox = inbox
         self.now: Callable[[], int | None] = lambda: None
         self.since = 0
         self.troubles = 0
@@ -117,7 +120,7 @@ class SilenceWatch:
         head = slots.box[0]
         # A serial without a message was lost on the way, not suppressed.
         spec = self._reader.spec
-        due = finished - (finished + spec.delay - spec.phase) % spec.every
+        due = finished - (finished + spec.ahead - spec.phase) % spec.every
         return slots.copy(head) and slots.serial == head and slots.tick < due
 
     def _report(self, code: Alarm, tick: int, age: int) -> None:

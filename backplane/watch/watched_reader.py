@@ -43,7 +43,7 @@ def watched(
     if spec.protocol == "queue":
         return WatchedQueue(segment, name, alarms, task, room)
     kind = SporadicReader if spec.writer == CLOCK else WatchedReader
-    return kind(segment, open_reader(segment, name, asynchronous), alarms, task)
+    return kind(segment, open_reader(segment, name, asynchronous, task.inbox), alarms, task)
 
 
 class WatchedReader:

@@ -36,13 +36,16 @@ def exchange_mistakes(config: RackConfig, board: str, inputs: Mapping[str, Input
             yield Mistake(f"{place}.phase", entry.phase, why)
 
 
-def asynchronous_queues(wiring: Wiring) -> Iterator[Mistake]:
-    """Yield a mistake for every queue that an asynchronous port reads."""
+def asynchronous_mistakes(wiring: Wiring) -> Iterator[Mistake]:
+    """Yield a mistake for every mailbox that an asynchronous port reads, and cannot read at once."""
     for ports in wiring.tasks:
         entries = wiring.config.board[ports.place.board].exchange if ports.place.role == "executor" else {}
         for port, mailbox in ports.sources:
-            if port in entries and entries[port].asynchronous and wiring.protocol(mailbox) == "queue":
-                why = f"'{mailbox}' is a queue, and its messages are taken by ticks; permitted: false"
+            why = {
+                "queue": f"'{mailbox}' is a queue, and its messages are taken by ticks; permitted: false",
+                "interrupt": f"the messages of '{mailbox}' interrupt the board as they come already; permitted: false",
+            }.get(wiring.protocol(mailbox))
+            if port in entries and entries[port].asynchronous and why is not None:
                 yield Mistake(f"board.{ports.place.board}.exchange.{port}.asynchronous", True, why)
 
 
@@ -52,7 +55,7 @@ def strict_mistakes(config: RackConfig) -> Iterator[Mistake]:
         return
     why = "makes a run depend on timing, refused by protocol.strict = true; permitted"
     if config.protocol.default not in BY_TICKS:
-        yield Mistake("protocol.default", config.protocol.default, f"{why}: time-slice")
+        yield Mistake("protocol.default", config.protocol.default, f"{why}: time-slice, interrupt")
     for mailbox, protocol in config.protocol.mailbox.items():
         if protocol not in BY_TICKS:
             yield Mistake(f"protocol.mailbox.{mailbox}", protocol, f"{why}: {', '.join(BY_TICKS)}")

@@ -18,12 +18,14 @@ from rack.backplane.mailbox.host_ring import SPARE
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
-from rack.boards.config.exchange import asynchronous_queues, exchanges, strict_mistakes
+from rack.boards.config.exchange import asynchronous_mistakes, exchanges, strict_mistakes
+from rack.boards.config.interrupts import interrupt_mistakes, is_exempt, with_interrupts
 from rack.boards.config.lan import entry_mistakes, is_taken
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports, table_of
+from rack.boards.config.protocols import UNREAD
 from rack.boards.config.queues import queue_mistakes, queue_slots
-from rack.boards.config.schema import LAN, UNREAD, RackConfig, TaskPlace
+from rack.boards.config.schema import LAN, RackConfig, TaskPlace
 from rack.boards.config.sides import Sides, key_of
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
@@ -31,6 +33,12 @@ from rack.levels.operator import OPERATOR_COMMAND
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox; commands are rare."""
+NOT_OPERATED = {
+    "lock": "the clock writes it and must not wait",
+    "queue": "it keeps every command already",
+    "interrupt": "the clock writes it, not a board",
+}
+"""Protocols that an operator's mailbox cannot have, and why."""
 MAX_SEGMENT_BYTES = 2**30
 KEPT_S = 2.0
 """Simulated time that mailboxes and trace rings retain for a recorder, which real-time boards may starve for 1 s."""
@@ -87,7 +95,7 @@ class Wiring:
         self.mistakes += entry_mistakes(self, has_clock="clock" not in broken)
         crossing = list(self.sides.mistakes(self._unknown))
         self.mistakes += crossing or queue_mistakes(self)
-        self.mistakes += asynchronous_queues(self)
+        self.mistakes += [*asynchronous_mistakes(self), *interrupt_mistakes(self)]
         self._check_params()
         if not broken & {"robot", "scene", "task"}:
             self._check_programs()
@@ -109,8 +117,7 @@ class Wiring:
                     Mistake(f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox")
                 )
             given = self.config.protocol.mailbox.get(mailbox)
-            if given in ("lock", "queue"):
-                why = "the clock writes it and must not wait" if given == "lock" else "it keeps every command already"
+            if why := NOT_OPERATED.get(given or ""):
                 why += "; permitted: time-slice, double-buffer"
                 self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", given, why))
 
@@ -202,6 +209,8 @@ class Wiring:
             spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, rests_on=rests_on)
             max_age = round(output.max_age_s * 1e9 / self.config.clock_ns)
             box = self._mailbox(name, output.type, sizes, partial(spec, phase=writer.phase, max_age=max_age))
+            if box.protocol == "interrupt":
+                box = with_interrupts(self.config, box, by_name, self._kept_ticks)
             mailboxes += self._queue(box, readers[0], writer) if box.protocol == "queue" else [box]
         # The clock passes an operator's commands on.
         operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
@@ -286,6 +295,8 @@ class Wiring:
         if mailbox in self.sides.from_host or (mailbox in self.writers and self.writers[mailbox][1].queued):
             return "queue"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
+        if protocol == "interrupt" and is_exempt(self, mailbox):
+            return "time-slice"
         # A lock would make the clock wait for readers.
         return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
 

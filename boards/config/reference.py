@@ -19,7 +19,7 @@ from rack.boards.errors import ConfigError, Mistake, shown
 from rack.boards.faults.kind import KINDS
 
 UNIT = re.compile(
-    r", ((?:kg m2|N s/m|N/m|N m|N|rad/s[23]?|rad|m/s|m|ms|s|Hz|ticks|cycles)(?: or (?:rad|N m))?)(?=$|[;:,])"
+    r", ((?:kg m2|N s/m|N/m|N m|N|rad/s[23]?|rad|m/s|m|ms|us|s|Hz|ticks|cycles)(?: or (?:rad|N m))?)(?=$|[;:,])"
 )
 """The unit in a description: between a comma and the end, or further punctuation."""
 REQUIRED = "required"

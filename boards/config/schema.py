@@ -14,8 +14,9 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from rack.backplane.clock.system_clock import ticks_of
-from rack.backplane.layout import Protocol, Role, Sampled, Wake
+from rack.backplane.layout import Role, Wake
 from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
+from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
@@ -42,7 +43,6 @@ def _listed(value: Any) -> Any:
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
-MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Neighbours = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_listed)]
 Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
@@ -53,8 +53,6 @@ Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
-UNREAD, MOST_UNREAD = 32, 4096
-"""Default and greatest depth of a queue, messages."""
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
@@ -149,19 +147,6 @@ class ExchangeConfig(Table):
     phase: int = Field(0, ge=0, description="number, less than every, of the first cycle that reads it, cycles")
     asynchronous: bool = Field(
         False, description="read the newest message as soon as it is written; in real time, runs then differ"
-    )
-
-
-class ProtocolConfig(Table):
-    """`[protocol]`: how mailboxes are shared."""
-
-    default: Sampled = Field("time-slice", description="protocol of every mailbox not listed under mailbox")
-    mailbox: dict[MailboxName, Protocol] = Field(
-        {}, description="protocol by mailbox; queue: its one reader gets every message, in order"
-    )
-    strict: bool = Field(False, description="refuse whatever makes a run depend on timing")
-    depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
-        {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
     )
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
+from rack.backplane.mailbox.inbox import InterruptSource
+from rack.backplane.mailbox.interrupt import how_sent
 from rack.boards.config.mistakes import PLANNER_BUDGET
 from rack.boards.config.schedule import frames
 from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
+from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.rack import BoardTiming, RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
@@ -31,8 +34,36 @@ def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] 
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
         response_goal_ns=None if goal_ms is None else goal_ms * NS_PER_MS,
+        inboxes=inboxes(layout),
         schedule=None if config.schedule is None else frames(config.schedule, config.clock_ns),
     )
+
+
+def inboxes(layout: Layout) -> dict[str, InboxTiming]:
+    """Return the inbox of every board that messages interrupt, by the task that serves it."""
+    found = {}
+    for slot in dict.fromkeys(task.slot for task in layout.tasks):
+        if boxes := layout.interrupting(slot):
+            name, names = layout.handler(slot), tuple(box.name for box in boxes)
+            how = [how_sent(box) for box in boxes]
+            times = zip(boxes, how, strict=True)
+            sources = [InterruptSource(box.every * layout.clock_ns, sent.service_ns) for box, sent in times]
+            found[name] = InboxTiming(name, names, tuple(sources), how[0].depth)
+    return found
+
+
+def without_interrupts(timing: RackTiming, found: Mapping[str, Budget]) -> dict[str, Budget]:
+    """Return budgets measured in a run, by board, without what interrupts took; in lockstep they take nothing."""
+    if timing.is_lockstep:
+        return dict(found)
+    return {
+        name: replace(
+            budget,
+            read_ns=max(0, budget.read_ns - timing.interrupted_ns(name)),
+            plan_ns=max(0, budget.plan_ns - timing.interrupted_ns(f"{name}.planner")),
+        )
+        for name, budget in found.items()
+    }
 
 
 def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None) -> BoardTiming:

@@ -40,6 +40,7 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.PEER_RESTARTED: "recovery",
     Alarm.LATCHED: "reaction",
     Alarm.QUEUE_FULL: "held",
+    Alarm.INBOX_FULL: "held",
     Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
 }
@@ -59,6 +60,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.BABBLE: ("mailbox", "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1"),
     Alarm.MASQUERADE: ("mailbox", "'{subject}': a message comes from process {value:.0f}, which is not its writer"),
     Alarm.QUEUE_FULL: ("mailbox", "'{subject}' is full: {messages} of '{writer}' refused"),
+    Alarm.INBOX_FULL: ("mailbox", "inbox is full: {messages} in '{subject}' lost"),
     Alarm.LOCKED: ("mailbox", "'{subject}': a dead or stopped process holds the lock"),
     Alarm.CLOCK_STOPPED: ("nothing", "clock stopped: no tick for {span}"),
     Alarm.CLOCK_SKIPPED: ("nothing", "clock skipped {ticks}"),

@@ -208,12 +208,12 @@ class FaultyWriter:
         on ticks alone, even with faults.
         """
         self.flush(tick, now)
-        spec, self._written = self._writer.spec, True
+        self._written = True
         visible_at = self._writer.visible_at(tick, now)
         for _ in self._writer.outgoing():
             self._first(Outgoing(tick, tick, visible_at, tick if basis is None else basis))
         self._show()
-        return self._written and (now is None or now < tick + spec.delay)
+        return self._written and self._writer.is_in_time(tick, now)
 
     def flush(self, tick: int, now: int | None = None) -> None:
         """Publish the delayed messages that are due."""

@@ -89,6 +89,11 @@ class HostBus:
         """Return the number of messages sent so far, by former processes of this board too."""
         return _of(self._writers, port).serial
 
+    @property
+    def tasks(self) -> list[str]:
+        """Names of the crate's tasks."""
+        return [task.name for task in self._segment.layout.tasks]
+
     def address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task. Raises `LookupError`."""
         places = self._segment.map

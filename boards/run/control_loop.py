@@ -17,6 +17,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE, ExchangeRecord
+from rack.boards.run.interrupts import interrupted
 from rack.boards.run.task import ClockGuard, Task, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
@@ -43,9 +44,10 @@ class VirtualControlLoop(Task):
         self.executor = executor
         self._guard = ClockGuard(segment, self.alarms, self.spec.every) if wiring.guards_clock else None
         self._has_cycled = False
+        self._due = segment.layout.due(self.spec)
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
-        self.read_command_and_status = slowed(self._read(wiring), times.read_ns)
+        self.read_command_and_status = interrupted(slowed(self._read(wiring), times.read_ns), self.interrupts)
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
 
     def _read(self, wiring: TaskWiring) -> Callable[[int], None]:
@@ -70,7 +72,7 @@ class VirtualControlLoop(Task):
 
     def cycle(self, tick: int) -> None:
         """Do the cycle released at `tick`."""
-        watch, deadline = self.stopwatch, tick + self.spec.every
+        watch, deadline = self.stopwatch, tick + self._due
         watch.start(tick, self.next_cycle.skipped)
         if watch.is_late:
             self._handle_delay(tick)
@@ -126,6 +128,7 @@ class PlannerLoop(Task):
         super().__init__(segment, wiring, planner, attention)
         self.planner = planner
         self.slice = self.spec.every * self.spec.within_cycles
+        self.read = interrupted(self.inputs.read, self.interrupts)
         self.write_plan = slowed(self.outputs.write, wiring.transfer.update_ns)
         self._critical_priority = wiring.critical_priority
         self._priority = self.block[Block.PRIORITY]
@@ -141,7 +144,7 @@ class PlannerLoop(Task):
         """Plan in the cycle released at `tick`, if a plan is wanted."""
         watch = self.stopwatch
         watch.start(tick, self.next_cycle.skipped)
-        self.inputs.read(tick)
+        self.read(tick)
         watch.read_ns = monotonic_ns()
         if not self.planner.wanted(self.inputs.values, tick):
             self._pass(tick)

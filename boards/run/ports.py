@@ -7,6 +7,7 @@ from functools import partial
 
 from rack.backplane.fault_table import Entry, FaultEntry
 from rack.backplane.layout import ExchangeSpec
+from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.queue import ALL, QueueWriter, taken_name
@@ -45,13 +46,14 @@ class InputPorts:
         *,
         room: Callable[[str], int] = all_of,
         exchange: Mapping[str, ExchangeSpec] | None = None,
+        inbox: BoardInbox | None = None,
     ) -> None:
         """Read `sources` by port, from a queue as many messages as there is `room` for on its port.
 
         `plan` is the mailbox that holds the task's own plan, `exchange` the ports that are not simply read in every
-        cycle.
+        cycle, `inbox` that of the task's board.
         """
-        self.task = ReadingTask()
+        self.task = ReadingTask(inbox)
         self.taken: list[Taken] = []
         self.values = Ports()
         self.readers: dict[str, Reader] = {}
@@ -189,7 +191,7 @@ class OutputPorts:
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [
-            (port, w, self._write_of(port), self._rests_on[port], w.spec.delay - w.spec.phase, w.spec.every)
+            (port, w, self._write_of(port), self._rests_on[port], w.spec.ahead - w.spec.phase, w.spec.every)
             for port, w in self.writers.items()
         ]
 

@@ -9,11 +9,13 @@ from typing import ParamSpec, TypeVar
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.clock.wake import NextCycle
+from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.process import compute_until
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.faults.tasks import TaskFaults
+from rack.boards.run.interrupts import InterruptHandler
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring
@@ -41,6 +43,8 @@ class Task(ABC):
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
         self.next_cycle = NextCycle(segment, wiring.task, self.alarms if wiring.guards_clock else None)
+        inbox = open_inbox(segment, wiring.task)
+        self.interrupts = InterruptHandler.of(segment, wiring.task, inbox, self.alarms)
         self.inputs = InputPorts(
             segment,
             wiring.inputs,
@@ -48,6 +52,7 @@ class Task(ABC):
             f"{spec.board}.plan",
             room=level.room,
             exchange=wiring.exchange,
+            inbox=inbox,
         )
         self.inputs.task.now = self.clock.now
         self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs, wiring.sent)

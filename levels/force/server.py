@@ -89,7 +89,9 @@ class ForceServer(TrajectoryExecutor):
 
     def _follow_boards(self, read: Ports) -> None:
         super()._follow_boards(read)
-        self._sensed = next(iter(read.boards.values())).value.position
+        for below in read.boards.values():
+            if below.is_there:
+                self._sensed = below.value.position
         self._feel(read.force)
         self._miss_client()
 

@@ -1,9 +1,11 @@
 """The law of the fingertips: joint targets from what is wanted of the fingers, each in one of three modes.
 
 JOINTS: the targets are those given. POINT: inverse kinematics, a few damped steps a cycle from the targets before.
-FORCE: torque = J^T (force + k (point - tip)), a spring of stiffness k about a point that is the same in all directions
-(Salisbury, "Active stiffness control of a manipulator in Cartesian coordinates", 1980); the joint loop damps it, and a
-small part of its stiffness keeps the posture, of which a tip of three coordinates leaves one joint undetermined.
+FORCE: torque = J^T force + J^T k J (joints at the point - joints), a spring of stiffness k about a point, the same in
+all directions (Salisbury, "Active stiffness control of a manipulator in Cartesian coordinates", 1980). The stiffness by
+joints, J^T k J, goes to the joint loop: closed at its rate the spring is stable at a stiffness at which, closed at the
+rate of this loop, it is not. The joint loop also damps it, and a small part of its own stiffness keeps the posture: the
+tip leaves one joint of a finger undetermined.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, transposed_mat_vec
+from rack.levels.algebra import Array, gram, transposed_mat_vec
 from rack.levels.hand.kinematics import FingerKinematics
 from rack.levels.hand.messages import FingerMode
 from rack.levels.tables import NotNegative, Table
@@ -51,10 +53,6 @@ class FingertipLaw:
         """Begin with targets, and a posture, at `position`, (joints,), rad."""
         self.wanted[:] = self._rest[:] = position
 
-    def yield_to(self, position: Array) -> None:
-        """Let the targets be where the joints are, at `position`, (joints,), rad: these do not follow."""
-        self.wanted[:] = position
-
     def sense(self, position: Array) -> Array:
         """Take the joint positions sensed, (joints,), rad; return the tips, (fingers, 3), m, of this law's fingers."""
         self.kinematics.look(position)
@@ -68,14 +66,14 @@ class FingertipLaw:
         points = grasp.tip + ahead_s * grasp.tip_velocity
         for finger in self._fingers:
             own, mode = self.kinematics.joints[finger], grasp.mode[finger]
-            out.stiff[own], out.torque[own] = 1.0, 0.0
+            out.stiff[own], out.torque[own], out.spring[own] = 1.0, 0.0, 0.0
             if mode == FingerMode.JOINTS:
                 self.wanted[own] = grasp.position[own] + ahead_s * grasp.velocity[own]
                 self._rest[own] = self.wanted[own]
             elif mode == FingerMode.FORCE:
-                way = points[finger] - self._tips[finger]
-                force = grasp.force[finger] + grasp.stiffness[finger] * way
-                out.torque[own] = transposed_mat_vec(self.kinematics.jacobian(finger), force)
+                jacobian = self.kinematics.jacobian(finger)
+                out.torque[own] = transposed_mat_vec(jacobian, grasp.force[finger])
+                out.spring[np.ix_(own, own)] = grasp.stiffness[finger] * gram(jacobian)
                 out.stiff[own] = self._posture
         self._reach([finger for finger in self._fingers if grasp.mode[finger] != FingerMode.JOINTS], points)
         moved = np.minimum(np.maximum(self.wanted - before, -self._most), self._most)

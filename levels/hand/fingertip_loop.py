@@ -24,8 +24,7 @@ class FingertipParams(FingertipGains):
 class FingertipLoop(HandLoop):
     """Turns postures, points and forces of fingers into targets of joints. See `FingertipLaw`.
 
-    While the hand is stopped the targets follow the joints, and afterwards return at no more than the joints' speed. A
-    restarted board continues from the targets that it gave last.
+    A restarted board continues from the targets that it gave last.
     """
 
     inputs = {
@@ -59,8 +58,6 @@ class FingertipLoop(HandLoop):
 def follow_grasp(loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int) -> None:
     """Fill a `FINGER_TARGET` for the `GRASP_TARGET` that a loop follows, and the `FINGER_STATUS`."""
     status.tip = law.sense(hand.position)
-    if loop.stopped:
-        law.yield_to(hand.position)
     target.active = loop.command.active
     if loop.command.active:
         law.targets(loop.command, loop.ahead_s(tick), target)

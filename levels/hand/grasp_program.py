@@ -25,14 +25,18 @@ class PreshapeStep(Table):
 
 
 class CloseStep(Table):
-    """Move the tips evenly towards points in an object until each touches it; a tip that arrives there has missed."""
+    """Move the tips evenly towards points in an object until each touches it; a tip that arrives there has missed.
+
+    Without points, they and the fingers are those of a plan from the level above.
+    """
 
     do: Literal["close"] = Field("close", description="the kind of step")
     object: str = Field(description="object of the scene")
     points: Mapping[str, Point] = Field(
-        description="where the tips would go if nothing were in the way, in the object's frame, m, by finger"
+        {}, description="where the tips would go if nothing were in the way, in the object's frame, m, by finger"
     )
-    speed: Positive = Field(0.04, le=1.0, description="of the tip with the longest way, m/s")
+    depth: Positive = Field(0.01, le=0.2, description="distance of such a point from a planned contact, inwards, m")
+    speed: Positive = Field(0.03, le=1.0, description="of the tip with the longest way, m/s")
     touch: Positive = Field(0.3, description="force at which a tip touches the object, N")
     seconds: Positive = Field(3.0, description="time by which all must touch it, s")
 
@@ -41,7 +45,7 @@ class SqueezeStep(Table):
     """Raise the internal forces of the grasp."""
 
     do: Literal["squeeze"] = Field("squeeze", description="the kind of step")
-    grip: Positive = Field(description="force of each finger but the opposed one, which bears their sum, N")
+    grip: Positive = Field(description="force of the finger that opposes the others, which share it, N")
     seconds: Positive = Field(0.5, description="time in which they rise, s")
 
 
@@ -76,7 +80,7 @@ GRIPPING = (SqueezeStep, ShiftStep, HoldStep, ReleaseStep)
 class GraspProgram(Program):
     """Postures and steps."""
 
-    opposed: str = Field("thumb", description="the finger that opposes all others")
+    opposing: str = Field("thumb", description="the finger that opposes all others")
     posture: Mapping[str, Posture] = Field({}, description="joint positions of every finger, rad, by posture")
     step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field(
         (), max_length=MAX_STEPS, description="steps, done in their order"
@@ -88,8 +92,8 @@ class GraspProgram(Program):
             return
         hand = robot.hand
         names = [finger.name for finger in hand.finger]
-        if self.opposed not in names:
-            yield "opposed", self.opposed, f"the hand has no such finger; fingers: {', '.join(names)}"
+        if self.opposing not in names:
+            yield "opposing", self.opposing, f"the hand has no such finger; fingers: {', '.join(names)}"
         for name, posture in self.posture.items():
             yield from _misfits_of_posture(f"posture.{name}", posture, hand)
         gripped = False
@@ -97,7 +101,7 @@ class GraspProgram(Program):
             if isinstance(step, PreshapeStep) and step.posture not in self.posture:
                 yield f"step[{k}].posture", step.posture, f"no such posture; postures: {_listed(self.posture)}"
             if isinstance(step, CloseStep):
-                yield from _misfits_of_close(f"step[{k}]", step, self.opposed, names, scene)
+                yield from _misfits_of_close(f"step[{k}]", step, self.opposing, names, scene)
             if isinstance(step, GRIPPING) and not gripped:
                 yield f"step[{k}].do", step.do, "it needs an object in the fingers: a 'close' must come before it"
             if gripped and isinstance(step, (PreshapeStep, CloseStep)):
@@ -117,15 +121,15 @@ def _misfits_of_posture(key: str, posture: Posture, hand: HandConfig) -> Iterato
 
 
 def _misfits_of_close(
-    key: str, step: CloseStep, opposed: str, names: list[str], scene: SceneConfig
+    key: str, step: CloseStep, opposing: str, names: list[str], scene: SceneConfig
 ) -> Iterator[tuple[str, Any, str]]:
     if step.object not in scene.objects:
         yield f"{key}.object", step.object, f"not in the scene; objects: {_listed(scene.objects)}"
     for name in step.points:
         if name not in names:
             yield f"{key}.points.{name}", name, f"the hand has no such finger; fingers: {', '.join(names)}"
-    if opposed not in step.points or len(step.points) < 2:
-        yield f"{key}.points", list(step.points), f"it needs the opposed finger, '{opposed}', and another one"
+    if step.points and (opposing not in step.points or len(step.points) < 2):
+        yield f"{key}.points", list(step.points), f"it needs the opposing finger, '{opposing}', and another one"
 
 
 def _listed(names: Any) -> str:

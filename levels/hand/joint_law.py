@@ -1,11 +1,12 @@
 """The law of the joints: torques that make every joint's error that of a damped oscillator, as stiff as is wanted.
 
-torque = M(q) (2 d w (qd_wanted - qd) + s w^2 (q_wanted - q)) + weight(q) + friction(qd_wanted) + torque of tip forces
+torque = M(q) (2 d w (qd_wanted - qd) + s w^2 e) + S e + torque of tip forces + weight(q) + friction(qd_wanted)
 
-`s`, 0 to 1 a joint, is the part of the stiffness that acts; the damping always acts, so a finger that only exerts a
-force is still slow. The weight of a finger is small, but at a joint that is soft it would cost degrees. Viscous
-friction is fed forward for the velocity wanted, not for the one sensed: what damps is not cancelled. The sample is
-taken on to when the torque acts, a valve's lag included, at the velocity sensed.
+e = q_wanted - q. `s`, 0 to 1 a joint, is the part of the stiffness that acts; S is that of tips which are springs. The
+damping always acts, so a finger that only exerts a force is still slow. The weight of a finger is small, but at a joint
+that is soft it would cost degrees. Viscous friction is fed forward for the velocity wanted, not for the one sensed:
+what damps is not cancelled. The sample is taken on to when the torque acts, a valve's lag included, at the velocity
+sensed.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ class JointLaw:
         self._ahead = gains.ahead
         self._state: Array = np.zeros(0)  # numbers of a status of the hand, and of a target
         self._wanted: Array = np.zeros(0)
+        self._spring: Array = np.zeros(0)
         self._set = set_joint_torques.load()
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
@@ -53,13 +55,14 @@ class JointLaw:
         """Read the `HAND_STATUS` and the `FINGER_TARGET` from these messages from now on."""
         self._state = numbers(hand, "position", "velocity").reshape(2, -1)
         self._wanted = numbers(target, "position", "torque").reshape(4, -1)
+        self._spring = target.spring
 
     def torques(self, age_s: float, ahead_s: float, out: Array) -> None:
         """Set `out`, (joints,), N m, for when the sample is `age_s` old; the target is taken on by `ahead_s`."""
         terms = self._dynamics.terms(self._state[0], self._still)
         times = age_s + self._ahead, ahead_s
-        state, wanted = self._state, self._wanted
-        if self._set(self._gains, times, self._constants, state, wanted, terms.inertia, terms.bias, out):
+        given = self._state, self._wanted, self._spring
+        if self._set(self._gains, times, self._constants, *given, terms.inertia, terms.bias, out):
             self.clipped += 1
 
 
@@ -70,6 +73,7 @@ def set_joint_torques(
     constants: Array,  # (4, joints): rows as below
     state: Array,  # (2, joints): rad, rad/s
     wanted: Array,  # (4, joints): rad, rad/s, part of the stiffness, N m
+    spring: Array,  # (joints, joints), N m/rad
     inertia: Array,  # (joints, joints), kg m2
     weight: Array,  # (joints,), N m
     torque: Array,  # (joints,), N m: set; 0 for joints of other boards
@@ -89,7 +93,7 @@ def set_joint_torques(
         acceleration = gains[0] * wanted[2, k] * away + gains[1] * (wanted[1, k] - state[1, k])
         for j in range(joints):
             if driven[j] != 0.0:
-                torque[j] += inertia[j, k] * acceleration
+                torque[j] += inertia[j, k] * acceleration + spring[j, k] * away
     for j in range(joints):
         if driven[j] != 0.0:
             needed = torque[j]
@@ -101,4 +105,4 @@ def set_joint_torques(
 def preload() -> None:
     """Load this module's compiled function."""
     joint, table = np.zeros(1), np.zeros((4, 1))
-    set_joint_torques.load()((0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], joint, joint)
+    set_joint_torques.load()((0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], table[:1], joint, joint)

@@ -33,7 +33,7 @@ class JointLoop(HandLoop):
     }
     outputs = {"command": TENDON_TORQUE, "status": LOOP_STATUS}
     params = JointParams
-    numbers = ("position", "velocity", "stiff", "torque")
+    numbers = ("position", "velocity", "stiff", "torque", "spring")
     velocities = ("velocity",)
 
     def __init__(self, context: LevelContext) -> None:

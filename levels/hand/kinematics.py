@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from rack.levels.algebra import Array, mat_vec, solve, transposed_mat_vec
+from rack.levels.planning.pose import site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
 
@@ -31,7 +32,7 @@ class FingerKinematics:
         self._low, self._high = self.limits.position[:, 0] + MARGIN_RAD, self.limits.position[:, 1] - MARGIN_RAD
         self._whole = np.zeros((3, cell.model.nv))
         mujoco.mj_kinematics(cell.model, d)
-        self._origin = d.site_xpos[cell.tool].copy()  # (3,), m: of the palm, in the world
+        self.palm = site_pose(d, cell.tool)  # in the world
         self._turned = d.site_xmat[cell.tool].reshape(3, 3).copy()  # from the palm's frame into the world's
 
     def look(self, position: Array) -> None:
@@ -42,7 +43,7 @@ class FingerKinematics:
 
     def tip(self, finger: int) -> Array:
         """Return the tip of a finger, (3,), m."""
-        return self.in_palm(self._data.site_xpos[self._tips[finger]])
+        return transposed_mat_vec(self._turned, self._data.site_xpos[self._tips[finger]] - self.palm.position)
 
     def jacobian(self, finger: int) -> Array:
         """Return the Jacobian of the tip of a finger by its own joints, (3, joints of the finger), m/rad."""
@@ -51,10 +52,6 @@ class FingerKinematics:
         rotated = np.empty_like(own)
         mujoco.mju_mulMatTMat(rotated, self._turned, own)
         return rotated
-
-    def in_palm(self, point: Array) -> Array:
-        """Return a point of the world, (3,), m, in the frame of the palm."""
-        return transposed_mat_vec(self._turned, point - self._origin)
 
     def step(self, finger: int, position: Array, way: Array, homing: Array) -> None:
         """Move the joints of a finger in `position`, (joints,), rad, so that its tip goes `way`, (3,), m: one step.

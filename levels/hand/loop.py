@@ -44,7 +44,6 @@ class HandLoop(Executor):
         self.orders = Orders(self.commands)
         self.command = Message(self.inputs["command"].type.dtype(context.sizes))  # that is followed
         self.commanded = False  # there was one
-        self.stopped = False  # the hand does not follow it
         self.driven: NDArray[np.bool_]  # (joints,) or (fingers,), as in the status: those of this board
         self._above, self._period = ", ".join(context.above), max(pace.every for pace in context.above.values())
         slowest = max(context.every, *(pace.every for pace in context.below.values()))
@@ -87,7 +86,6 @@ class HandLoop(Executor):
             self.meet(read, hand.value)
         self._take(read.command, tick)
         kept = self._kept(read, tick)
-        self.stopped = bool(kept)
         self.follow(hand.value, write, tick)
         write.command.id += 1
         write.command.operator = self.orders.rests_on(self.command.operator)
@@ -114,7 +112,7 @@ class HandLoop(Executor):
 
     def _wait(self, status: Message) -> None:
         status.driven, status.sensed, status.holding, status.stopped = self.driven, -1, True, True
-        status.state, status.reason = State.HOLDING, NO_HAND_YET
+        status.reason = NO_HAND_YET
 
     def _kept(self, read: Ports, tick: int) -> str:
         """Return why the hand does not follow the level above; empty: it does."""
@@ -138,7 +136,7 @@ class HandLoop(Executor):
         note = kept or self._rejected
         if lost and not note:
             note = f"no command from '{self._above}': its last one is kept"
-        shown = self.stopped, lost or not self.commanded, note, hand.error
+        shown = bool(kept), lost or not self.commanded, note, hand.error
         if shown == self._shown:
             return
         self._shown = shown
@@ -146,7 +144,7 @@ class HandLoop(Executor):
         status.stopped, status.holding, status.reason, status.error = shown
         if hand.error:
             status.state = State.ERROR
-        elif note:
+        elif note and self.commanded:
             status.state = State.HOLDING
         else:
             status.state = State.EXECUTING if self.commanded else State.IDLE

@@ -86,7 +86,8 @@ FINGER_TARGET = command(
     Field("position", "f8", "rad", "joint positions", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
     Field("stiff", "f8", "1", "part of the joint loop's stiffness that acts, 0 to 1; its damping acts", ("joints",)),
-    Field("torque", "f8", "N m", "in addition to that of the joint loop: for tip forces", ("joints",)),
+    Field("torque", "f8", "N m", "in addition: of the forces of tips", ("joints",)),
+    Field("spring", "f8", "N m/rad", "in addition: stiffness of tips, by joint and joint", ("joints", "joints")),
 )
 """From the fingertip loop to the joint loop."""
 
@@ -142,10 +143,11 @@ GRASP_STATUS = status(
     Field("passed", "f8", "s", "time for which that step is under way"),
     Field("object", "i2", "1", "row of the object grasped, in the world model; -1: none"),
     Field("touching", "u1", "1", "1: the finger touches the object", ("fingers",)),
-    Field("grip", "f8", "N", "internal force of each finger but the opposing one, which bears their sum"),
+    Field("grip", "f8", "N", "internal force of the finger that opposes the others; they share it"),
     Field("load", "f8", "N", "that the grasp makes up for: weight and pull", (3,)),
     Field("anchor", "f8", "m", "where the object is to be", (3,)),
     Field("moved", "f8", "m", "distance of the object from there"),
     Field("farthest", "f8", "m", "largest such distance since the object was gripped"),
+    Field("plan", "u4", "1", "id of the grasp plan in use; 0: none"),
 )
-"""From the grasp loop."""
+"""From the grasp loop. Points and forces are in the frame of the palm."""

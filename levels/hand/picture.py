@@ -15,11 +15,11 @@ import numpy as np
 from rack.levels.algebra import Array, mat_vec
 from rack.levels.robot.cell import Cell
 
-VIEWS = (("front", 0, 2), ("above", 0, 1))
-"""Name, axis to the right, axis up."""
+VIEWS = (("from the front", 0, 2), ("from above", 0, 1))
+"""Title, axis to the right, axis up."""
 SIDE, GAP, LINE = 420, 16, 17
 """Pixels: sides of a view, between views, from line to line of text."""
-REACH_M = 0.14
+REACH_M = 0.16
 """Half of a view's side."""
 NEWTONS_A_VIEW = 40.0
 """Force whose arrow is as long as half of a view's side."""
@@ -50,12 +50,14 @@ class HandPicture:
         self._cell, self._hand, self._data = cell, cell.hand, cell.start()
         model, own = cell.model, set(cell.gripper_geoms.tolist())
         self._palm = model.site_bodyid[cell.tool]
-        self._centre = self._data.site_xpos[cell.tool].copy()
+        shown = self._data.site_xpos[[cell.tool, *self._hand.tips]]
+        self._centre = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
         bodies = cell.bodies
         self._objects = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in bodies]
         fixed = [geom for geom in range(model.ngeom) if geom not in self._objects and self._is_solid(geom)]
         self._palms = [geom for geom in fixed if geom in own and model.geom_bodyid[geom] == self._palm]
         self._rest = [geom for geom in fixed if geom not in own]
+        self._local = {geom: local_points(model, geom) for geom in (*self._rest, *self._palms, *self._objects)}
         joints = np.array([self._joint(address) for address in cell.qpos])
         self._chains = [joints[row] for row in self._hand.fingers]
 
@@ -69,12 +71,7 @@ class HandPicture:
             parts.append(f'<svg x="{GAP + number * (SIDE + GAP)}" y="{GAP}" width="{SIDE}" height="{SIDE}">')
             parts.append(f'<rect width="{SIDE}" height="{SIDE}" fill="#f6f7f9" stroke="{REST}"/>')
             parts += self._view(scene, (right, up))
-            parts += [
-                f'<text x="8" y="18" font-size="13" fill="{HAND}">from {name}</text>'.replace(
-                    "from front", "from the front"
-                ),
-                "</svg>",
-            ]
+            parts += [f'<text x="8" y="18" font-size="13" fill="{HAND}">{name}</text>', "</svg>"]
         left = GAP + len(VIEWS) * (SIDE + GAP)
         for row, line in enumerate(text):
             parts.append(f'<text x="{left}" y="{GAP + LINE * (row + 1)}" font-size="13">{escape(line)}</text>')
@@ -136,21 +133,21 @@ class HandPicture:
 
     def _surface(self, geom: int) -> Array:
         """Return points, (n, 3), m, whose hull is that of a geom."""
-        return (
-            self._data.geom_xpos[geom]
-            + local_points(self._cell.model, geom) @ self._data.geom_xmat[geom].reshape(3, 3).T
-        )
+        turned = self._data.geom_xmat[geom].reshape(3, 3)
+        points = np.array([mat_vec(turned, point) for point in self._local[geom]])
+        return np.asarray(points + self._data.geom_xpos[geom])
 
     def _is_solid(self, geom: int) -> bool:
-        return self._cell.model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE
+        return bool(self._cell.model.geom_type[geom] != int(mujoco.mjtGeom.mjGEOM_PLANE))
 
     def _joint(self, address: int) -> int:
         return int(np.flatnonzero(self._cell.model.jnt_qposadr == address)[0])
 
 
 def local_points(model: mujoco.MjModel, geom: int) -> Array:
-    """Return points on the surface of a geom, (n, 3), m, in its own frame; of a mesh the corners of its box."""
-    kinds, kind, (a, b, c) = mujoco.mjtGeom, model.geom_type[geom], model.geom_size[geom]
+    """Return points on the surface of a geom, (n, 3), m, in its own frame; of a box or mesh the corners of its box."""
+    kinds, (a, b, c) = mujoco.mjtGeom, model.geom_size[geom]
+    kind = kinds(int(model.geom_type[geom]))
     turns = np.linspace(0.0, 2.0 * np.pi, RIM, endpoint=False)
     ring = np.stack([np.cos(turns), np.sin(turns), np.zeros(RIM)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
@@ -159,12 +156,9 @@ def local_points(model: mujoco.MjModel, geom: int) -> Array:
         return np.concatenate(ends if kind == kinds.mjGEOM_CYLINDER else [*ends, [(a + b) * up, -(a + b) * up]])
     if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
         size = np.array([a, a, a] if kind == kinds.mjGEOM_SPHERE else [a, b, c])
-        return size * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]])
-    centre, half = (
-        (model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]) if kind == kinds.mjGEOM_MESH else (0.0, (a, b, c))
-    )
+        return np.array(size * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]]))
     corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
-    return np.asarray(centre + corners * np.array(half))
+    return np.asarray(model.geom_aabb[geom, :3] + corners * model.geom_aabb[geom, 3:])
 
 
 def hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

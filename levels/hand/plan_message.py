@@ -14,6 +14,6 @@ GRASP_PLAN = command(
     Field("posture", "f8", "rad", "joint positions from which the fingers close", ("joints",)),
     Field("contact", "f8", "m", "of each tip, on the object's surface, in the object's frame", ("fingers", 3)),
     Field("normal", "f8", "1", "direction of each tip's force there, in the object's frame", ("fingers", 3)),
-    Field("grip", "f8", "N", "force of the opposing finger, which bears the sum of the others"),
+    Field("grip", "f8", "N", "force of each finger; the opposing one bears their sum"),
 )
 """From a planner, on a board or on the host side, to the grasp loop. The newest with an `id` above 0 counts."""

@@ -17,6 +17,7 @@ from rack.levels.timing.verdicts import EquationVerdict, verdicts
 class Forecast:
     """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction.
 
+    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it.
     `schedule` is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
     """
 
@@ -26,6 +27,7 @@ class Forecast:
     verdicts: tuple[EquationVerdict, ...]
     responses: tuple[TaskResponse, ...]
     loads: dict[int, float]
+    inboxes: tuple[dict[str, Any], ...]
     tick_ns: int
     schedule: CyclicSchedule | None
     frames: tuple[CoreFrames, ...]
@@ -41,6 +43,9 @@ class Forecast:
             verdicts=tuple(verdicts(rack)),
             responses=task_responses(rack.tasks, rack.context_switch_ns),
             loads=rack.loads,
+            inboxes=tuple(
+                inbox.document(rack.slice_ticks(name) * rack.clock_ns) for name, inbox in rack.inboxes.items()
+            ),
             tick_ns=rack.tick_ns,
             schedule=rack.schedule,
             frames=core_frames(rack),
@@ -61,6 +66,7 @@ class Forecast:
             "verdicts": [verdict.document() for verdict in self.verdicts],
             "responses": [response.document() for response in self.responses],
             "loads": {str(core): load for core, load in self.loads.items()},
+            "inboxes": list(self.inboxes),
             "schedule": self._schedule(),
             "notes": list(self.notes),
             "holds": self.holds,

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from rack.backplane.layout import TickGrid
 from rack.levels.timing.equations import communication_ns, grid_wait, residual_ns, response_ticks
+from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.response_time import load_of
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
@@ -173,7 +174,8 @@ class RackTiming:
     `clock_ns` is one tick of simulated time. `clock` is the task of the system clock, released every tick of the wall
     clock; its cost is 0 if unknown. `context_switch_ns` is t_cs, `small_share` the limit of eq. 3.10.
     `response_goal_ns` is the goal for the system's response, simulated time. Budgets are processor times: a `speed`
-    factor shortens the cycles, not the budgets.
+    factor shortens the cycles, not the budgets. `inboxes`, by task, are those of boards that messages interrupt;
+    budgets do not include what that costs.
     """
 
     is_lockstep: bool
@@ -184,6 +186,7 @@ class RackTiming:
     context_switch_ns: int
     small_share: float
     response_goal_ns: float | None = None
+    inboxes: Mapping[str, InboxTiming] = field(default_factory=dict)
     schedule: CyclicSchedule | None = None  # a static one, if the rack has it
 
     @property
@@ -286,15 +289,25 @@ class RackTiming:
             coupling=table.coupling,
             cycle_ns=table.every * self.tick_ns,
             longest_cycle_ns=round(self.longest_cycles[board] * self.tick_ns),
-            read_ns=budget.read_ns,
+            read_ns=budget.read_ns + self.interrupted_ns(board),
             execution_ns=budget.process_ns,
             write_ns=budget.write_ns,
             exchange_ns=budget.exchange_ns if table.has_planner else 0,
-            plan_ns=budget.plan_ns if plans else None,
+            plan_ns=budget.plan_ns + self.interrupted_ns(f"{board}.planner") if plans else None,
             update_ns=budget.update_ns if plans else 0,
             within_cycles=table.within_cycles if plans else None,
             plan_within_ns=table.plan_within_ns if plans else None,
         )
+
+    def interrupted_ns(self, task: str) -> int:
+        """Return the processor time that interrupts take from a task in a cycle, or in a plan; 0 if it serves none."""
+        inbox = self.inboxes.get(task)
+        return 0 if inbox is None else inbox.cost_ns(self.slice_ticks(task) * self.clock_ns)
+
+    def slice_ticks(self, task: str) -> int:
+        """Return the cycle of an executor, or the time slice of a planner's plan, ticks."""
+        board = self.boards[task.removesuffix(".planner")]
+        return board.every * (1 if task == board.name else board.within_cycles)
 
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:
@@ -321,7 +334,7 @@ class RackTiming:
             phase_ns=board.phase * self.tick_ns,
             parts=_nonzero(
                 Part(Unit.EXCHANGE, budget.exchange_ns if board.has_planner else 0),
-                Part(Unit.READ, budget.read_ns),
+                Part(Unit.READ, budget.read_ns + self.interrupted_ns(board.name)),
                 Part(Unit.PROCESS, budget.process_ns),
                 Part(Unit.WRITE, budget.write_ns),
             ),
@@ -333,7 +346,8 @@ class RackTiming:
             core=board.planner_core,
             priority=board.planner_priority,
             parts=_nonzero(
-                Part(Unit.PLAN, budget.plan_ns), Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical)
+                Part(Unit.PLAN, budget.plan_ns + self.interrupted_ns(f"{board.name}.planner")),
+                Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical),
             ),
             within_cycles=board.within_cycles,
             ceiling=board.priority if board.is_critical else 0,

@@ -22,10 +22,10 @@ SYSTEM = "system"
 """The subject of the system's response."""
 LOOSE_PLAN = "fig. 4"
 """A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation number."""
-PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES = "plan within", "response time", "load", "frames"
+PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX = "plan within", "response time", "load", "frames", "inbox"
 """Criteria beyond the paper."""
 EQUATIONS = "3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.8", LOOSE_PLAN, "3.9", "3.10"
-BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES
+BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX
 ORDER = (*EQUATIONS, *BEYOND)
 """All equations and criteria, in the order of the verdicts."""
 
@@ -35,8 +35,8 @@ class EquationVerdict:
     """Both sides of one equation for one subject, and whether it holds; predicted or measured.
 
     `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task, a core or
-    "system". `left` and `right` are ns, or shares if `unit` is "1". `meaning` names both sides in the paper's terms, as
-    in "t_plan / d < t_residual - 2 t_cs".
+    "system". `left` and `right` are ns, or numbers if `unit` is "1". `meaning` names both sides in the paper's terms,
+    as in "t_plan / d < t_residual - 2 t_cs".
     """
 
     equation: str
@@ -75,7 +75,8 @@ def verdicts(rack: RackTiming) -> list[EquationVerdict]:
     A response time without a bound is infinite.
     """
     levels = (level_verdicts(rack, level) for level in rack.levels.values())
-    found = chain(system_verdicts(rack), *levels, _of_tasks(rack), _of_cores(rack), _of_frames(rack))
+    beyond = _of_tasks(rack), _of_cores(rack), _of_frames(rack), _of_inboxes(rack)
+    found = chain(system_verdicts(rack), *levels, *beyond)
     return sorted(found, key=lambda verdict: ORDER.index(verdict.equation))
 
 
@@ -167,3 +168,12 @@ def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
             relation = Relation(place.end_ns, "<=", place.limit_ns)
             meaning = f"done before {place.limit}, in frame {alike.frames[0]}"
             yield EquationVerdict.of(FRAMES, place.board, relation, meaning)
+
+
+def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
+    for name, inbox in rack.inboxes.items():
+        waiting = inbox.burst.waiting
+        relation = Relation(inf if waiting is None else waiting, "<=", inbox.depth)
+        yield EquationVerdict.of(
+            INBOX, name, relation, "interrupts that wait after a burst of all senders <= depth", "1"
+        )

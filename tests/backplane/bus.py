@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
-from rack.backplane.layout import Layout, MailboxSpec, Protocol, Role, TaskSpec, Wake
+from rack.backplane.layout import InterruptSpec, Layout, MailboxSpec, Protocol, Role, TaskSpec, Wake
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import Field, MessageType
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 
 CLOCK_NS = 2_500_000
+SERVICE_NS, SPARE_NS = 60_000, 1_000_000
+"""Under protocol interrupt: service of a message, and the time from sending it to the tick that shows it."""
 NAME = "writer.point"
 SIZES = {"row": 24}
 POINT = MessageType(
@@ -34,7 +36,8 @@ def mailbox(
     writer: str = "writer",
     capacity: int = 0,
 ) -> MailboxSpec:
-    """Return the spec of a mailbox of points."""
+    """Return the spec of a mailbox of points; under protocol interrupt they are sent early enough for `delay`."""
+    interrupt = InterruptSpec(delay * CLOCK_NS - SPARE_NS, SERVICE_NS, 16, delay, delay, slots=(3,))
     return MailboxSpec(
         name=name,
         writer=writer,
@@ -48,6 +51,7 @@ def mailbox(
         size=POINT.dtype(SIZES).itemsize,
         fields=field_specs(POINT, SIZES),
         capacity=capacity,
+        interrupt=interrupt if protocol == "interrupt" else None,
     )
 
 

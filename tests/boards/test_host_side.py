@@ -167,6 +167,21 @@ def test_a_killed_bridge_goes_on_where_it_was(config: MakeConfig) -> None:
         assert (status(rack.segment).numbers["passed"], status(rack.segment, "adder").sum) == (60, 60 * 61 / 2)
 
 
+def check_memory(bus: HostBus, segment: Segment) -> None:
+    """Any word of the crate's memory is read by its address, and none beyond it."""
+    assert bus.tasks == ["bridge", "adder"]
+    counts = bus.words(bus.address("adder") + 8 * Block.PID, 2)
+    assert counts == [segment.block("adder")[Block.PID], segment.block("adder")[Block.STATE]]
+    assert bus.words(8 * System.TICK)[0] <= segment.words[System.TICK]
+    (newest,) = bus.words(bus.address("adder.status"))
+    assert newest > 0
+    with pytest.raises(LookupError, match="nothing on the bus is called 'added'; known: bridge, adder, "):
+        bus.address("added")
+    for address in (12, -8, segment.map.size):
+        with pytest.raises(ValueError, match="words of 8 bytes at 0x"):
+            bus.words(address)
+
+
 def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConfig) -> None:
     found = config("host.program.program=host_programs:Console", "host.program.external=true", text=HOSTED)
     with Rack(found) as rack:
@@ -183,6 +198,7 @@ def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConf
         assert (second.read("sum").value.sum, second.sent("numbers")) == (5.0, 2)
         with pytest.raises(AttributeError, match="no field 'valu'; fields: id, value, colour"):
             second.send("numbers", valu=1)
+        check_memory(second, rack.segment)
         second.finish()
         while rack.watch(0.5):
             continue

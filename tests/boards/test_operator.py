@@ -286,3 +286,5 @@ def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
     with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
         wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))
+    with pytest.raises(ConfigError, match="the clock writes it, not a board; permitted: time-slice, double-buffer"):
+        wire(config("protocol.mailbox={'upper.operator' = 'interrupt'}", text=COMMANDED))

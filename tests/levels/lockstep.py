@@ -45,7 +45,9 @@ class Task:
         self.level, self.spec, self.due = level, spec, 0
         # A port that reads many has an input for each board, by (port, board).
         self._inputs: dict[str | tuple[str, str], Box] = {}
-        for port, input_ in {**level.inputs, **made_ports(spec, level).inputs}.items():
+        ports = {**level.inputs, **made_ports(spec, level).inputs}
+        self._many = [port for port, input_ in ports.items() if input_.many]
+        for port, input_ in ports.items():
             names = sources(input_, spec)
             self._inputs |= {(port, name.partition(".")[0]) if input_.many else port: boxes[name] for name in names}
         self._values = {port: Message(box.dtype) for port, box in self._inputs.items()}
@@ -56,12 +58,12 @@ class Task:
 
     def release(self, tick: int, demand: Demand = Demand.NONE) -> None:
         """Run one cycle, under a demand on the arm."""
-        read, span = Ports(), self.spec.every
+        read, span = Ports(**{port: {} for port in self._many}), self.spec.every
         for port in self._inputs:
             if isinstance(port, str):
                 setattr(read, port, self._read(port, tick))
             else:
-                read.__dict__.setdefault(port[0], {})[port[1]] = self._read(port, tick)
+                getattr(read, port[0])[port[1]] = self._read(port, tick)
         if isinstance(self.level, Executor):
             self.level.demand = demand
             self.level.process(read, self.write, tick)
@@ -237,7 +239,7 @@ class Lockstep:
 
 def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
     """Return neighbours as a tuple."""
-    return (boards,) if isinstance(boards, str) else boards
+    return boards if isinstance(boards, tuple) else (boards,) if boards else ()
 
 
 def made_ports(board: BoardSpec, level: Executor | Planner) -> MadePorts:

@@ -8,6 +8,7 @@ from itertools import product
 from typing import Any
 
 from rack.boards.config import RackConfig, rack_timing
+from rack.boards.config.timing import without_interrupts
 from rack.levels.timing.equations import Relation
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, verdicts
@@ -84,7 +85,7 @@ class Analysis:
         loads, response = core_loads(recording, cycles, predicted), system_response(recording)
 
         def measured(percent: float) -> RackTiming:
-            return rack_timing(config, layout, budgets_of(cycles, percent))
+            return rack_timing(config, layout, without_interrupts(predicted, budgets_of(cycles, percent)))
 
         def pairs(percent: float) -> tuple[Pair, ...]:
             rack = measured(percent)

@@ -14,6 +14,7 @@ from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
+from rack.levels.hand.messages import HAND_STATUS
 from rack.levels.joint_messages import DRIVING
 from rack.levels.messages import TASK_STATUS
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
@@ -79,6 +80,7 @@ def report_of(recording: Recording) -> Report:
         "network": network(recording),
         "task": _task_outcome(recording),
         "motion": _motion(recording),
+        "hand": _hand(recording, config),
         "queues": queues(recording),
         "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
@@ -89,7 +91,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
         *("misses", "steal", "frequency_mhz", "notes", "holds", "state_tables", "faults", "unexplained", "restarts"),
-        *("system_response", "entries", "network", "task", "motion", "queues", "rows_lost"),
+        *("system_response", "entries", "network", "task", "motion", "hand", "queues", "rows_lost"),
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
@@ -212,6 +214,27 @@ def _motion(recording: Recording) -> Report | None:
     return {
         "tracking_rms_mrad": round(float(np.sqrt(np.mean(error**2))), 6),
         "tracking_peak_mrad": round(float(np.abs(error).max()), 6),
+        **{name: int(recording.signal(mailbox, name)[-1]) for name in ("touches", "violations", "pushed")},
+        "clipped_cycles": int(recording.signal(mailbox, "clipped")[-1]),
+    }
+
+
+def _hand(recording: Recording, config: RackConfig) -> Report | None:
+    """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or None."""
+    mailbox = _mailbox_of(recording, HAND_STATUS.name)
+    if mailbox is None or config.robot is None or config.robot.hand is None:
+        return None
+    tension, force = recording.signal(mailbox, "tension"), recording.signal(mailbox, "force")
+    error = tension - recording.signal(mailbox, "wanted")
+    most = np.sqrt((force**2).sum(axis=2)).max(axis=0)
+    fingers = [finger.name for finger in config.robot.hand.finger]
+    return {
+        "tension_rms_n": round(float(np.sqrt(np.mean(error**2))), 6),
+        "tension_peak_n": round(float(np.abs(error).max()), 6),
+        "least_tension_n": round(float(tension.min()), 6),
+        "largest_tension_n": round(float(tension.max()), 6),
+        "largest_force_n": {finger: round(float(value), 6) for finger, value in zip(fingers, most, strict=True)},
+        "closed_cycles": int(np.count_nonzero(recording.signal(mailbox, "stopped"))),
         **{name: int(recording.signal(mailbox, name)[-1]) for name in ("touches", "violations", "pushed")},
         "clipped_cycles": int(recording.signal(mailbox, "clipped")[-1]),
     }

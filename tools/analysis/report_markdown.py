@@ -84,6 +84,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _motion(report["motion"])
+    yield from _hand(report["hand"])
     yield from _queues(report["queues"])
     yield from _holds(report)
     yield from _state_tables(report["state_tables"])
@@ -236,6 +237,19 @@ def _motion(motion: Report | None) -> Iterator[str]:
             f"{motion['touches']} touches, {motion['clipped_cycles']} cycles clipped; "
             f"limits exceeded in {motion['violations']} substeps, by a push from outside in {motion['pushed']}."
         )
+
+
+def _hand(hand: Report | None) -> Iterator[str | Grid]:
+    if hand is None:
+        return
+    yield (
+        f"Tensions {hand['tension_rms_n']:.2f} N RMS off their commands, {hand['tension_peak_n']:.2f} peak; "
+        f"{hand['least_tension_n']:.2f} to {hand['largest_tension_n']:.2f} N; valves closed in {hand['closed_cycles']} "
+        f"cycles; {hand['touches']} touches, {hand['clipped_cycles']} cycles clipped; "
+        f"limits exceeded in {hand['violations']} substeps, by a push from outside in {hand['pushed']}."
+    )
+    forces = ", ".join(f"{finger} {force:.2f}" for finger, force in hand["largest_force_n"].items())
+    yield f"Largest force on each tip, N: {forces}."
 
 
 def _queues(queues: Sequence[Report]) -> Iterator[str]:

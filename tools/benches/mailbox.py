@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane import semaphores
-from rack.backplane.layout import PROTOCOLS, Layout, MailboxSpec, Protocol, TaskSpec
+from rack.backplane.layout import PROTOCOLS, InterruptSpec, Layout, MailboxSpec, Protocol, TaskSpec
+from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_reader, open_writer
 from rack.backplane.message import Field, Message, command
@@ -154,7 +155,7 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
         semaphores.create(layout)
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
-        readers = [_reading(open_reader(segment, box.name)) for _ in range(case.readers)]
+        readers = [_reading(open_reader(segment, box.name, inbox=open_inbox(segment, task))) for task in box.readers]
     # Open, it needs no name: nothing is left even if this process is killed.
     yield Transport(writer.message, writer.write, readers)
 
@@ -171,6 +172,8 @@ def _reading(reader: Reader) -> Callable[[int], Message]:
 def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
     readers = tuple(f"reader{number}" for number in range(case.readers))
     tasks = tuple(TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers)))
+    # Each reader is alone with its inbox: every message is served before the next one is sent.
+    interrupt = InterruptSpec(1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:]))
     box = MailboxSpec(
         name="writer.command",
         writer="writer",
@@ -183,5 +186,6 @@ def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
         version=MESSAGE.version,
         size=MESSAGE.dtype(case.lengths).itemsize,
         fields=field_specs(MESSAGE, case.lengths),
+        interrupt=interrupt if protocol == "interrupt" else None,
     )
     return Layout(rack, 2_500_000, tasks, (box,))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.frames import CoreFrames
 from rack.levels.timing.rack import LevelTiming, spanned
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
-from rack.levels.timing.verdicts import FRAMES, LOAD, RESPONSE_TIME, EquationVerdict
+from rack.levels.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
 from rack.tools.console.tables import ms, table
+
+TABLED = {*BEYOND} - {PLAN_WITHIN}
+"""Criteria that have a table of their own."""
 
 
 def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:
@@ -20,7 +24,7 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
     if forecast.levels:
         yield from ("", f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:", "")
         yield from _levels(forecast.levels, width)
-    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in (RESPONSE_TIME, LOAD, FRAMES)]:
+    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
         yield from _verdicts(paper, width)
     if forecast.responses:
@@ -29,6 +33,9 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
         yield ""
         loads = (f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}" for core, load in forecast.loads.items())
         yield f"load: {', '.join(loads)}"
+    if forecast.inboxes:
+        yield from ("", "interrupts, served by the first task of the board, ms:", "")
+        yield from _inboxes(forecast.inboxes, width)
     yield from _schedule_lines(forecast, width)
     yield from forecast.notes
 
@@ -104,6 +111,20 @@ def _responses(responses: Iterable[TaskResponse], width: int | None) -> Iterator
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
     yield from table(head, _merged([_response_row(response) for response in ordered], 1), width, ("FIFO", "margin"))
+
+
+def _inboxes(inboxes: Sequence[Mapping[str, Any]], width: int | None) -> Iterator[str]:
+    """Yield a line per board that messages interrupt: what they cost it, and its worst burst."""
+    head = ["board", "interrupted by", "in a cycle", "load", "longest", "wait", "of", ""]
+    rows = [
+        [
+            *(inbox["task"], spanned([name.partition(".")[0] for name in inbox["mailboxes"]])),
+            *(ms(inbox["cycle_cost_ns"]), f"{inbox['load']:.3f}", ms(inbox["longest_ns"])),
+            *("-" if inbox["waiting"] is None else str(inbox["waiting"]), str(inbox["depth"]), _result(inbox["fits"])),
+        ]
+        for inbox in inboxes
+    ]
+    yield from table(head, _merged(rows, 0), width, ("interrupted by",))
 
 
 def _merged(rows: Sequence[Sequence[str]], named: int) -> list[list[str]]:

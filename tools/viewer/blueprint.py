@@ -14,10 +14,13 @@ from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.joint_messages import DRIVING
 from rack.levels.robot.cell import Cell
+from rack.levels.robot.hand import Hand
 from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
 from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
 from rack.tools.viewer.events import EVENTS, RECORDER
+from rack.tools.viewer.forces import AXES, CONTACT, FORCES, TASK
+from rack.tools.viewer.hand import BY_FINGER, HAND, TIPS
 from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
 from rack.tools.viewer.style import lanes_view
@@ -64,6 +67,7 @@ class RackViews:
     def __init__(self, layout: Layout, config: RackConfig, cell: Cell | None, root: Sequence[str] = ()) -> None:
         self._layout, self._config, self._cell, self._root = layout, config, cell, root
         has_arm = cell is not None and any(mailbox.message in DRIVING for mailbox in layout.mailboxes)
+        self._hand = None if cell is None else cell.hand
         self._joints = config.robot.joints if config.robot is not None and has_arm else ()
 
     def path(self, *entity: str) -> str:
@@ -81,7 +85,7 @@ class RackViews:
         cell = self._cell
         left = below if cell is None else rrb.Vertical(self._scene(cell, "cell"), below, row_shares=[11, 9])
         right = rrb.Vertical(
-            self._arm() if self._joints else self._signals(),
+            self._fingers(self._hand) if self._hand is not None else self._arm() if self._joints else self._signals(),
             lanes_view("boards, cycle by cycle", [self.all(BOARDS)], CYCLES_S),
             rrb.Horizontal(self._load(), self._ages(), self._log(), column_shares=[3, 3, 4]),
             row_shares=[4, 5, 3],
@@ -113,7 +117,32 @@ class RackViews:
             for quantity in QUANTITIES
         ]
         error = _curves("tracking error, mrad", [self.path(ERROR)])
-        return rrb.Grid(*views, rrb.Tabs(error, _curves("gripper", [self.all(GRIPPER)])), grid_columns=2)
+        gripper = _curves("gripper", [self.all(GRIPPER)])
+        return rrb.Grid(*views, rrb.Tabs(*self._forces(), error, gripper), grid_columns=2)
+
+    def _forces(self) -> list[rrb.View]:
+        """Return the views of forces, of an arm or hand that senses them."""
+        cell = self._cell
+        if cell is None or cell.wrist is None:
+            return []
+        task = [[self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit] for unit in ("N", "N m")]
+        return [
+            _curves("force wanted and exerted, N", task[0]),
+            _curves("torque wanted and exerted, N m", task[1]),
+            _curves("contact, with limits", [self.all(FORCES, CONTACT)]),
+        ]
+
+    def _fingers(self, hand: Hand) -> rrb.Container:
+        """Return a view of every finger for tensions, joints and forces, each kind in a tab, and one of all tips."""
+        tabs = [
+            rrb.Grid(
+                *(_curves(f"{finger}, {unit}", [self.path(HAND, finger, kind)], legend=False) for finger in hand.names),
+                grid_columns=2,
+                name=kind,
+            )
+            for kind, unit in BY_FINGER.items()
+        ]
+        return rrb.Horizontal(rrb.Tabs(*tabs, active_tab=0), _curves("force on the tips, N", [self.path(*TIPS)]))
 
     def _joint(self, name: str, quantity: str) -> rrb.View:
         shown = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import STATE, Cell
+from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import verb_name
 from rack.tools.viewer.shapes import shape_of, xyzw
 from rack.tools.viewer.stream import Changes, RowBlock, Stream
@@ -79,9 +80,10 @@ class Poses:
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
-        self._bodies = moving_bodies(cell.model)
+        self._bodies, self._contacts = moving_bodies(cell.model), contacts_of(cell)
         self._world = stream.frame(WORLD)
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
+        self._frames += [stream.frame(contact.frame) for contact in self._contacts]
         self._every = max(1, round(POSES_S * 1e9 / clock_ns))
         self._last = -1
         stream.static(TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD))
@@ -97,16 +99,17 @@ class Poses:
             self._write(block, chosen)
 
     def _write(self, block: RowBlock, chosen: np.ndarray) -> None:
-        model, data, bodies = self._cell.model, self._data, self._bodies
-        positions = np.empty((len(chosen), len(bodies), 3))
-        quaternions = np.empty((len(chosen), len(bodies), 4))
+        model, data, bodies, count = self._cell.model, self._data, self._bodies, len(self._frames)
+        positions, quaternions = np.empty((len(chosen), count, 3)), np.empty((len(chosen), count, 4))
         tool = np.empty((len(chosen), 3))
         for row, state in enumerate(block.messages["state"][chosen]):
             mujoco.mj_setState(model, data, np.ascontiguousarray(state), STATE)
             mujoco.mj_kinematics(model, data)
-            positions[row], quaternions[row] = data.xpos[bodies], data.xquat[bodies]
+            positions[row, : len(bodies)], quaternions[row, : len(bodies)] = data.xpos[bodies], data.xquat[bodies]
+            for at, contact in enumerate(self._contacts, len(bodies)):
+                positions[row, at], quaternions[row, at] = contact.pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
-        times, count = self._stream.times, len(bodies)
+        times = self._stream.times
         ticks, stamps = block.ticks[chosen], block.stamps_ns[chosen]
         self._stream.columns(TOOL, times.columns(ticks, stamps), rr.Points3D.columns(positions=tool))
         poses = rr.Transform3D.columns(

@@ -16,7 +16,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, loads, rack_timing
 from rack.boards.config.timing import tick_ns
-from rack.levels.force.messages import SERVER_STATUS
+from rack.levels.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH
+from rack.levels.hand.messages import HAND_STATUS
 from rack.levels.joint_messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.messages import (
     ARM_STATE,
@@ -32,7 +33,10 @@ from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses, RecorderLoad
+from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces
+from rack.tools.viewer.hand import HandCurves
 from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Modes, Moves, Requests
+from rack.tools.viewer.pushes import Pushes
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
@@ -192,7 +196,7 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         parts.append(Requests(stream, mailbox).write)
     if mailbox.message == SERVER_STATUS.name:
         parts.append(Modes(stream, mailbox).write)
-    if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name):
+    if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name, HAND_STATUS.name):
         parts.append(Fields(stream, mailbox).write)
     return parts
 
@@ -202,9 +206,18 @@ def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ARM_STATE.name:
-            return [Poses(stream, cell, config.clock_ns).write]
+            pushes = [Pushes(stream, cell, config.clock_ns).write] if config.scene.push else []
+            return [Poses(stream, cell, config.clock_ns).write, *pushes]
+        case HAND_STATUS.name if cell.hand is not None:
+            arrows = ContactArrows(stream, cell, "force", config.clock_ns)
+            return [HandCurves(stream, robot.joints, cell.hand).write, arrows.write]
         case driving if driving in DRIVING:
             return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
+        case WRENCH.name if cell.wrist is not None:
+            arrows = ContactArrows(stream, cell, "wrench", config.clock_ns)
+            return [arrows.write, ContactForces(stream, cell.wrist.most).write]
+        case FORCE_STATUS.name:
+            return [TaskForces(stream).write]
         case MOVE_PLAN.name:
             return [PlannedPath(stream, cell).write]
         case TASK_PLAN.name:

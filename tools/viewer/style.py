@@ -30,6 +30,7 @@ LIMIT: Colour = (200, 60, 60, 110)
 PLANNED: Colour = (255, 200, 40, 255)
 GOAL: Colour = (70, 210, 90, 255)
 CURRENT: Colour = (255, 110, 40, 255)
+FORCE: Colour = (240, 60, 60, 255)
 
 STATES: dict[str, Colour] = {
     "idle": (110, 110, 120, 255),
@@ -66,6 +67,11 @@ PHASES: dict[str, Colour] = {
 def of_joint(at: int) -> Colour:
     """Return the colour of a joint by its index, from base to tool."""
     return _JOINTS[at % len(_JOINTS)]
+
+
+def dimmed(colour: Colour) -> Colour:
+    """Return a colour of which less is seen."""
+    return (*colour[:3], 110)
 
 
 def style_lane(stream: Stream, entity: Sequence[str], colours: Mapping[str, Colour], quiet: Sequence[str] = ()) -> None:

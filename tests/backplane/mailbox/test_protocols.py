@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from xxhash import xxh3_64_intdigest
 
-from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.layout import BY_TICKS, PROTOCOLS, Protocol
 from rack.backplane.mailbox.mailbox import Reader, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
 from rack.backplane.mailbox.slots import CHECKED_FROM, Slots, epoch_of
@@ -64,7 +64,7 @@ def test_an_observer_reads_by_its_protocol_and_never_waits(make_bus: MakeBus, pr
     writer.write(0)
     if protocol == "lock":
         lock_semaphore(segment.rack, NAME).acquire(0)
-    expected = Verdict.NONE if protocol == "time-slice" else Verdict.NEW
+    expected = Verdict.NONE if protocol in BY_TICKS else Verdict.NEW
     assert observer.read(0).verdict is expected
     assert observer.read(4).is_there
     assert observer.statistics.bus_errors == 0

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.layout import BY_TICKS, PROTOCOLS, Protocol
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from tests.backplane.bus import NAME, message_address
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
@@ -138,7 +138,7 @@ def test_a_restarted_writer_is_not_taken_for_a_fault(link: MakeLink, protocol: P
     rack.run(250, 300)
     assert rack.alarms() == []
     assert rack.alarms("writer") == []
-    assert rack.reader.seen[-1].released == 299 - (protocol == "time-slice")
+    assert rack.reader.seen[-1].released == 299 - (protocol in BY_TICKS)
 
 
 def test_an_episode_rings_once_and_a_later_one_again(link: MakeLink) -> None:

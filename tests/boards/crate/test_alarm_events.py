@@ -43,6 +43,7 @@ KINDS = {
     Alarm.PEER_RESTARTED: "recovery",
     Alarm.LATCHED: "reaction",
     Alarm.QUEUE_FULL: "held",
+    Alarm.INBOX_FULL: "held",
 }
 
 

@@ -12,17 +12,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rack.boards.config import load, rack_timing, wire
-from rack.boards.config.files import CONFIGS
+from rack.boards.config.files import CONFIGS, read
 from rack.boards.config.layout import obtained_core
 from rack.tools.analysis.analysis import core_loads
 from rack.tools.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.benches.observed import Runs, missed_share
 from rack.tools.benches.systems.figures import RealTimeFigures, SystemFigures, Systems
 from rack.tools.benches.systems.hold import held, hold_for
-from rack.tools.benches.systems.kills import KilledBoards, kill_each, kills_s
+from rack.tools.benches.systems.kills import kill_each, kills_s
 from rack.tools.benches.systems.motion import LONGEST_S, PosesBench, PosesRun, poses_config
 from rack.tools.benches.systems.prediction import prediction
 from rack.tools.benches.systems.realtime import ages_ms, board_loads, bus_traffic, cycles_in, plan_latencies
+from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.runs.cycles import cycles_of
 from rack.tools.runs.display import Display
@@ -37,8 +38,12 @@ LOCKSTEP_SPEED = 2.5
 
 
 def systems() -> list[str]:
-    """Return the bundled racks to compare: the default rack, and those that have a folder of their own."""
-    return ["nasrem", *sorted(path.stem for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name)]
+    """Return the bundled racks to compare: the default rack, and those that have a folder of their own.
+
+    Racks of a network are not among them: they need others to work with.
+    """
+    found = sorted(path for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name)
+    return ["nasrem", *(path.stem for path in found if "adapter" not in read(path))]
 
 
 def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:
@@ -89,14 +94,15 @@ class _System:
         realtime, failure = self._in_real_time(folder / "own")
         progress.end(parts["in real time"], realtime.verdict, ())
         progress.begin(f"{self._name}: killing each board")
-        kills: KilledBoards = kill_each(self._lockstep, self._layout, self._runs.share)
+        kills = kill_each(self._lockstep, self._layout, self._runs.share)
         progress.end(parts["killing each board"], kills.failure or kills.verdict, ())
-        poses: PosesRun | None = None
+        poses, unmoved = None, ""
         if self._poses is not None:
             progress.begin(f"{self._name}: three poses")
-            poses = self._poses.measure(folder / "poses")
-            progress.end(parts["three poses"], poses.verdict, ())
-        failures = [text for text in (failure, kills.failure and f"killing each board: {kills.failure}") if text]
+            poses, unmoved = self._in_poses(self._poses, folder / "poses")
+            progress.end(parts["three poses"], unmoved if poses is None else poses.verdict, ())
+        killed = kills.failure and f"killing each board: {kills.failure}"
+        failures = [text for text in (failure, killed, unmoved) if text]
         return SystemFigures(
             rack=Path(self._name).stem,
             predicted=prediction(self._config, self._timing, self._layout),
@@ -105,6 +111,13 @@ class _System:
             poses=poses,
             failure="; ".join(failures),
         )
+
+    def _in_poses(self, bench: PosesBench, folder: Path) -> tuple[PosesRun | None, str]:
+        """Return the motion, or why there was none."""
+        try:
+            return bench.measure(folder), ""
+        except Failure as failure:
+            return None, str(failure)
 
     def _in_real_time(self, folder: Path) -> tuple[RealTimeFigures, str]:
         commands = () if self._hold is None else (self._hold,)

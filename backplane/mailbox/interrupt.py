@@ -1,0 +1,207 @@
+"""Protocol interrupt: every message interrupts each board that reads it, and a handler there serves one at a time.
+
+A message is sent at a logical instant: the release of the cycle that writes it plus that cycle's budgeted processor
+time, one tick without a budget; a plan at the end of its time slice. At the reading board it joins the `Inbox`. A level
+sees it at its first release at or after the end of its service. When too many wait it is lost, at that board only.
+
+Every reading task works its board's inbox out by itself, from the heads of the slots in shared memory: who sent what
+when. That is a function of ticks alone, so all tasks of a board agree, and runs repeat, as long as messages are there
+at their instant. So a message must be written before the first tick that is not before it, and lockstep waits for it.
+One that is late counts as a miss of its writer, and as sent in the tick in which it is written.
+
+A reader that is restarted replays the messages that the slots still hold, two seconds at least, and continues as the
+one before it, if the inbox was empty at any time within them. A writer that is restarted continues as under time-slice.
+
+Between tasks in one slot a message passes no bus, so it interrupts nobody: it is read as under time-slice.
+
+Alternatives considered: the wall-clock instant of the write (runs would differ even if no deadline is missed), the end
+of the writer's cycle (time-slice with the handler's time on top: the reason to interrupt, that a message need not wait
+for a cycle's end, would not show), a process per board that serves interrupts and keeps the inbox in shared memory (a
+context switch for each message, and one more process that may die).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from rack.backplane.address_map import oldest_kept
+from rack.backplane.layout import InterruptSpec, MailboxSpec
+from rack.backplane.mailbox.inbox import Inbox
+from rack.backplane.mailbox.mailbox import MAX_STEP_BACK, Reader, Reading, Writer
+from rack.backplane.mailbox.slots import Slots
+from rack.backplane.segment import Segment
+from rack.backplane.words import Slot
+
+# Plain integers for the hot path.
+_EPOCH, _SERIAL, _VISIBLE = int(Slot.EPOCH), int(Slot.SERIAL), int(Slot.VISIBLE_AT)
+
+
+def how_sent(spec: MailboxSpec) -> InterruptSpec:
+    """Return how the messages of a mailbox of protocol interrupt are sent."""
+    assert spec.interrupt is not None, f"mailbox '{spec.name}' is of protocol {spec.protocol}"
+    return spec.interrupt
+
+
+def sent_ns(spec: MailboxSpec, visible_at: int, clock_ns: int) -> int:
+    """Return the instant at which a message was sent that is visible from that tick at the earliest."""
+    return (visible_at - spec.delay) * clock_ns + how_sent(spec).sent_ns
+
+
+class InterruptWriter(Writer):
+    """The one writer of a mailbox under protocol interrupt. Its messages must be written before they are sent."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        super().__init__(segment, name)
+        self._due = how_sent(self.spec).due
+
+    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
+        """Publish `message`, released at `tick`; return False when it is too late."""
+        self.publish(tick, self.visible_at(tick, now), tick if basis is None else basis)
+        return self.is_in_time(tick, now)
+
+    def is_in_time(self, tick: int, now: int | None) -> bool:
+        """Say whether a message released at `tick` and written now is there when it is to be sent."""
+        return now is None or now < tick + self._due
+
+    def visible_at(self, tick: int, now: int | None) -> int:
+        """Return the earliest tick at which the message is visible; a late one is sent in the tick that writes it."""
+        released = tick if now is None else max(tick, now - self._due + 1)
+        return released + self._delay
+
+
+class InterruptLine:
+    """One mailbox that interrupts a board, as that board sees it: the serials served, and the number lost there."""
+
+    def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
+        self.spec = spec
+        self.service_ns = how_sent(spec).service_ns
+        self.lost = 0
+        """Messages lost here because too many waited."""
+        self.served: deque[int] = deque(maxlen=MAX_STEP_BACK)
+        """Serials served, the last few."""
+        self._slots = slots = Slots(segment, spec)
+        self._box, self._heads, self._mask = slots.box, slots.heads, slots.mask
+        self._clock_ns = segment.layout.clock_ns
+        self._sent_ns = sent_ns(spec, 0, self._clock_ns)
+        self._passed = self._signature = self._missing = self._suspect = 0
+        self._last_ns = 0
+
+    @property
+    def found(self) -> int:
+        """Serial of the newest message that a reader is to judge: served, lost on its way, or not its writer's."""
+        served = self.served
+        return max(served[-1] if served else 0, self._missing, self._suspect)
+
+    def collect(self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]) -> None:
+        """Append the messages sent up to an instant: when, `number`, and serial."""
+        head, heads, mask = self._box[0], self._heads, self._mask
+        serial = self._passed + 1
+        self._suspect = 0
+        if serial > head:
+            return
+        serial = max(serial, oldest_kept(head, self._slots.depth))
+        while serial <= head:
+            words = heads[serial & mask]
+            if words[_SERIAL] != serial:
+                # Its slot was never filled: it raises no interrupt.
+                self._missing = serial
+            elif words[_EPOCH] != self._signature and not self._accepts(serial):
+                # The true message will replace it, under the same serial.
+                self._suspect = serial
+                break
+            else:
+                at_ns = words[_VISIBLE] * self._clock_ns + self._sent_ns
+                if at_ns > until_ns:
+                    break
+                self._last_ns = max(self._last_ns, at_ns)
+                arrivals.append((self._last_ns, number, serial))
+            serial += 1
+        self._passed = serial - 1
+
+    def _accepts(self, serial: int) -> bool:
+        """Say whether a message comes from the writer that holds the claim, or from an earlier holder."""
+        slots = self._slots
+        if not slots.copy(serial) or not slots.is_lawful(self._signature):
+            return False
+        self._signature = slots.signature
+        return True
+
+
+class BoardInbox:
+    """The inbox of the board in a slot, as one of its tasks works it out. `lines` are its mailboxes by name."""
+
+    def __init__(self, segment: Segment, slot: int) -> None:
+        boxes = segment.layout.interrupting(slot)
+        self.lines = {box.name: InterruptLine(segment, box) for box in boxes}
+        self.inbox = Inbox(min((how_sent(box).depth for box in boxes), default=0))
+        self.count = 0
+        """Messages served."""
+        self.service_ns = 0
+        """Time for which the handler has worked on them."""
+        self._lines = tuple(self.lines.values())
+        self._clock_ns = segment.layout.clock_ns
+        self._tick = -1
+        self._newest_ns = 0
+        # Arrived and not yet served: the end of the service, line and serial.
+        self._ahead: deque[tuple[int, InterruptLine, int]] = deque()
+
+    def advance(self, tick: int) -> None:
+        """Let everything happen that happens up to the release at `tick`."""
+        if tick <= self._tick:
+            return
+        self._tick = tick
+        until_ns = tick * self._clock_ns
+        arrivals: list[tuple[int, int, int]] = []
+        for number, line in enumerate(self._lines):
+            line.collect(until_ns, number, arrivals)
+        if len(arrivals) > 1:
+            arrivals.sort()
+        for at_ns, number, serial in arrivals:
+            self._arrive(at_ns, self._lines[number], serial)
+        ahead = self._ahead
+        while ahead and ahead[0][0] <= until_ns:
+            _, line, serial = ahead.popleft()
+            line.served.append(serial)
+            self.count += 1
+            self.service_ns += line.service_ns
+
+    def _arrive(self, at_ns: int, line: InterruptLine, serial: int) -> None:
+        # A message that was not there at its instant cannot come before others that have been served.
+        self._newest_ns = max(self._newest_ns, at_ns)
+        end_ns = self.inbox.arrive(self._newest_ns, line.service_ns)
+        if end_ns is None:
+            line.lost += 1
+        else:
+            self._ahead.append((end_ns, line, serial))
+
+
+def open_inbox(segment: Segment, task: str) -> BoardInbox | None:
+    """Return the inbox of a task's board; None if nothing interrupts it."""
+    slot = segment.layout.task(task).slot
+    return BoardInbox(segment, slot) if segment.layout.interrupting(slot) else None
+
+
+class InterruptReader(Reader):
+    """A reader of a mailbox whose messages interrupt its board."""
+
+    def __init__(self, segment: Segment, name: str, inbox: BoardInbox) -> None:
+        super().__init__(segment, name)
+        self._inbox, self._line = inbox, inbox.lines[name]
+
+    def read(self, tick: int) -> Reading:
+        """Return the newest message served by the release at `tick`, with its verdict."""
+        self.accesses += 1
+        self._inbox.advance(tick)
+        self.found = serial = self._line.found
+        if serial == self.serial:
+            return self._unchanged
+        return self._new if self._obtain(serial) else self._take_older(serial, tick)
+
+    def _step_back(self, serial: int, tick: int) -> Reading:
+        """Take the newest good message that was served before a lost, damaged or forged one, if it is unread."""
+        for older in reversed(self._line.served):
+            if self.serial < older < serial:
+                if self._obtain(older):
+                    return self._new
+                self._blame(older)
+        return self._unchanged

@@ -1,0 +1,81 @@
+"""The interrupt handler of a board, under protocol interrupt: what it costs, and what it counts.
+
+On the boards of the time it ran whenever a message came. Here the first task of the board does its work, just before it
+reads: it takes as much processor time as the handler has worked since the last cycle. So reading, t_comm of eq. 3.5,
+grows by it, and every task below on the same core is kept waiting. In lockstep, where nothing waits for a processor, it
+takes no time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import process_time_ns
+from typing import Self
+
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.mailbox.interrupt import BoardInbox
+from rack.backplane.process import compute_until
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
+from rack.backplane.words import Block
+
+# Plain integers for the hot path.
+_COUNT, _LOST, _WAITING = int(Block.INTERRUPTS), int(Block.INTERRUPTS_LOST), int(Block.INTERRUPTS_WAITING)
+
+
+class InterruptHandler:
+    """Serves the interrupts of a task's board: charges their time, counts them, and reports those that are lost."""
+
+    def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
+        self._inbox, self._block = inbox, segment.block(task)
+        clock = SystemClock(segment)
+        self._takes_time = not clock.is_lockstep
+        self._lines = [(line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()]
+        # What happened before this process was there is neither charged nor counted.
+        inbox.advance(clock.tick)
+        inbox.inbox.most_waiting = 0
+        self._served, self._service_ns = inbox.count, inbox.service_ns
+        self._lost = [line.lost for line in inbox.lines.values()]
+        self._cycles = 0
+
+    @classmethod
+    def of(cls, segment: Segment, task: str, inbox: BoardInbox | None, alarms: AlarmWriter) -> Self | None:
+        """Return the handler that a task runs; None: nothing interrupts its board, or another task runs it."""
+        is_first = task == segment.layout.handler(segment.layout.task(task).slot)
+        return cls(segment, task, inbox, alarms) if inbox is not None and is_first else None
+
+    def serve(self, tick: int) -> None:
+        """Serve everything that has come up to the release at `tick`."""
+        inbox, begun_ns = self._inbox, process_time_ns()
+        self._cycles += 1
+        inbox.advance(tick)
+        if inbox.count != self._served:
+            self._block[_COUNT] += inbox.count - self._served
+            self._served = inbox.count
+            if self._takes_time:
+                compute_until(begun_ns + inbox.service_ns - self._service_ns)
+            self._service_ns = inbox.service_ns
+        if inbox.inbox.most_waiting > self._block[_WAITING]:
+            self._block[_WAITING] = inbox.inbox.most_waiting
+        if inbox.inbox.lost != sum(self._lost):
+            self._report(tick)
+
+    def _report(self, tick: int) -> None:
+        """Count the messages lost in the inbox, and raise an alarm for each mailbox."""
+        for at, (line, episodes) in enumerate(self._lines):
+            if lost := line.lost - self._lost[at]:
+                self._lost[at] = line.lost
+                self._block[_LOST] += lost
+                episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
+
+
+def interrupted(read: Callable[[int], None], handler: InterruptHandler | None) -> Callable[[int], None]:
+    """Return `read`, after the handler has served what has come; `read` itself without one."""
+    if handler is None:
+        return read
+
+    def serve_and_read(tick: int) -> None:
+        handler.serve(tick)
+        read(tick)
+
+    return serve_and_read

@@ -1,0 +1,80 @@
+"""The arithmetic of an inbox: one served at a time, in order of arrival, as many waiting as permitted."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rack.backplane.mailbox.inbox import Inbox, InterruptSource, burst_of
+
+ARRIVALS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=60)
+"""Pauses before messages, and their services."""
+
+
+def test_messages_are_served_one_at_a_time() -> None:
+    inbox = Inbox(2)
+    assert [inbox.arrive(at, 60) for at in (0, 10, 200)] == [60, 120, 260]
+    assert (inbox.lost, inbox.most_waiting) == (0, 1)
+
+
+def test_one_that_arrives_while_too_many_wait_is_lost_and_costs_nothing() -> None:
+    inbox = Inbox(2)
+    assert [inbox.arrive(0, 60) for _ in range(4)] == [60, 120, 180, None]
+    # At 60 the first is done: a place to wait is free again.
+    assert [inbox.arrive(59, 60), inbox.arrive(60, 60)] == [None, 240]
+    assert (inbox.lost, inbox.most_waiting) == (2, 2)
+
+
+@given(ARRIVALS, st.integers(1, 5))
+def test_no_two_services_overlap_and_no_more_wait_than_permitted(pauses: list[tuple[int, int]], depth: int) -> None:
+    inbox, at, served = Inbox(depth), 0, list[tuple[int, int, int]]()
+    for pause, service in pauses:
+        at += pause
+        waiting = sum(end - took > at for _, end, took in served)
+        end = inbox.arrive(at, service)
+        assert (end is None) == (waiting >= depth)
+        if end is not None:
+            served.append((at, end, service))
+    for (_, before, _), (arrived, end, took) in pairwise(served):
+        assert end - took == max(arrived, before)
+    assert inbox.lost == len(pauses) - len(served)
+    assert inbox.most_waiting <= depth
+
+
+@given(ARRIVALS, ARRIVALS, st.integers(1, 5))
+def test_after_an_idle_instant_nothing_before_it_counts(
+    first: list[tuple[int, int]], then: list[tuple[int, int]], depth: int
+) -> None:
+    used, at, ends = Inbox(depth), 0, [0]
+    for pause, service in first:
+        at += pause
+        ends.append(used.arrive(at, service) or 0)
+    at, fresh = max(at, *ends), Inbox(depth)
+    for pause, service in then:
+        at += pause
+        assert used.arrive(at, service) == fresh.arrive(at, service)
+
+
+def test_a_burst_of_all_senders_waits_for_each_other() -> None:
+    burst = burst_of([InterruptSource(2_500, 60)] * 5)
+    assert (burst.waiting, burst.longest_ns) == (4, 300)
+    assert burst.load == pytest.approx(0.12)
+    assert burst.fits(4)
+    assert not burst.fits(3)
+
+
+def test_a_burst_includes_what_comes_while_it_is_served() -> None:
+    # From 0: 300 of service, during which the fast source comes twice more.
+    burst = burst_of([InterruptSource(100, 10), InterruptSource(1_000, 250)])
+    assert burst.longest_ns == 260
+    assert burst.waiting == 2
+
+
+@pytest.mark.parametrize("service", [500, 600])
+def test_a_handler_that_is_never_idle_fills_every_inbox(service: int) -> None:
+    burst = burst_of([InterruptSource(2_500, service)] * 5)
+    assert burst.waiting is burst.longest_ns is None
+    assert not burst.fits(1_000_000)

@@ -1,0 +1,156 @@
+"""Racks whose boards interrupt each other: what arrives, what is lost, what it costs, and that runs repeat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from rack.backplane.words import Block
+from rack.boards import Rack
+from rack.boards.faults.config import FaultConfig
+from tests.boards.conftest import MakeConfig
+from tests.boards.interrupt_levels import BOARDS
+from tests.boards.messages import Written
+
+TICKS, SECONDS = 100, 0.25
+RACK = f"""
+name = "interrupted"
+python_path = ["{Path(__file__).parents[1]}"]
+protocol.default = "interrupt"
+
+[clock]
+period_ms = 2.5
+mode = "lockstep"
+
+[board.hub]
+slot = 2
+every = 1
+below = [{", ".join(f'"figure{at}"' for at in range(BOARDS))}]
+executor = "interrupt_levels:Hub"
+""" + "".join(
+    f"""
+[board.figure{at}]
+slot = {10 - at}
+core = 1
+every = 1
+executor = "rack.levels.figures:FigureLoop"
+params.process_ms = 0.0
+budget.process_ms = 0.5
+"""
+    for at in range(BOARDS)
+)
+SMALL = "protocol.interrupt.depth=2"
+"""An inbox for three of five messages at once: one is served, two wait."""
+OVERLOADED = "protocol.interrupt.fixed_us=900"
+"""Five messages take longer than a tick."""
+
+
+class Heard(NamedTuple):
+    """A run: its digest, what the hub had of each board in each cycle, shape (TICKS, BOARDS), and its counts.
+
+    `counts` are interrupts served and lost, and the most that waited; `full` the events of a full inbox.
+    """
+
+    digest: str
+    cycle: np.ndarray
+    lost: np.ndarray
+    counts: tuple[int, int, int]
+    full: list[str]
+    service_ns: int
+    written: Written
+
+
+def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()) -> Heard:
+    """Run the rack for `TICKS`."""
+    found = config(*settings, text=RACK).model_copy(update={"fault": faults})
+    with Rack(found) as rack:
+        outcome = rack.run(SECONDS)
+        written, block = Written.on(rack.segment), rack.segment.block("hub")
+        heard = written.messages["hub.status"]["message"]
+        counts = (block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST], block[Block.INTERRUPTS_WAITING])
+        full = [event.text for event in rack.events if event.code == "inbox_full"]
+        interrupt = rack.segment.layout.mailbox("figure0.status").interrupt
+        assert interrupt is not None
+    return Heard(outcome.digest, heard["cycle"], heard["lost"], counts, full, interrupt.service_ns, written)
+
+
+def test_every_message_arrives_in_an_inbox_with_room(config: MakeConfig) -> None:
+    found = run(config)
+    assert (found.cycle[1:] == np.arange(TICKS - 1)[:, None]).all()
+    # What is written in the last cycle is served after it.
+    assert found.counts == (BOARDS * (TICKS - 1), 0, BOARDS - 1)
+    assert not found.full
+    assert not found.lost.any()
+
+
+def test_a_full_inbox_loses_the_messages_of_the_last_slots(config: MakeConfig) -> None:
+    found = run(config, SMALL)
+    # In order of the slots the last board named comes first.
+    assert (found.cycle[1:, 2:] == np.arange(TICKS - 1)[:, None]).all()
+    assert (found.cycle[:, :2] == -1).all()
+    assert found.counts == (3 * (TICKS - 1), 2 * (TICKS - 1), 2)
+    assert sorted(found.full) == [f"inbox is full: 1 message in 'figure{at}.status' lost" for at in (0, 1)]
+
+
+def test_an_overloaded_handler_delays_what_it_does_not_lose(config: MakeConfig) -> None:
+    found = run(config, OVERLOADED, SMALL)
+    known = found.cycle[50:]
+    ages = np.arange(50, TICKS)[:, None] - known[:, known[-1] >= 0]
+    assert ages.max() > 1
+    served, lost, waiting = found.counts
+    # Three take longer than a tick: one is still served when the next burst comes, and of that two may wait.
+    assert served == pytest.approx(2.5 * TICKS, abs=3)
+    assert served + lost == pytest.approx(BOARDS * TICKS, abs=3 * BOARDS)
+    assert waiting == 2
+
+
+@pytest.mark.parametrize("settings", [(SMALL,), (OVERLOADED,)], ids=["burst", "overload"])
+def test_runs_with_a_full_inbox_and_killed_boards_repeat(config: MakeConfig, settings: tuple[str, ...]) -> None:
+    faults = tuple(FaultConfig(kind="kill", board=board, tick=tick) for board, tick in (("figure4", 20), ("hub", 31)))
+    quick = "supervision.lockstep_restart_s=0.02"
+    first, second = (run(config, quick, *settings, faults=faults) for _ in range(2))
+    assert first.digest == second.digest
+    # At most as old as a full inbox is long.
+    assert first.cycle[-1].max() > TICKS - 10
+
+
+def test_a_restarted_reader_finds_its_inbox_as_it_was(config: MakeConfig) -> None:
+    killed = (FaultConfig(kind="kill", board="hub", tick=31),)
+    calm = run(config, SMALL, "supervision.lockstep_restart_s=0.02")
+    back = run(config, SMALL, "supervision.lockstep_restart_s=0.02", faults=killed)
+    ticks = back.written.messages["hub.status"]["tick"]
+    assert len(ticks) < TICKS
+    assert (back.cycle[ticks > 40] == calm.cycle[ticks[ticks > 40]]).all()
+
+
+def test_messages_that_faults_strike_cost_the_same_on_every_run(config: MakeConfig) -> None:
+    faults = tuple(
+        FaultConfig(kind=kind, board="figure3", tick=tick, cycles=10)  # type: ignore[arg-type]
+        for kind, tick in (("drop", 10), ("delay", 25), ("corrupt", 40), ("reorder", 55), ("babble", 70))
+    )
+    first, second = (run(config, faults=faults) for _ in range(2))
+    assert first.digest == second.digest
+    assert first.counts == second.counts
+    assert first.counts[0] != BOARDS * (TICKS - 1)
+    assert first.cycle[-1, 3] == TICKS - 2
+
+
+def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
+    exact = run(config, SMALL)
+    for _ in range(3):
+        real = run(config, SMALL, "clock.mode=realtime", "clock.speed=0.5")
+        same = real.written.first_miss(TICKS)
+        assert real.written.until(same) == exact.written.until(same)
+        if same == TICKS:
+            assert real.digest == exact.digest
+            return
+
+
+def test_in_real_time_interrupts_take_the_reading_boards_processor(config: MakeConfig) -> None:
+    found = run(config, "clock.mode=realtime", "clock.speed=0.5")
+    cycles, served = found.written.cycles["hub"], found.counts[0]
+    reading_ns = (cycles["read_ns"] - cycles["plan_ns"]).sum()
+    assert reading_ns >= served * found.service_ns > 0

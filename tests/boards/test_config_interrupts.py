@@ -1,0 +1,144 @@
+"""Protocol interrupt in a config: when messages are sent, what they cost, and which mailboxes may have it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.layout import Layout, MailboxSpec
+from rack.boards.config import load, loads, rack_timing, resolve, wire
+from rack.boards.config.resolved import validated
+from rack.boards.config.timing import without_interrupts
+from rack.boards.config.toml import override, parse
+from rack.boards.errors import ConfigError
+from rack.levels.timing.verdicts import INBOX, verdicts
+from tests.boards.lan.racks import rack_text
+from tests.boards.run.test_interrupts import BOARDS, RACK
+from tests.boards.test_host_side import HOSTED
+from tests.boards.test_queues import QUEUES
+
+INTERRUPT = "protocol.default=interrupt"
+LOOSE = ("board.lower.coupling=loose", "board.lower.planner_slot=9")
+
+
+def layout_of(small: Path, *settings: str) -> Layout:
+    """Return the layout of the small rack under this protocol."""
+    return wire(load(small, [INTERRUPT, *settings]))
+
+
+def mistake(text: str, *settings: str) -> str:
+    """Return the one mistake of a config."""
+    with pytest.raises(ConfigError) as error:
+        resolve(validated(override(parse(text), settings)))
+    (found,) = error.value.mistakes
+    return str(found)
+
+
+def sent(box: MailboxSpec) -> tuple[int, int, int]:
+    """Return when a message is sent, ns, before which tick it must be there, and when it can first be seen."""
+    assert box.interrupt is not None
+    return box.interrupt.sent_ns, box.interrupt.due, box.delay
+
+
+def test_a_message_is_sent_after_the_budget_of_its_cycle(small: Path) -> None:
+    budget = "board.upper.budget={ read_ms = 0.5, process_ms = 2.0, write_ms = 0.6 }"
+    assert sent(layout_of(small, budget).mailbox("upper.command")) == (3_100_000, 2, 2)
+    # Without a budget after a tick, so it is served in the next one.
+    assert sent(layout_of(small).mailbox("upper.command")) == (2_500_000, 1, 2)
+    over = "board.upper.budget.process_ms=1000"
+    layout = layout_of(small, over)
+    assert sent(layout.mailbox("upper.command"))[1] == layout.task("upper").every
+
+
+def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path) -> None:
+    layout = layout_of(small, "protocol.interrupt={ fixed_us = 10, word_us = 2.5, depth = 3 }")
+    command, plan = layout.mailbox("upper.command").interrupt, layout.mailbox("lower.plan").interrupt
+    assert command is not None
+    assert plan is not None
+    assert command.service_ns == 10_000 + 2_500 * (layout.mailbox("upper.command").size // 4)
+    assert (command.depth, command.slots) == (3, (layout.task("lower").slot,))
+    # Planner and executor share a board.
+    assert plan.slots == ()
+
+
+def test_a_plan_is_sent_at_the_end_of_its_slice(small: Path) -> None:
+    layout = layout_of(small, *LOOSE)
+    planner, plan = layout.task("lower.planner"), layout.mailbox("lower.plan")
+    span = planner.every * planner.within_cycles
+    assert sent(plan) == (span * layout.clock_ns, span, span + 1)
+    assert plan.interrupt is not None
+    assert plan.interrupt.slots == (layout.task("lower").slot,)
+
+
+def test_operators_mailboxes_stay_as_they_are_under_a_default(small: Path) -> None:
+    assert {box.protocol for box in layout_of(small).mailboxes if box.writer == "clock"} <= {"time-slice"}
+
+
+def test_the_protocol_passes_where_determinism_is_demanded(small: Path) -> None:
+    assert layout_of(small, "protocol.strict=true").mailbox("upper.command").is_repeatable
+
+
+@pytest.mark.parametrize(
+    ("setting", "why"),
+    [
+        ("protocol.interrupt.fixed_us=-1", "protocol.interrupt.fixed_us = -1: should be greater than or equal to 0"),
+        ("protocol.interrupt.word_us=inf", "protocol.interrupt.word_us = inf: should be a finite number"),
+        ("protocol.interrupt.depth=0", "protocol.interrupt.depth = 0: should be greater than or equal to 1"),
+        ("protocol.interrupt.slots=3", "protocol.interrupt.slots = 3: unknown key"),
+        (
+            "board.hub.exchange.status.asynchronous=true",
+            "the messages of 'figure0.status' interrupt the board as they come already; permitted: false",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(setting: str, why: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        resolve(validated(override(parse(RACK), [setting])))
+    assert why in str(error.value)
+
+
+def test_a_queue_and_mailboxes_beyond_the_boards_are_refused() -> None:
+    assert "sends any number of messages in a cycle; permitted: queue" in mistake(
+        QUEUES, "protocol.mailbox={ 'upper.requests' = 'interrupt' }"
+    )
+    for mailbox in ("program.numbers", "bridge.sum"):
+        found = mistake(HOSTED, f"protocol.mailbox={{ '{mailbox}' = 'interrupt' }}")
+        assert found.startswith(f'protocol.mailbox.{mailbox} = "interrupt": it is on the host side, where nothing is')
+    network = rack_text("here", "tcp/127.0.0.1:7001", (), "there")
+    found = mistake(network, "protocol.mailbox={ 'lan.other' = 'interrupt' }")
+    assert "the network adapter writes it as messages come in; permitted: time-slice, double-buffer" in found
+
+
+def test_the_network_adapter_reads_without_interrupts() -> None:
+    layout = wire(validated(override(parse(rack_text("here", "tcp/127.0.0.1:7001", (), "there")), [INTERRUPT])))
+    pulse = layout.mailbox("pulse.status")
+    assert pulse.interrupt is not None
+    assert pulse.interrupt.slots == ()
+    assert layout.mailbox("lan.other").protocol == "time-slice"
+
+
+def test_interrupts_are_part_of_reading_and_of_a_plan(small: Path) -> None:
+    budget = "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0 }"
+    config = load(small, [INTERRUPT, budget, *LOOSE])
+    layout = wire(config)
+    timing = rack_timing(config, layout)
+    inbox = timing.inboxes["lower"]
+    assert set(inbox.mailboxes) == {"upper.command", "lower.plan"}
+    cost = inbox.cost_ns(layout.task("lower").every * layout.clock_ns)
+    assert cost == sum(source.service_ns for source in inbox.sources)
+    level = timing.level("lower")
+    assert level.read_ns == 100_000 + cost
+    assert {task.name: task.cost_ns for task in timing.tasks}["lower"] == 600_000 + cost
+    assert level.plan_ns == 2_000_000 + timing.interrupted_ns("lower.planner")
+    measured = {"lower": timing.boards["lower"].budget}
+    assert measured["lower"] is not None
+    # In lockstep they take no time, so nothing was measured of them.
+    assert without_interrupts(timing, {"lower": measured["lower"]}) == measured
+
+
+@pytest.mark.parametrize(("depth", "holds"), [(BOARDS - 1, True), (BOARDS - 2, False)])
+def test_an_inbox_that_a_burst_overflows_fails(depth: int, holds: bool) -> None:
+    config = loads(RACK.replace('"interrupt"', f'"interrupt"\nprotocol.interrupt.depth = {depth}'))
+    found = [v for v in verdicts(rack_timing(config, wire(config))) if v.equation == INBOX]
+    assert [(v.subject, v.left, v.right, v.holds) for v in found] == [("hub", BOARDS - 1, depth, holds)]

@@ -1,0 +1,95 @@
+"""Forces in a recording: arrows where they are sensed, and curves of what is wanted and exerted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import rerun.blueprint as rrb
+
+from rack.backplane.message import MessageType
+from rack.backplane.segment import Launch
+from rack.levels.force.messages import FORCE_STATUS, WRENCH
+from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.tools.viewer.cell import Poses
+from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
+from tests.levels.force.pad import pad
+
+CLOCK_NS = 1_000_000
+ROWS = 60
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Cell:
+    return build_cell(*pad(tmp_path), CLOCK_NS)
+
+
+class Written:
+    """A recording of one message type, which a part of the view writes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / "run.rrd"
+        recording = new_recording("run", "run", self.file, rrb.Blueprint(rrb.TextLogView()))
+        self._times = Timelines(CLOCK_NS, Launch(0, 0))
+        self.stream = Stream(recording, self._times)
+
+    def write(self, kind: MessageType, cell: Cell, write: ViewPart, **fields: np.ndarray) -> None:
+        """Write `ROWS` messages with these fields, one a tick."""
+        dtype = [("tick", "i8"), ("stamp_ns", "i8"), ("message", kind.dtype(sizes(cell)))]
+        rows = np.zeros(ROWS, dtype=dtype)
+        rows["tick"] = rows["stamp_ns"] = np.arange(ROWS)
+        for name, values in fields.items():
+            rows["message"][name] = values
+        write(RowBlock(rows, "stamp_ns", self._times))
+        self.stream.close()
+
+
+def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, cell: Cell) -> None:
+    force = np.zeros((ROWS, 6))
+    force[:, 2] = np.arange(ROWS)
+    written = Written(tmp_path)
+    written.write(WRENCH, cell, ContactArrows(written.stream, cell, "wrench", CLOCK_NS).write, wrench=force)
+    arrows = read(written.file, "/cell/forces/tool", "Arrows3D:vectors")
+    assert arrows.ticks.tolist() == [0, 20, 40]
+    assert arrows.values[:, 0] == pytest.approx(np.array([[0.0, 0.0, tick / 60.0] for tick in (0, 20, 40)]))
+
+
+def test_the_arrows_frame_is_at_the_tool_and_turns_with_the_world(tmp_path: Path, cell: Cell) -> None:
+    data, state = cell.start(), np.zeros(sizes(cell)["state"])
+    mujoco.mj_getState(cell.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    written = Written(tmp_path)
+    written.write(ARM_STATE, cell, Poses(written.stream, cell, CLOCK_NS).write, state=np.tile(state, (ROWS, 1)))
+    frames = read(written.file, "/frames", "Transform3D:child_frame").values.ravel()
+    row = frames.tolist().index(contacts_of(cell)[0].frame)
+    place = read(written.file, "/frames", "Transform3D:translation").values[row, 0]
+    assert place == pytest.approx(data.site_xpos[cell.tool], abs=1e-6)
+    assert read(written.file, "/frames", "Transform3D:quaternion").values[row, 0].tolist() == [0.0, 0.0, 0.0, 1.0]
+
+
+def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(tmp_path: Path, cell: Cell) -> None:
+    wrench, wanted, selected = np.zeros((3, ROWS, 6))
+    wrench[:, 2], wanted[:, 2], selected[:, 2] = 18.0, -20.0, 1
+    written = Written(tmp_path)
+    part = TaskForces(written.stream).write
+    written.write(FORCE_STATUS, cell, part, wrench=wrench, wanted=wanted, selected=selected)
+    assert read(written.file, "/forces/task_frame/z").values[-1].tolist() == [-20.0, -18.0]
+    assert np.isnan(read(written.file, "/forces/task_frame/x").values[-1][0])
+
+
+def test_the_contact_is_shown_against_the_arms_limits(tmp_path: Path, cell: Cell) -> None:
+    assert cell.wrist is not None
+    written = Written(tmp_path)
+    part = ContactForces(written.stream, cell.wrist.most).write
+    written.write(WRENCH, cell, part, wrench=np.tile([3.0, 0.0, 4.0, 0.0, 0.6, 0.8], (ROWS, 1)))
+    assert read(written.file, "/forces/contact/force").values[-1].tolist() == [60.0, 5.0]
+    assert read(written.file, "/forces/contact/torque").values[-1].tolist() == [8.0, 1.0]
+
+
+def test_an_arm_without_a_sensor_has_no_arrows(tmp_path: Path) -> None:
+    robot, scene = pad(tmp_path)
+    assert contacts_of(build_cell(robot.model_copy(update={"wrist": None}), scene, CLOCK_NS)) == []

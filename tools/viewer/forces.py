@@ -1,0 +1,118 @@
+"""Forces of contacts: an arrow at each place where they are sensed, and curves of what is wanted and exerted."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from rack.levels.robot.cell import Cell
+from rack.tools.viewer.stream import RowBlock, Stream
+from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
+
+ARROWS, FORCES = ("cell", "forces"), "forces"
+TASK, CONTACT = "task_frame", "contact"
+"""Groups of curves: along the axes of a task frame, of the whole contact against its limits."""
+ARROW_COLOUR = (0, 230, 255)
+ARROW_S = 0.02
+"""Time between arrows: the rate of a screen."""
+LONGEST_M, TOOL_SHAFT_M = 1.0, 0.014
+"""Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show beyond the tool."""
+TIP_M, TIP_SHAFT_M = 0.02, 0.003
+"""Length of an arrow at a fingertip for 1 N, and its radius."""
+AXES = {"x": "N", "y": "N", "z": "N", "rx": "N m", "ry": "N m", "rz": "N m"}
+
+
+class ContactPlace(NamedTuple):
+    """A place where forces are sensed, and the frame in which its messages give them."""
+
+    name: str
+    site: int  # where it is
+    turned: int | None  # site whose orientation the frame has; None: the world's
+
+    @property
+    def frame(self) -> str:
+        """Name of the frame in the recording."""
+        return f"contact/{self.name}"
+
+    def pose(self, data: mujoco.MjData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return place, m, and quaternion in `data`."""
+        quaternion = np.array([1.0, 0.0, 0.0, 0.0])
+        if self.turned is not None:
+            mujoco.mju_mat2Quat(quaternion, data.site_xmat[self.turned])
+        return data.site_xpos[self.site], quaternion
+
+
+def contacts_of(cell: Cell) -> list[ContactPlace]:
+    """Return the places where a cell's forces are sensed: the tool on a wrist sensor, the tips of a hand."""
+    if cell.hand is not None:
+        tips = zip(cell.hand.names, cell.hand.tips, strict=True)
+        return [ContactPlace(name, int(tip), cell.tool) for name, tip in tips]
+    return [] if cell.wrist is None else [ContactPlace("tool", cell.tool, None)]
+
+
+class ContactArrows:
+    """Writes the forces of the surroundings on tool or fingertips as arrows."""
+
+    def __init__(self, stream: Stream, cell: Cell, field: str, clock_ns: int) -> None:
+        """Take the forces from `field`, whose numbers begin with three for each place."""
+        self._stream, self._field, self._places = stream, field, contacts_of(cell)
+        self._scale, shaft = TIP_M, TIP_SHAFT_M
+        if cell.wrist is not None:
+            self._scale, shaft = LONGEST_M / cell.wrist.most[0], TOOL_SHAFT_M
+        self._every, self._last = max(1, round(ARROW_S * 1e9 / clock_ns)), -1
+        for place in self._places:
+            arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
+            stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
+
+    def write(self, block: RowBlock) -> None:
+        """Write an arrow every 20 ms of simulated time."""
+        slots, first = np.unique(block.ticks // self._every, return_index=True)
+        chosen, self._last = first[slots > self._last], int(slots[-1])
+        if not len(chosen):
+            return
+        times = self._stream.times.columns(block.ticks[chosen], block.stamps_ns[chosen])
+        forces = block.messages[self._field][chosen].reshape(len(chosen), -1)
+        for at, place in enumerate(self._places):
+            vectors = self._scale * forces[:, 3 * at : 3 * at + 3]
+            self._stream.columns((*ARROWS, place.name), times, rr.Arrows3D.columns(vectors=vectors))
+
+
+class TaskForces:
+    """Writes `FORCE_STATUS`es: what the tool exerts along each axis of the task frame, and what is wanted of it."""
+
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
+        for at, (axis, unit) in enumerate(AXES.items()):
+            names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
+            lines = rr.SeriesLines(names=names, colors=[COMMANDED, of_joint(at)], widths=[2.5, 1.0])
+            stream.static((FORCES, TASK, axis), lines)
+
+    def write(self, block: RowBlock) -> None:
+        """Write every cycle of that level; nothing is wanted on an axis of motion."""
+        messages = block.messages
+        wanted = np.where(messages["selected"] == 1, messages["wanted"], np.nan)
+        for at, axis in enumerate(AXES):
+            curves = np.column_stack((wanted[:, at], -messages["wrench"][:, at]))
+            self._stream.scalars((FORCES, TASK, axis), block.times, curves)
+
+
+class ContactForces:
+    """Writes `WRENCH`es as the size of force and torque, with the arm's limits."""
+
+    def __init__(self, stream: Stream, most: tuple[float, float]) -> None:
+        self._stream, self._most = stream, dict(zip(("force", "torque"), most, strict=True))
+        for what, unit in (("force", "N"), ("torque", "N m")):
+            names = [f"limit, {unit}", f"{what} of the contact, {unit}"]
+            stream.static((FORCES, CONTACT, what), rr.SeriesLines(names=names, colors=[LIMIT, of_joint(0)]))
+
+    def write(self, block: RowBlock) -> None:
+        """Write every cycle of the arm."""
+        halves = block.messages["wrench"].reshape(len(block.rows), 2, 3)
+        for at, (what, most) in enumerate(self._most.items()):
+            size = np.sqrt((halves[:, at] ** 2).sum(axis=1))
+            curves = np.column_stack((np.full(len(size), most), size))
+            self._stream.scalars((FORCES, CONTACT, what), block.times, curves)

@@ -1,0 +1,53 @@
+"""A hand: joints, tensions and tip forces by finger, as curves."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from rack.levels.hand.messages import EXTENSOR, FLEXOR
+from rack.levels.robot.hand import Hand
+from rack.tools.viewer.stream import RowBlock, Stream
+from rack.tools.viewer.style import COMMANDED, dimmed, of_joint
+
+HAND = "hand"
+JOINTS, TENSIONS, FORCES = "joints", "tensions", "forces"
+BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FORCES: "N"}
+"""Curves of a finger, and their units."""
+TIPS = (HAND, "tip_forces")
+
+
+class HandCurves:
+    """Writes `HAND_STATUS`es: a finger's joints, tensions as sensed and as commanded, and the force on its tip."""
+
+    def __init__(self, stream: Stream, names: tuple[str, ...], hand: Hand) -> None:
+        """Show the joints `names` of a hand."""
+        self._stream = stream
+        self._fingers = {name: np.flatnonzero(hand.fingers[at]) for at, name in enumerate(hand.names)}
+        for finger, joints in self._fingers.items():
+            own = [names[joint] for joint in joints]
+            colours = [of_joint(at) for at in range(len(own))]
+            rows = ("flexor", "extensor")
+            pairs = [f"{name} {row}{what}, N" for what in (" commanded", "") for row in rows for name in own]
+            angles = rr.SeriesLines(names=[f"{name}, rad" for name in own], colors=colours)
+            stream.static((HAND, finger, JOINTS), angles)
+            # The lower ones are wider: they show on both sides where the two agree.
+            shades = [*[COMMANDED] * (2 * len(own)), *colours, *(dimmed(colour) for colour in colours)]
+            widths = [2.5] * (2 * len(own)) + [1.0] * (2 * len(own))
+            stream.static((HAND, finger, TENSIONS), rr.SeriesLines(names=pairs, colors=shades, widths=widths))
+            axes = [f"{axis}, N" for axis in "xyz"]
+            stream.static((HAND, finger, FORCES), rr.SeriesLines(names=axes, colors=[of_joint(at) for at in range(3)]))
+        labels = [f"{finger}, N" for finger in self._fingers]
+        stream.static(TIPS, rr.SeriesLines(names=labels, colors=[of_joint(at) for at in range(len(labels))]))
+
+    def write(self, block: RowBlock) -> None:
+        """Write every cycle of the hand."""
+        messages, times = block.messages, block.times
+        for at, (finger, joints) in enumerate(self._fingers.items()):
+            self._stream.scalars((HAND, finger, JOINTS), times, messages["position"][:, joints])
+            tensions = [
+                messages[field][:, row][:, joints] for field in ("wanted", "tension") for row in (FLEXOR, EXTENSOR)
+            ]
+            self._stream.scalars((HAND, finger, TENSIONS), times, np.hstack(tensions))
+            self._stream.scalars((HAND, finger, FORCES), times, messages["force"][:, at])
+        self._stream.scalars(TIPS, times, np.sqrt((messages["force"] ** 2).sum(axis=2)))
