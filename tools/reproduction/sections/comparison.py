@@ -124,12 +124,18 @@ def _layered(workshop: Workshop) -> Side:
 
 
 def _layered_tested(findings: Findings) -> Assessment:
-    flat = [name for name in systems() if len(_promise(name).levels) < 2]
-    if flat:
-        return Assessment(Side(), Ruling.BOUNDED, f"From the configs alone. No level above another: {', '.join(flat)}.")
+    """Judge from the configs alone: levels, and whether the slow ones are above the fast ones."""
+    promised = {name: _promise(name) for name in systems()}
+    flat = [name for name, said in promised.items() if len(said.levels) < 2]
+    even = [name for name, said in promised.items() if sorted(said.rates_hz) != list(said.rates_hz)]
+    if flat or even:
+        why = (
+            f"From the configs alone. Without a second level: {', '.join(flat) or 'none'}; with a faster level above a "
+        )
+        return Assessment(Side(), Ruling.BOUNDED, f"{why}slower one: {', '.join(even) or 'none'}.")
     why = (
-        "From the configs alone: every one has at least two levels, or could not be modelled faithfully with "
-        "fewer; the slow ones plan."
+        f"From the configs alone: all {len(promised)} have at least two levels, and no level is faster than the one "
+        "below."
     )
     return Assessment(Side(), Ruling.HOLDS, why)
 
