@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.reproduction.experiments.experiment import Workshop
-from rack.tools.reproduction.reproduction import CHAPTERS, chapters_named, experiments
+from rack.tools.reproduction.experiments.experiment import KEPT, Workshop
+from rack.tools.reproduction.reproduction import CHAPTERS, chapters_named, experiments, forget
 from rack.tools.reproduction.sections import application, model, opening, time
 from rack.tools.reproduction.sections.page import Assessment, Ruling
 from rack.tools.reproduction.sections.statement import Chapter, Findings
@@ -121,3 +121,11 @@ def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None
     assert lacking.tested.ruling is Ruling.UNTESTABLE
     assert lacking.tested.why == "this machine has one processor."
     assert all(claim.predicted.items for claim in (unmade, failed, lacking))
+
+
+def test_a_section_is_made_again_when_it_is_forgotten(tmp_path: Path) -> None:
+    (tmp_path / KEPT).mkdir()
+    for name in ("goto", "nasrem"):
+        (tmp_path / KEPT / f"{name}.json").touch()
+    forget(chapters_named(["3"]), tmp_path)
+    assert [path.name for path in (tmp_path / KEPT).iterdir()] == ["nasrem.json"]

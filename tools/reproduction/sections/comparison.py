@@ -12,6 +12,7 @@ from rack.tools.benches.systems.figures import SystemFigures
 from rack.tools.benches.systems.prediction import SystemPrediction, prediction
 from rack.tools.reproduction.experiments.experiment import PICTURES, Workshop
 from rack.tools.reproduction.experiments.systems import SYSTEMS, systems_of
+from rack.tools.reproduction.sections.gantt import DISTURBED
 from rack.tools.reproduction.sections.page import Assessment, Columns, Listing, Plate, Ruling, Side, code, text
 from rack.tools.reproduction.sections.statement import Chapter, Findings, Statement
 
@@ -76,8 +77,14 @@ def _compared(findings: Findings) -> Assessment:
         Plate(Path(drawn), "Responses with their bounds, ages of messages, and more, system by system."),
         Listing("\n".join(found.lines(None)), f"All figures, as {code('rack bench systems')} prints them."),
     )
-    if failed := [one.rack for one in found.figures if not one.worked]:
-        return Assessment(side, Ruling.FAILS, f"These did not run as they should: {', '.join(failed)}.")
+    failed = [one for one in found.figures if not one.worked]
+    if failed and all(one.realtime.missed > DISTURBED for one in failed):
+        missed = ", ".join(f"{one.rack} ({100 * one.realtime.missed:.1f} % of its fastest cycles)" for one in failed)
+        why = f"Missed too many cycles to do its task: {missed}. Should other programs have had the processors: "
+        return Assessment(side, Ruling.UNTESTABLE, f"{why}{code('rack reproduce --only 4.1 --again')}.")
+    if failed:
+        names = "; ".join(f"{one.rack}: {one.failure}" for one in failed)
+        return Assessment(side, Ruling.FAILS, f"These did not run as they should: {text(names)}.")
     late = [one.rack for one in found.figures if _is_beyond(one)]
     count = len(found.figures)
     if late:

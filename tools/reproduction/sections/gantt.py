@@ -31,6 +31,7 @@ WORST_CYCLES = 3
 """"At worst an updated plan should be available every third cycle"."""
 WORST_CYCLES = 3
 """"At worst an updated plan should be available every third cycle"."""
+AGAIN = code("rack reproduce --only 3.4 --again")
 DISTURBED = 0.02
 """Part of an executor's cycles late from which on a run shows the machine, not the figure."""
 MOSTLY = 0.5
@@ -107,7 +108,7 @@ def _judged(figure: FigureRack, works: bool, findings: Findings) -> Assessment:
     )
     measured = ran(figure, found)
     if fails(found) == works and DISTURBED < late(found, LEVEL) < MOSTLY:
-        why = f"Other programs had the processors too often: {said}. On a quiet machine, run it again."
+        why = f"Other programs had the processors too often: {said}. On a quiet machine: {AGAIN}."
         return Assessment(measured, Ruling.UNTESTABLE, why)
     if fails(found) == works:
         return Assessment(measured, Ruling.FAILS, f"The paper says that it {_verb(works)}; the run had {said}.")

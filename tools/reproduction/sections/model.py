@@ -123,7 +123,7 @@ def _loop_tested(findings: Findings) -> Assessment:
     if not bad:
         return Assessment(side, Ruling.HOLDS, f"All {due} cycles of all levels ended within their bound.")
     if bad < MOSTLY / 10 * due:
-        why = f"{due} cycles ended within their bound, {bad} were missed or skipped. {stolen(found)}"
+        why = f"{bad} of {due} cycles were missed or skipped; all others ended within their bound. {stolen(found)}"
         return Assessment(side, Ruling.BOUNDED, why)
     return Assessment(side, Ruling.FAILS, f"{bad} of {due} cycles were missed or skipped.")
 
