@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -10,7 +11,7 @@ from pydantic import TypeAdapter
 from rack.boards.config import load
 from rack.tools.benches.observed import Runs
 from rack.tools.benches.systems.bench import measure, systems
-from rack.tools.benches.systems.figures import SystemFigures, Systems
+from rack.tools.benches.systems.figures import Systems
 from rack.tools.console.progress import Progress
 from rack.tools.reproduction.experiments.experiment import Document, Experiment, Workshop
 
@@ -36,9 +37,10 @@ def _run(name: str, workshop: Workshop) -> Document:
     return plain
 
 
-def figures_of(found: Document) -> SystemFigures:
-    """Return the figures of a rack as they were measured."""
-    return TypeAdapter(Systems).validate_python(found).figures[0]
+def systems_of(found: Iterable[Document]) -> Systems:
+    """Return what was measured of several racks, as one comparison."""
+    each = [TypeAdapter(Systems).validate_python(one) for one in found]
+    return Systems(tuple(figures for one in each for figures in one.figures), SECONDS, each[0].absent)
 
 
 SYSTEMS = tuple(system_experiment(name) for name in systems())
