@@ -28,14 +28,10 @@ FINGERS = ("index", "middle", "ring", "thumb")
 OPEN = {**dict.fromkeys(FINGERS, (0.0, 0.17, 0.26, 0.17)), "thumb": (0.0, 0.05, 0.17, 0.17)}
 AROUND = {**dict.fromkeys(FINGERS, (0.0, 0.60, 0.70, 0.64)), "thumb": (0.0, 0.08, 0.90, 0.96)}
 POINTS = {"index": [0.014, 0.0, 0.03], "middle": [0.014, 0.0, 0.0], "ring": [0.014, 0.0, -0.03]}
-CLOSE: dict[str, Any] = {
-    "do": "close",
-    "object": "can",
-    "points": {**POINTS, "thumb": [-0.014, 0.0, 0.0]},
-    "speed": 0.06,
-}
+POINTS["thumb"] = [-0.014, 0.0, 0.0]
+CLOSE: dict[str, Any] = {"do": "close", "object": "can", "points": POINTS, "speed": 0.06}
 PRESHAPE: dict[str, Any] = {"do": "preshape", "posture": "around", "seconds": 0.5}
-SQUEEZE = {"do": "squeeze", "grip": 6.0, "seconds": 0.3}
+SQUEEZE = {"do": "squeeze", "grip": 5.0, "seconds": 0.3}
 LIFT = {"do": "shift", "by": [0.0, 0.0, 0.006], "seconds": 0.5}
 
 

@@ -74,6 +74,7 @@ def test_a_board_that_dies_leaves_the_object_in_the_hand(board: str) -> None:
     status = rig.grasp
     assert (status.state, status.error, status.reason) == (State.DONE, Error.NONE, "")
     assert status.touching.all()
+    assert status.farthest < 0.003
 
 
 def test_an_operator_holds_the_grasp_which_then_goes_on() -> None:
