@@ -33,6 +33,11 @@ class Fault(NamedTuple):
     since: int  # tick at which it began
     step: object  # acts the fault; of a class that the level lists in `faults`
 
+    @property
+    def joint(self) -> int:
+        """The joint that it strikes, by index; -1: all."""
+        return int(self.parameters.get("joint", -1))
+
 
 @dataclass(frozen=True)
 class ActiveFault:
@@ -87,6 +92,11 @@ class CommandStep:
     """Corrupts the torques commanded. `act` takes torques and limits, N m, and returns torques (joints,)."""
 
     act: Callable[[Array, Array, ActiveFault], Array]
+
+
+@dataclass(frozen=True)
+class TendonStep:
+    """Tears a tendon of a hand, so that it gives no tension: that of `joint` on `side`, 0 flexor, 1 extensor."""
 
 
 def _with_position(sample: Sample, position: Array, fault: ActiveFault) -> tuple[Sample, bool]:

@@ -85,6 +85,7 @@ class Alarm(IntEnum):
     # Raised by the board of a hand.
     TENSION_INVALID = 55  # [joint; -]  rejected: a tension is NaN or infinite
     TENSION_LIMIT = 56  # [joint; N]  a tension beyond its limits was cut
+    TENDON = 57  # [joint; N]  a tendon stays slack, although a tension is wanted of it
     # Raised by the network adapter: other racks, and those who ask from other machines.
     PEER_LOST = 60  # [number among the level's `names`; -]
     PEER_BACK = 61  # [number; ticks it was away]  the same launch as before

@@ -74,6 +74,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.COMMAND_LIMIT: ("joint", "torque of {subject} cut to its limit: {value:.3g} N m was commanded"),
     Alarm.TENSION_INVALID: ("joint", "rejected: a tension of {subject} is NaN"),
     Alarm.TENSION_LIMIT: ("joint", "tension of {subject} cut to its limit: {value:.3g} N was commanded"),
+    Alarm.TENDON: ("joint", "tendon of {subject} is slack: {value:.3g} N"),
     Alarm.BRAKES_OPENED: ("nothing", "brakes released after {span}"),
     Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),

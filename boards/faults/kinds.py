@@ -328,6 +328,20 @@ KINDS.add(
         bound=bounds.cycles_and_time(12, 30_000_000),
         lasts=draw.seconds(0.05, 0.4),
     ),
+    Kind(
+        name="tendon-torn",
+        where="arm",
+        means="a tendon of a hand gives no tension",
+        step=arm.TendonStep(),
+        parameters=(
+            _joint(),
+            Parameter("side", "1", "0: the flexor; 1: the extensor", 0, 0, 1, is_whole=True),
+        ),
+        detected_as=(Alarm.TENDON,),
+        # Slack in five cycles in a row; the first sample after it tears is that of a cycle later.
+        bound=bounds.cycles(5 + 1),
+        lasts=draw.seconds(0.05, 0.4),
+    ),
     _torque(
         name="command-nan",
         means="a commanded torque is NaN",

@@ -58,8 +58,7 @@ class FaultyLink:
         self._arm.weaken(self._most() if self._motors else None)
 
     def _joints(self, fault: Fault) -> NDArray[np.bool_]:
-        joint = int(fault.parameters.get("joint", -1))
-        return np.full(len(self._limits), True) if joint < 0 else np.arange(len(self._limits)) == joint
+        return np.full(len(self._limits), True) if fault.joint < 0 else np.arange(len(self._limits)) == fault.joint
 
     def _most(self) -> Array:
         most = np.full(len(self._limits), np.inf)

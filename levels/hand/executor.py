@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
+
 from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
-from rack.levels.arm import preload
+from rack.levels.arm import poses, substeps
 from rack.levels.errors import LevelError
+from rack.levels.faults import TendonStep
 from rack.levels.hand.messages import HAND_STATUS, TENSION_COMMAND
 from rack.levels.hand.simulated import HandSample, SimulatedHand
+from rack.levels.hand.slack_monitor import SlackMonitor
 from rack.levels.hand.tensions import Tensions
-from rack.levels.level import Executor, Finding, Input, LevelContext, Ports, Verdict
+from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports, Verdict
 from rack.levels.messages import ARM_STATE, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.robot.cell import build_cell
@@ -41,6 +45,7 @@ class HandExecutor(Executor):
     outputs = {"status": HAND_STATUS, "state": ARM_STATE, "scene": SCENES}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = Table
+    faults = (TendonStep,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -55,12 +60,15 @@ class HandExecutor(Executor):
         self._opened = False  # the valves have been open on this board, or before it was restarted
         self._waiting = ""  # why the boards above do not drive the hand; empty: they do
         self._wrong: Alarm | None = None  # last cycle's finding about a tension
+        self._slack = SlackMonitor(cell.hand, context.robot.joints)
+        self._torn: tuple[int, ...] = ()  # indices of the injected faults that tear tendons
         self._shown: tuple[Any, ...] | None = None  # what seldom changes, in the last status
 
     @classmethod
     def preload(cls) -> None:
         """Load the compiled functions of the plant."""
-        preload()
+        for module in (substeps, poses):
+            module.preload()
 
     @classmethod
     def misfits(
@@ -79,6 +87,16 @@ class HandExecutor(Executor):
                 why = f"joint '{joint}' must be commanded by one board; it is commanded by {by}"
                 yield "above", [other.board for other in above], why
 
+    def inject(self, faults: Sequence[Fault]) -> None:
+        """Replace the torn tendons; one of a joint that the hand lacks has no effect."""
+        joints = np.arange(len(self.hand.hand.arms))
+        struck = [(fault.joint < 0) | (joints == fault.joint) for fault in faults]
+        torn = np.zeros((2, len(joints)), dtype=bool)
+        for fault, own in zip(faults, struck, strict=True):
+            torn[int(fault.parameters["side"])] |= own
+        self.hand.tear(torn)
+        self._torn = tuple(place for place, own in enumerate(struck) if own.any())
+
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
         hand = self.hand
@@ -89,6 +107,8 @@ class HandExecutor(Executor):
         if read.operator.verdict is Verdict.NEW:
             self.orders.take(read.operator)
         sample = hand.sense()
+        self.findings += self._slack.look(sample.tension, hand.wanted)
+        self.acted += self._torn
         self._drive(read, tick)
         self._report(write.status, sample, tick)
         self.orders.report(write.status, self.tensions.rests_on)
@@ -145,7 +165,7 @@ class HandExecutor(Executor):
         status.torque, status.tension, status.force = sample.torque, sample.tension, sample.force
         status.wanted = hand.wanted
         counts = hand.clipped, hand.touches, hand.violations, hand.pushed
-        shown = self._waiting, self._opened, self.demand, counts, hand.fault
+        shown = self._waiting, self._opened, self.demand, counts, hand.fault, self._slack.note
         if shown == self._shown:
             return
         self._shown = shown
@@ -157,4 +177,4 @@ class HandExecutor(Executor):
             return
         status.state = State.EXECUTING if not closed else State.HOLDING if self._opened else State.IDLE
         status.error = Error.LIMIT if hand.violations else Error.TOUCHED if hand.touches else Error.NONE
-        status.reason = self._waiting or hand.first_violation or hand.first_touch
+        status.reason = self._waiting or hand.first_violation or hand.first_touch or self._slack.note

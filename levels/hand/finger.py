@@ -53,10 +53,9 @@ class FingerExecutor(HandLoop):
         self._joints = hand.fingers[finger]
         self._tip = FingertipLaw(FingerKinematics(self.cell, hand), [finger], params, context.period_s)
         self._servo = JointLaw(self.cell, self._joints, params)
-        self._tendons = TendonLaw(hand, self._joints, params, context.period_s)
+        self._tendons = TendonLaw(hand, self._joints, params, context)
         self._target = Message(FINGER_TARGET.dtype(context.sizes))
         self._torque = np.zeros(len(self._joints))
-        self._sampled = 0  # tick of the newest status of the hand
 
     @classmethod
     def preload(cls) -> None:
@@ -80,14 +79,10 @@ class FingerExecutor(HandLoop):
         self._tendons.start(hand)
         self._target.position, self._target.stiff = hand.position, 1.0
         self._servo.start(hand, self._target)
-        self._sampled = hand.tick
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
         """Write the tensions of the finger's tendons."""
-        tick_s, elapsed = self.context.tick_s, hand.tick - self._sampled
-        self._sampled = hand.tick
         follow_grasp(self, self._tip, hand, self._target, write.status, tick)
-        age_s = (tick + self.context.every - hand.tick) * tick_s
-        self._servo.torques(age_s, 0.0, self._torque)
-        self._tendons.tensions(self._torque, elapsed * tick_s, write.command.tension)
+        self._servo.torques(self.age_s(hand, tick), 0.0, self._torque)
+        self._tendons.tensions(self._torque, write.command.tension)
         write.command.driven, write.command.sampled = self._joints, hand.tick

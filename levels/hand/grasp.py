@@ -14,7 +14,7 @@ from rack.levels.errors import Refused
 from rack.levels.hand.fingers_below import FingersBelow
 from rack.levels.hand.grasp_program import CloseStep, GraspProgram, Posture, PreshapeStep, ShiftStep, SqueezeStep, Step
 from rack.levels.hand.grasp_steps import WORKS, Grasp, GraspParams, StepWork
-from rack.levels.hand.grip import Grip
+from rack.levels.hand.grip import HandGrip
 from rack.levels.hand.kinematics import FingerKinematics
 from rack.levels.hand.messages import FINGER_STATUS, GRASP_STATUS, GRASP_TARGET, GraspKind
 from rack.levels.hand.plan_message import GRASP_PLAN
@@ -70,7 +70,7 @@ class GraspExecutor(Executor):
             period_s=context.period_s,
             fingers=FingersBelow(context, kinematics.joints),
             target=Message(GRASP_TARGET.dtype(context.sizes)),
-            grip=Grip(params, np.full(len(names), False), self._opposing, context.period_s),
+            grip=HandGrip(params, np.full(len(names), False), self._opposing, context.period_s),
             touching=np.full(len(names), False),
         )
         self._work: StepWork | None = None  # on the step under way
@@ -191,10 +191,10 @@ class GraspExecutor(Executor):
         self._work = WORKS[type(step)](grasp, step, self._passed_s)
 
     def _take_up(self, close: CloseStep) -> None:
-        """Grip by a CLOSE from now on."""
+        """HandGrip by a CLOSE from now on."""
         grasp, gripping = self._grasp, np.array([name in close.points for name in self._grasp.names])
         grasp.close, grasp.base = close, 0.0
-        grasp.grip = Grip(grasp.params, gripping, self._opposing, self.context.period_s)
+        grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
     def _prepared(self, index: int) -> Step:
         """Return a step of the program with what the plan says, and with ways in the frame of the palm."""

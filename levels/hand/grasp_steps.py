@@ -27,7 +27,7 @@ from rack.levels.hand.grasp_program import (
     SqueezeStep,
     Step,
 )
-from rack.levels.hand.grip import Grip, GripGains
+from rack.levels.hand.grip import GripGains, HandGrip
 from rack.levels.hand.messages import FingerMode, GraspKind
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose
@@ -57,7 +57,7 @@ class Grasp:
     period_s: float
     fingers: FingersBelow
     target: Message  # the `GRASP_TARGET` that the steps fill
-    grip: Grip
+    grip: HandGrip
     touching: NDArray[np.bool_]  # (fingers,)
     close: CloseStep | None = None  # by which the object was, or is, gripped
     base: float = 0.0  # N: the grip wanted without a load
@@ -99,7 +99,7 @@ def least_jerk(time: float) -> tuple[float, float]:
     return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x), 30.0 * x * x * (1.0 - x) * (1.0 - x)
 
 
-class Preshape(StepWork):
+class PreshapeWork(StepWork):
     """Brings all joints to a posture; done when they are there."""
 
     kind = GraspKind.PRESHAPE
@@ -126,7 +126,7 @@ class Preshape(StepWork):
         return False
 
 
-class Close(StepWork):
+class CloseWork(StepWork):
     """Moves tips evenly towards points in the object, until each touches it; one that touches stays, and presses."""
 
     kind = GraspKind.CLOSE
@@ -172,7 +172,7 @@ class Close(StepWork):
         target.force[finger] = force
 
 
-class Held(StepWork):
+class GrippingWork(StepWork):
     """Base of the steps while the fingers have the object: they keep the grip, and notice when it is lost."""
 
     def __init__(self, grasp: Grasp, step: Step, passed_s: float) -> None:
@@ -209,7 +209,7 @@ class Held(StepWork):
             raise Refused(Error.OBJECT_LOST, f"lost '{close.object}': {far}")
 
 
-class Squeeze(Held):
+class SqueezeWork(GrippingWork):
     """Raises the grip. The object settles between the fingers meanwhile: its place is where it is afterwards."""
 
     kind = GraspKind.SQUEEZE
@@ -228,7 +228,7 @@ class Squeeze(Held):
         return part >= 1.0
 
 
-class Shift(Held):
+class ShiftWork(GrippingWork):
     """Moves the place of the object, and the points of the tips with it; `by` is a way in the palm's frame."""
 
     kind = GraspKind.SHIFT
@@ -252,7 +252,7 @@ class Shift(Held):
         return part >= 1.0
 
 
-class Hold(Held):
+class HoldWork(GrippingWork):
     """Keeps the object where it is."""
 
     kind = GraspKind.HOLD
@@ -264,7 +264,7 @@ class Hold(Held):
         return passed_s >= self.step.seconds
 
 
-class Release(StepWork):
+class ReleaseWork(StepWork):
     """Lets the forces fall in the first half of its time; the tips withdraw in the second."""
 
     kind = GraspKind.RELEASE
@@ -294,11 +294,11 @@ class Release(StepWork):
 
 
 WORKS: dict[type[Table], type[StepWork]] = {
-    PreshapeStep: Preshape,
-    CloseStep: Close,
-    SqueezeStep: Squeeze,
-    ShiftStep: Shift,
-    HoldStep: Hold,
-    ReleaseStep: Release,
+    PreshapeStep: PreshapeWork,
+    CloseStep: CloseWork,
+    SqueezeStep: SqueezeWork,
+    ShiftStep: ShiftWork,
+    HoldStep: HoldWork,
+    ReleaseStep: ReleaseWork,
 }
 """What is at work in a step, by the step's class."""

@@ -54,7 +54,6 @@ class JointLoop(HandLoop):
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
         """Write the torques for the newest targets."""
-        age_s = (tick + self.context.every - hand.tick) * self.context.tick_s
-        self._law.torques(age_s, self.ahead_s(tick), write.command.torque)
+        self._law.torques(self.age_s(hand, tick), self.ahead_s(tick), write.command.torque)
         write.command.sampled = hand.tick
         write.status.clipped = self._law.clipped

@@ -92,6 +92,10 @@ class HandLoop(Executor):
         self._report(read, write.status, kept)
         self.orders.report(write.status, self.command.operator)
 
+    def age_s(self, hand: Message, tick: int) -> float:
+        """Return how old the sample of a `HAND_STATUS` is when what this cycle commands acts, s."""
+        return float((min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s)
+
     def ahead_s(self, tick: int) -> float:
         """Return the time by which the command is to be taken on at its velocities, s: a cycle of the level above."""
         return min(tick - self._taken, self._period) * self.context.tick_s

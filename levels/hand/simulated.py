@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import PATIENCE_CYCLES
@@ -48,6 +49,8 @@ class SimulatedHand(Simulation):
         self._spring = np.stack((-pull, pull))  # (2, joints), N/rad: of closed valves
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._before = np.zeros(len(hand.arms))
+        acts = cell.model.actuator_actadr[hand.actuators]
+        self._acts = acts if (acts >= 0).all() else None  # (2, joints), tensions behind valves that take time
 
     def _start_with(self, tension: Array) -> None:
         """Let the valves have had tensions, (2, joints), N, for ever."""
@@ -80,6 +83,10 @@ class SimulatedHand(Simulation):
         self.waited, self.braked = 0, False
         self._data.ctrl[self.hand.actuators] = tension
 
+    def tear(self, torn: NDArray[np.bool_]) -> None:
+        """Let the tendons marked, (2, joints), give no tension, and all others theirs."""
+        self._model.actuator_gainprm[self.hand.actuators, 0] = np.where(torn, 0.0, 1.0)
+
     def close(self) -> None:
         """Close the valves."""
         self.braked = True
@@ -97,13 +104,19 @@ class SimulatedHand(Simulation):
             self._data.time = self._now_s
 
     def _simulate(self) -> None:
-        """Simulate one tick. The controls of closed valves follow the joints, below 0 too: MuJoCo cuts them there."""
+        """Simulate one tick. Tensions behind closed valves follow the joints at once, and their controls with them.
+
+        The controls may go below 0, where MuJoCo cuts them: a slack tendon is tight again where it became slack.
+        """
         if not self.braked:
             return super()._simulate()
         position, before = self._state[0], self._before
         before[:] = position
         super()._simulate()
-        self._data.ctrl[self.hand.actuators] += self._spring * (position - before)
+        drawn = self._spring * (position - before)
+        self._data.ctrl[self.hand.actuators] += drawn
+        if self._acts is not None:
+            self._data.act[self._acts] = np.maximum(self._data.act[self._acts] + drawn, 0.0)
         return None
 
 

@@ -22,9 +22,13 @@ from pydantic import Field
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
+from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
 from rack.levels.servo.driver import numbers
 from rack.levels.tables import NotNegative, Positive, Table
+
+MOST_LEARNED = 0.1
+"""Largest part of an error that one sample corrects, after however many that were missed."""
 
 
 class TendonGains(Table):
@@ -40,30 +44,36 @@ class TendonGains(Table):
 class TendonLaw:
     """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew after a restart."""
 
-    def __init__(self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, period_s: float) -> None:
-        """Drive the joints `driven`, (joints,), every `period_s`."""
+    def __init__(self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, context: LevelContext) -> None:
+        """Drive the joints `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
         self._constants = np.zeros((4, joints))  # in the rows of `set_tensions`
         self._constants[0], self._constants[1] = hand.arms, hand.least + gains.margin
         self._constants[2], self._constants[3] = hand.most, driven
-        self._numbers = hand.rest, gains.lead, 1.0 - math.exp(-period_s / gains.lag), gains.most_trim
-        self._lag, self._trim = gains.lag, gains.trim
+        self._numbers = hand.rest, gains.lead, 1.0 - math.exp(-context.period_s / gains.lag), gains.most_trim
+        self._lag, self._trim, self._tick_s = gains.lag, gains.trim, context.tick_s
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
-        self._sensed: Array = np.zeros(0)  # numbers of a status of the hand
-        self._elapsed_s, self._shares = 0.0, (0.0, 0.0)
+        self._elapsed, self._shares = 0, (0.0, 0.0)  # ticks between two samples, and shares of that time
         self._set = set_tensions.load()
+        self._status: Message  # of the hand
+        self._sensed: Array  # its numbers
+        self._sampled = 0  # tick of the last sample
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
     def start(self, status: Message) -> None:
         """Begin with the tensions of a `HAND_STATUS`, whose later contents are read from the same place."""
         self._valves[0], self._valves[1], self._valves[2] = status.wanted, status.tension, 0.0
+        self._status, self._sampled = status, status.tick
         self._sensed = numbers(status, "tension", "wanted")
 
-    def tensions(self, torque: Array, elapsed_s: float, out: Array) -> None:
-        """Set `out`, (2, joints), N, for `torque`, (joints,), N m; the sample before was `elapsed_s` older."""
-        if elapsed_s != self._elapsed_s:
-            self._elapsed_s = elapsed_s
-            self._shares = 1.0 - math.exp(-elapsed_s / self._lag), min(self._trim * elapsed_s, 0.5)
+    def tensions(self, torque: Array, out: Array) -> None:
+        """Set `out`, (2, joints), N, for `torque`, (joints,), N m."""
+        # Valves that are closed do not follow their commands: nothing is to be learned from them.
+        elapsed = 0 if self._status.holding else self._status.tick - self._sampled
+        self._sampled = self._status.tick
+        if elapsed != self._elapsed:
+            self._elapsed, elapsed_s = elapsed, elapsed * self._tick_s
+            self._shares = 1.0 - math.exp(-elapsed_s / self._lag), min(self._trim * elapsed_s, MOST_LEARNED)
         if self._set(self._numbers, self._shares, self._constants, self._valves, self._sensed, torque, out):
             self.clipped += 1
 

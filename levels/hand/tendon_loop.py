@@ -38,8 +38,7 @@ class TendonLoop(HandLoop):
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
         gains = read_params(TendonParams, context.params)
-        self._law = TendonLaw(self.hand, self.driven, gains, context.period_s)
-        self._sampled = 0  # tick of the newest status of the hand
+        self._law = TendonLaw(self.hand, self.driven, gains, context)
 
     @classmethod
     def preload(cls) -> None:
@@ -49,14 +48,12 @@ class TendonLoop(HandLoop):
     def meet(self, read: Ports, hand: Message) -> None:
         """Begin with the tensions that are there."""
         self._law.start(hand)
-        self._sampled = hand.tick
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
         """Write the tensions for the newest torques."""
-        elapsed_s, self._sampled = (hand.tick - self._sampled) * self.context.tick_s, hand.tick
         command = write.command
         command.driven = self.driven
         command.sampled = min(hand.tick, self.command.sampled) if self.commanded else -1
         if command.sampled >= 0:
-            self._law.tensions(self.command.torque, elapsed_s, command.tension)
+            self._law.tensions(self.command.torque, command.tension)
         write.status.clipped = self._law.clipped

@@ -20,9 +20,10 @@ class Tensions:
     """Joins the `TENSION_COMMAND`s of the boards above, each for the joints that it drives."""
 
     def __init__(self, context: LevelContext, hand: Hand) -> None:
-        # A tension rests on a status of a cycle ago and takes a cycle of its board; then the valves keep it.
+        # A tension rests on a status of a cycle ago. It takes a cycle of its board, and one of the board that gave that
+        # the torque; then the valves keep it.
         self.oldest = {  # ticks, by board
-            board: context.every + (1 + PATIENCE_CYCLES) * pace.every for board, pace in context.above.items()
+            board: context.every + (2 + PATIENCE_CYCLES) * pace.every for board, pace in context.above.items()
         }
         self._joints, self._low, self._high = context.robot.joints, hand.least, hand.most
         self._margin = MARGIN * hand.most

@@ -66,7 +66,8 @@ class ArmExecutor(ArmDriver):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield every joint, and the gripper, that not exactly one board above drives."""
+        """Yield every joint, and the gripper, that not exactly one board above drives, and what `ArmDriver` yields."""
+        yield from super().misfits(context, above, below)
         everything = context.robot.joints
         wanted = {other.board: other.params.get("joints", everything) for other in above}
         for joint in everything:

@@ -68,8 +68,9 @@ class ServoExecutor(ArmDriver):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield control modifications that do not suit the law."""
-        return misfits_of(context)
+        """Yield control modifications that do not suit the law, and what `ArmDriver` yields."""
+        yield from super().misfits(context, above, below)
+        yield from misfits_of(context)
 
     @classmethod
     def preload(cls) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from wave_levels import Watch
 
 from rack.backplane.message import Field, State, status
-from rack.levels.faults import CommandStep, MotorStep, SensorStep
+from rack.levels.faults import CommandStep, MotorStep, SensorStep, TendonStep
 from rack.levels.level import Executor, LevelContext, Ports
 
 PLACE = status("place", 1, Field("position", "f8", "rad", "where it is"), Field("mode", "i2", "1", "how it moves"))
@@ -15,7 +15,7 @@ class Driven(Executor):
     """Reports that it stands still."""
 
     outputs = {"status": PLACE}
-    faults = (SensorStep, MotorStep, CommandStep)
+    faults = (SensorStep, MotorStep, CommandStep, TendonStep)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Report its position."""

@@ -76,8 +76,8 @@ def test_every_kind_is_drawn_as_often_as_asked_for(course: RackUnderTest, kinds:
     found[EXTERNAL] += sum(len(plan.kills) for plan in plans)
     wanted = [kind for kind in kinds if not (lockstep and needs_real_time(kind))]
     assert +found == Counter(dict.fromkeys(wanted, COUNT))
-    # Nothing of the default rack has protocol lock.
-    assert set(KINDS.names) - set(kinds) == {"lock-held"}
+    # Nothing of the default rack has protocol lock, or tendons.
+    assert set(KINDS.names) - set(kinds) == {"lock-held", "tendon-torn"}
 
 
 def test_what_needs_real_time_is_no_matter_of_lockstep() -> None:

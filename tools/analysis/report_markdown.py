@@ -85,6 +85,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _task(report["task"])
     yield from _motion(report["motion"])
     yield from _hand(report["hand"])
+    yield from _force(report["force"])
     yield from _queues(report["queues"])
     yield from _interrupts(report["interrupts"])
     yield from _holds(report)
@@ -251,6 +252,16 @@ def _hand(hand: Report | None) -> Iterator[str | Grid]:
     )
     forces = ", ".join(f"{finger} {force:.2f}" for finger, force in hand["largest_force_n"].items())
     yield f"Largest force on each tip, N: {forces}."
+
+
+def _force(force: Report | None) -> Iterator[str]:
+    if force is None:
+        return
+    off = "" if force["force_rms_n"] is None else f"; axes of force {force['force_rms_n']:.2f} N RMS off"
+    yield (
+        f"Contact: at most {force['largest_force_n']:.1f} N and {force['largest_torque_nm']:.2f} N m, "
+        f"beyond the arm's limits in {force['exceeded_cycles']} cycles{off}."
+    )
 
 
 def _queues(queues: Sequence[Report]) -> Iterator[str]:

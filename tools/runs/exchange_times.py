@@ -116,4 +116,5 @@ def _arrivals(recording: Recording, box: MailboxSpec, reader: str, board: BoardI
     stamps, is_lockstep = recording.signal(box.name, "stamp_ns"), recording.rack_config.clock.mode == "lockstep"
     at_ns = released * layout.clock_ns if is_lockstep else np.rint(stamps * recording.rack_config.clock.speed)
     own = f"{recording.layout.task(reader).board}.plan" == box.name
-    return _Arrivals(released, at_ns, stamps, rows["start_ns" if own else "plan_ns"])
+    cycles = np.maximum(np.searchsorted(rows["tick"], reads, side="right") - 1, 0)
+    return _Arrivals(released, at_ns, stamps, rows["start_ns" if own else "plan_ns"][cycles])

@@ -74,7 +74,9 @@ class Holds:
         boxes = [box for box in segment.layout.mailboxes if box.name.endswith(".status") and box.writer in tasks]
         self._statuses = {box.writer: open_observer(segment, box.name) for box in boxes if "state" in _fields(box)}
         self._operated = {box.writer for box in boxes if _fields(box) >= OPERATED}
-        self._arm = next((box.writer for box in boxes if "demand" in _fields(box)), None)
+        driving = next((box for box in boxes if "demand" in _fields(box)), None)
+        self._arm = None if driving is None else driving.writer
+        self._stop = ("arm", "braked") if driving is None or "braked" in _fields(driving) else ("hand", "valves closed")
 
     def look(self) -> tuple[Hold, ...]:
         """Return the holds now, the arm's first; none once the run is over."""
@@ -90,7 +92,8 @@ class Holds:
             since = self._segment.block(self._arm)[Block.LEVEL_SINCE] if self._arm is not None else 0
             where = ", on its own machine" if self._segment.is_mirror else ""
             release = f"rack estop {self._segment.layout.rack} --reset{where}"
-            yield self._hold("arm", since, "braked: emergency stop", release)
+            what, how = self._stop
+            yield self._hold(what, since, f"{how}: emergency stop", release)
 
     def _awaiting(self) -> Iterator[Hold]:
         for board, why in awaited(self._segment):

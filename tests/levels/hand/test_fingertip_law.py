@@ -95,15 +95,21 @@ def test_torques_of_a_force_do_its_work() -> None:
     assert tips.target.torque[np.delete(np.arange(16), own)].tolist() == [0.0] * 12
 
 
-def test_a_tip_that_is_pushed_away_is_a_spring_of_its_stiffness() -> None:
+def test_a_tip_that_is_pushed_away_is_a_spring_of_its_stiffness_in_all_directions() -> None:
     tips = Tips()
     start = tips.run(1, BENT)
     tips.grasp.mode[FINGER], tips.grasp.tip[FINGER] = FingerMode.FORCE, start[FINGER]
     tips.grasp.stiffness[FINGER] = 200.0
-    pushed = BENT.copy()
-    own = the_kinematics().joints[FINGER]
-    pushed[own] += (0.02, -0.02, 0.01, 0.0)
-    away = tips.run(1, pushed)[FINGER] - start[FINGER]
+    tips.run(1, BENT)
     kinematics = the_kinematics()
-    kinematics.look(pushed)
-    assert tips.target.torque[own] == pytest.approx(kinematics.jacobian(FINGER).T @ (-200.0 * away))
+    own = kinematics.joints[FINGER]
+    for pushed in np.eye(4) * 1e-5:
+        kinematics.look(BENT)
+        jacobian = kinematics.jacobian(FINGER)
+        away = np.zeros(16)
+        away[own] = pushed
+        kinematics.look(BENT + away)
+        force = -200.0 * (kinematics.tip(FINGER) - start[FINGER])
+        torque = -tips.target.spring @ away
+        assert torque[own] == pytest.approx(jacobian.T @ force, rel=1e-3, abs=1e-9)
+        assert np.delete(torque, own).tolist() == [0.0] * 12

@@ -7,10 +7,13 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
+from rack.boards.faults.kinds import KINDS
 from rack.levels.hand.executor import HandExecutor
-from rack.levels.level import Demand, LevelContext
+from rack.levels.hand.messages import EXTENSOR
+from rack.levels.level import Demand, Fault, LevelContext
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation
+from rack.levels.servo import ArmExecutor, ServoExecutor
 from rack.levels.tables import PushConfig
 from tests.levels.arms import config
 from tests.levels.box import mute
@@ -87,7 +90,7 @@ def test_board_that_sees_nothing_new_closes_the_valves() -> None:
     rig.cycles(8)
     status = rig.status
     assert (status.state, status.stopped) == (State.HOLDING, 1)
-    assert status.reason == "tensions of board 'index' are stale: they rest on a status more than 16 ticks old"
+    assert status.reason == "tensions of board 'index' are stale: they rest on a status more than 20 ticks old"
     rig.swing("index").is_blind = False
     rig.cycles(10)
     assert_follows(rig)
@@ -176,6 +179,42 @@ def test_push_on_the_object_shows_as_an_error_only_when_something_is_struck() ->
     assert rig.read("hand.scene").position[0, 0] > 0.06
 
 
+def tear(rig: HandRig, joint: int, side: int) -> None:
+    kind = KINDS["tendon-torn"]
+    rig.executor.inject([Fault(kind.name, {"joint": joint, "side": side}, 1, rig.tick, kind.step)])
+
+
+def test_torn_tendon_is_found_within_its_bound_and_the_others_pull_on() -> None:
+    rig = swinging(())
+    tear(rig, 5, EXTENSOR)
+    assert str(KINDS["tendon-torn"].bound) == "6 cycles"
+    rig.cycles(6)
+    assert [(found.alarm, found.subject) for found in rig.executor.findings] == [(Alarm.TENDON, 5)]
+    assert rig.executor.acted
+    rig.cycles(2)
+    status = rig.status
+    assert (status.state, status.error) == (State.EXECUTING, Error.NONE)
+    assert status.reason == "slack: extensor of 'middle1'"
+    assert status.tension[EXTENSOR, 5] == 0.0
+    assert status.torque[5] > 0.0
+    assert np.delete(status.tension, 5, axis=1).min() >= 2.0
+    rig.executor.inject([])
+    rig.cycles(20)
+    assert rig.status.reason == ""
+    assert_follows(rig)
+
+
+def test_slack_that_closed_valves_bring_about_is_no_torn_tendon() -> None:
+    rig = swinging(())
+    rig.stop(Demand.STOP, ticks=40 * EVERY)
+    rig.cycles(2)
+    rig.executor.hand._data.ctrl[:] = -60.0  # as of fingers that have moved on
+    rig.cycles(30)
+    assert rig.status.tension.max() < 0.9
+    rig.cycles(30)
+    assert rig.executor.findings == []
+
+
 def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContext]:
     """Return the context of a hand's board, then those of the boards `above` with the fingers that they drive."""
     robot, scene = config("utah_mit" if hand else "puma560")
@@ -212,6 +251,13 @@ def test_board_of_a_hand_needs_a_hand() -> None:
     assert [misfit[2] for misfit in HandExecutor.misfits(own, others, [])] == [
         "this board drives a hand; [robot.hand] is missing"
     ]
+
+
+@pytest.mark.parametrize("kind", [ArmExecutor, ServoExecutor])
+def test_board_of_an_arm_drives_no_hand(kind: type[ArmExecutor | ServoExecutor]) -> None:
+    own, *_ = context({})
+    first, *_ = kind.misfits(own, [], [])
+    assert first == ("executor", kind.__name__, "it drives an arm with motors; [robot.hand] is a hand of tendons")
 
 
 def test_rig_swings_by_what_the_hand_has_sensed() -> None:

@@ -51,9 +51,9 @@ def test_open_hand_carries_its_weight_before_the_first_command() -> None:
 def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_the_valve() -> None:
     hand = hand_of()
     before = hand.sense().tension[FLEXOR, INDEX1]
-    hand.pull(flexed(hand, INDEX1, 65.0))
-    risen = []
+    wanted, risen = flexed(hand, INDEX1, 65.0), []
     for _ in range(40):
+        hand.pull(wanted)
         hand.step(1)
         risen.append((hand.sense().tension[FLEXOR, INDEX1] - before) / (65.0 - before))
     times = TICK_S * np.arange(1, 41) - 0.001

@@ -11,10 +11,13 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.hand.messages import HAND_STATUS
 from rack.levels.hand.tendon_law import TendonGains, TendonLaw
+from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
-from tests.levels.arms import cell
+from tests.levels.arms import cell, config
 
-PERIOD_S, LAG_S, SUBSTEPS = 0.002, 0.008, 8
+EVERY, TICK_NS, LAG_S, SUBSTEPS = 4, 500_000, 0.008, 8
+CONTEXT = LevelContext("tendon", EVERY, 1, TICK_NS, 0, *config("utah_mit"), {}, {})
+PERIOD_S = CONTEXT.period_s
 EXACT = TendonGains(lead=0.0, trim=0.0, margin=0.0)
 
 
@@ -34,18 +37,19 @@ class Valves:
         self.status.tension = self.status.wanted = self.hand.rest
         self.tension = np.full((2, joints), self.hand.rest)
         self.wanted = self.tension.copy()
-        self.law = TendonLaw(self.hand, np.full(joints, True), gains, PERIOD_S)
+        self.law = TendonLaw(self.hand, np.full(joints, True), gains, CONTEXT)
         self.law.start(self.status)
         self.histories: list[Array] = []
 
     def run(self, torque: Array, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD_S)):
             sensed, wanted = self.tension.copy(), self.wanted.copy()
-            self.law.tensions(torque, PERIOD_S, self.wanted)
+            self.law.tensions(torque, self.wanted)
             for _ in range(SUBSTEPS):
                 aim = self._gain * self.wanted + self._offset
                 self.tension += (aim - self.tension) * (1.0 - math.exp(-PERIOD_S / SUBSTEPS / LAG_S))
             self.status.tension, self.status.wanted = sensed, wanted
+            self.status.tick += EVERY
             self.histories.append(self.torque)
 
     @property
@@ -58,7 +62,7 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
     valves = Valves()
     hand = valves.hand
     torque = part * hand.torque
-    valves.law.tensions(torque, 0.0, valves.wanted)
+    valves.law.tensions(torque, valves.wanted)
     flexors, extensors = valves.wanted
     assert hand.arms * (flexors - extensors) == pytest.approx(torque)
     assert valves.wanted.min() >= hand.least
@@ -72,7 +76,7 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
 
 def test_a_torque_beyond_the_tendons_is_clipped_and_counted() -> None:
     valves = Valves()
-    valves.law.tensions(3.0 * valves.hand.torque, 0.0, valves.wanted)
+    valves.law.tensions(3.0 * valves.hand.torque, valves.wanted)
     assert valves.wanted[0] == pytest.approx(valves.hand.most)
     assert valves.wanted[1] == pytest.approx(valves.hand.least)
     assert valves.law.clipped == 1
@@ -106,7 +110,8 @@ def test_lasting_errors_of_valves_are_learned_and_the_least_tension_is_kept(gain
 def test_a_sensor_that_gives_no_number_teaches_nothing() -> None:
     valves = Valves(gains=TendonGains())
     valves.status.tension[0, 0] = math.nan
-    valves.law.tensions(np.zeros(16), PERIOD_S, valves.wanted)
+    valves.status.tick += EVERY
+    valves.law.tensions(np.zeros(16), valves.wanted)
     assert np.isfinite(valves.wanted).all()
     valves.run(0.1 * valves.hand.torque, 2.0)
     assert np.isfinite(valves.tension[:, 1:]).all()
@@ -114,11 +119,25 @@ def test_a_sensor_that_gives_no_number_teaches_nothing() -> None:
 
 def test_tendons_of_other_boards_get_no_tension() -> None:
     hand = the_hand()
-    law = TendonLaw(hand, hand.fingers[3], TendonGains(), PERIOD_S)
+    law = TendonLaw(hand, hand.fingers[3], TendonGains(), CONTEXT)
     status = Message(HAND_STATUS.dtype({"joints": 16, "fingers": 4}))
     status.tension = status.wanted = hand.rest
     law.start(status)
     tension = np.zeros((2, 16))
-    law.tensions(0.1 * hand.torque, PERIOD_S, tension)
+    status.tick += EVERY
+    law.tensions(0.1 * hand.torque, tension)
     assert (tension[:, ~hand.fingers[3]] == 0.0).all()
     assert (tension[:, hand.fingers[3]] >= hand.least).all()
+
+
+def test_valves_that_are_closed_teach_nothing() -> None:
+    valves = Valves(gains=TendonGains())
+    torque = 0.1 * valves.hand.torque
+    valves.run(torque, 1.0)
+    before = valves.wanted.copy()
+    valves.status.holding = 1
+    for _ in range(500):
+        valves.status.tick += EVERY
+        valves.status.tension += 0.1
+        valves.law.tensions(torque, valves.wanted)
+    assert valves.wanted == pytest.approx(before)
