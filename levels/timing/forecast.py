@@ -83,6 +83,8 @@ class Forecast:
 def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
     if queues := [queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues]:
         yield f"the system's response is that of empty queues: {', '.join(queues)}"
+    if rack.inboxes:
+        yield f"the system's response leaves out how long messages wait to be served: {', '.join(rack.inboxes)}"
     known = [board for board in rack.boards.values() if board.budget is not None]
     if known and rack.is_lockstep:
         yield "in lockstep a tick waits for late tasks; this is the timing of the same rack in real time"

@@ -149,12 +149,14 @@ def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareR
     """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it.
 
     Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes there is none; and
-    for one with an exchange, which belongs to the board.
+    for one with an exchange or with interrupts, which belong to the board.
     """
     if exchanged := [spec.name for spec in layout.mailboxes if spec.exchanges]:
         raise Failure(f"{', '.join(exchanged)}: read at a rate of its own; only racks without any run without boards")
     if queues := [spec.name for spec in layout.mailboxes if spec.capacity]:
         raise Failure(f"{', '.join(queues)}: a queue; only racks without any run without mailboxes")
+    if served := [spec.name for spec in layout.mailboxes if spec.interrupt is not None]:
+        raise Failure(f"{', '.join(served)}: interrupts its readers; only racks without any run without boards")
     posts = {spec.name: Post(spec) for spec in layout.mailboxes}
     tasks = [BareTask(layout, wiring, posts, ticks) for wiring in wirings]
     try:

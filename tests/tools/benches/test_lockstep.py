@@ -67,3 +67,9 @@ def test_work_apart_raises_what_it_raised_and_says_when_it_ended() -> None:
         apart(fails)
     with pytest.raises(Failure, match="ended with status 4"):
         apart(exits)
+
+
+def test_a_rack_whose_boards_interrupt_each_other_does_not_run_bare(small: Path) -> None:
+    resolved = resolve(load(small, ["protocol.default=interrupt"]))
+    with pytest.raises(Failure, match="interrupts its readers; only racks without any run without boards"):
+        run_bare(resolved.layout, resolved.tasks, 1)
