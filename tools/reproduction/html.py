@@ -39,7 +39,7 @@ MEANINGS = {
     Ruling.HOLDS: "Prediction and measurement agree with the paper.",
     Ruling.BOUNDED: "It holds, with limits that the text names, of this machine or of the claim.",
     Ruling.CONTRADICTS: "What the paper says in one place excludes what it says in another.",
-    Ruling.UNTESTABLE: "This machine or this project lacks what a test needs; the text says what.",
+    Ruling.UNTESTABLE: "This machine lacks what a test needs, or was too busy; the text says what.",
     Ruling.FAILS: "Prediction or measurement contradicts the paper.",
     Ruling.UNMADE: "Its experiments have not been made, or could not be finished.",
 }
