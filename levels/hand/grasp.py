@@ -35,8 +35,9 @@ class GraspExecutor(Executor):
     """Does the steps of a program in their order; the fingers keep what they do while it waits.
 
     It waits while a finger does not follow, and on an operator's hold; then the step under way goes on. A step that
-    fails ends the program with an error: the fingers stay. With a planner above, the posture before a CLOSE, its points
-    and the grip after it are those of the newest plan. After a restart it continues from its own last messages.
+    fails, or waits for too long, ends the program with an error: the fingers stay. With a planner above, the posture
+    before a CLOSE, its points and the grip after it are those of the newest plan. After a restart it continues from its
+    own last messages.
     """
 
     inputs = {
@@ -76,6 +77,7 @@ class GraspExecutor(Executor):
         self._work: StepWork | None = None  # on the step under way
         self._done = 0  # steps that are done
         self._passed_s = 0.0  # since the step under way began, without waiting
+        self._waited_s = 0.0  # in a row, other than for an operator
         self._failed = Refused(Error.NONE, "")
         self._plan = Message(GRASP_PLAN.dtype(context.sizes))  # in use; id 0: none
         self._tick: int | None = None  # of the last cycle
@@ -110,6 +112,7 @@ class GraspExecutor(Executor):
             self._recall(read)
         self._tick = tick
         waits = self._waits(read)
+        self._count_waiting(waits)
         if not waits and not self._failed.code and self._done < len(self._program.step):
             self._go_on(read)
         if waits or self._failed.code:
@@ -153,6 +156,13 @@ class GraspExecutor(Executor):
         if read.plan and not self._newest(read.plan).id and self._awaits_plan():
             return NO_PLAN.format(", ".join(read.plan))
         return ""
+
+    def _count_waiting(self, waits: str) -> None:
+        """Fail when something has kept the program for too long."""
+        is_over = self._done == len(self._program.step) or self._orders.standing is Operation.HOLD
+        self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
+        if self._waited_s > self._grasp.params.stalled and not self._failed.code:
+            self._failed = Refused(Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}")
 
     @staticmethod
     def _newest(plans: Mapping[str, Reading]) -> Message:

@@ -42,6 +42,9 @@ class GraspParams(GripGains):
 
     astray: Positive = Field(0.03, description="distance from a posture at which a joint has reached it, rad")
     patience: Positive = Field(1.0, description="time in excess of its own after which a step has failed, s")
+    stalled: Positive = Field(
+        60.0, description="time of waiting, other than for an operator, that fails the program, s"
+    )
     lost: Positive = Field(0.2, description="time without touch after which a finger has lost the object, s")
     tolerance: Positive = Field(0.02, description="distance of a gripped object from its place: it is lost, m")
 

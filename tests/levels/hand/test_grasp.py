@@ -96,6 +96,16 @@ def test_an_operator_holds_the_grasp_which_then_goes_on() -> None:
     assert rig.grasp.kind == GraspKind.NONE
 
 
+def test_a_program_that_is_kept_for_too_long_fails() -> None:
+    rig = GraspRig("fingers", [PRESHAPE, CLOSE], stalled=0.3)
+    rig.run(0.2)
+    rig.lose("thumb", ticks=2000)
+    assert rig.go(0.9)
+    status = rig.grasp
+    assert (status.state, status.error) == (State.ERROR, Error.STALLED)
+    assert status.reason.startswith("waited for 0.3 s: ")
+
+
 WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
     "finger": (program() | {"opposing": "little"}, "opposing", "no such finger; fingers: index, middle, ring, thumb"),
     "posture": (program({**PRESHAPE, "posture": "fist"}), "step[0].posture", "no such posture; postures: open, around"),
