@@ -66,6 +66,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, ClassVar, NamedTuple
 
+from pydantic import model_validator
+
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.queue import ALL
 from rack.backplane.message import Message, MessageType
@@ -73,7 +75,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.faults import Fault
 from rack.levels.operator import Commands, Operation
-from rack.levels.tables import RobotConfig, SceneConfig, Table
+from rack.levels.tables import RobotConfig, SceneConfig, Table, frozen
 
 __all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
 __all__ += ["MadePorts", "Ports", "Program", "Reading", "Verdict"]
@@ -134,6 +136,12 @@ class Ports(SimpleNamespace):
 
 class Program(Table):
     """Base of the record of a level that reads a program from `[task]`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_frozen_tables(cls, table: Any) -> Any:
+        """Freeze the lists in tables by names of the user's own, too."""
+        return frozen(table)
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
         """Yield key, as in "action[0].object", value and reason of each entry that does not suit arm or scene."""

@@ -33,12 +33,17 @@ class Table(BaseModel):
     @classmethod
     def _with_tuples(cls, table: Any) -> Any:
         """Turn TOML's lists into tuples, which are frozen."""
-        return _tuple(table) if isinstance(table, dict) else table
+        return {key: _tuple(value) for key, value in table.items()} if isinstance(table, dict) else table
+
+
+def frozen(value: Any) -> Any:
+    """Return a value of TOML with tuples in place of all lists in it, also of those in tables."""
+    if isinstance(value, dict):
+        return {key: frozen(item) for key, item in value.items()}
+    return tuple(map(frozen, value)) if isinstance(value, list) else value
 
 
 def _tuple(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _tuple(item) for key, item in value.items()}
     return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
 
 

@@ -329,6 +329,31 @@ def systems(
 
 
 @bench.command()
+def hand(
+    rounds: Rounds = 1,
+    share: Share = False,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Compare table-driven buffers with interrupt-driven messages, on the same hand.
+
+    The racks hic and condor grasp a can, keep it while it is pulled, and release it, by turns. In real time, then in
+    lockstep, where everything is exact: what the workstation of condor sent in real time enters again.
+
+    The output shows how far the pulls move the can, the processor time of messages, cycles missed or skipped; and of
+    every link, under the type of its messages: the jitter of arrival, the age of messages when they are read, and how
+    many were lost. Exit status 1 if a rack did not do its task.
+    """
+    from rack.tools.benches.hand import measure
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(rounds, share, progress)
+    show(found, plot, as_json)
+    raise typer.Exit(0 if found.worked else 1)
+
+
+@bench.command()
 def lan(
     racks: Annotated[list[int] | None, typer.Option(metavar="N", min=1, max=64, help="racks; several times")] = None,
     rate: Rates = None,

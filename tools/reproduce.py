@@ -21,6 +21,7 @@ Out = Annotated[Path, typer.Option(metavar="DIR", help="folder of the page; one 
 Only = Annotated[
     list[str], typer.Option("--only", metavar="SECTION", help='only this section, as in 3.4 or "abstract"; repeatable')
 ]
+Again = Annotated[bool, typer.Option("--again", help="make anew what is kept, of the sections of --only or of all")]
 Share = Annotated[
     bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
 ]
@@ -29,6 +30,7 @@ Share = Annotated[
 def reproduce(
     out: Out = PAGE,
     only: Only = [],  # noqa: B006  typer copies it
+    again: Again = False,
     share: Share = False,
     as_json: Json = False,
 ) -> None:
@@ -51,6 +53,7 @@ def reproduce(
     Examples:
       rack reproduce
       rack reproduce --out paper --only 3.4
+      rack reproduce --only 3.4 --again
       rack reproduce --json | jq .rulings
     """
     from rack.tools.console.progress import progress_for
@@ -60,6 +63,8 @@ def reproduce(
     wanted = reproduction.chapters_named(only)
     if out.exists() and not out.is_dir():
         raise Failure(f"--out {out}: exists, and is not a folder", 2)
+    if again:
+        reproduction.forget(wanted, out)
     with INTERRUPT.orderly(INTERRUPT.end, unfinished=STAYS.format(out)), progress_for(as_json) as progress:
         page = reproduction.reproduce(wanted, Workshop(out, share), progress)
     is_good = reproduction.worked(page, wanted)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import norm
+from rack.levels.algebra import Array, norm
 from rack.levels.arm import wrist
 from rack.levels.arm.wrist import ContactWrench
 from rack.levels.errors import LevelError
@@ -38,11 +38,13 @@ class ForceArmExecutor(ArmExecutor):
     """Writes the wrench of the contact in every cycle; stops the arm when it is beyond `[robot.wrist]` most_*.
 
     A contact stops the arm for as long as it is too strong and for `retry` longer; after `patience` the fault is
-    latched, as others are. A sensor at the end of its range counts as beyond: what it senses is not known.
+    latched, as others are. Brakes let the arm spring back a little; an arm that holds keeps pressing. A sensor at the
+    end of its range counts as beyond: what it senses is not known. What a gripper holds counts as contact.
 
-    Weight and inertia of the tool are taken off by the acceleration that the joints' velocities show. At the limits of
-    acceleration a tool of 1.1 kg would otherwise seem to be pushed by 7 N; by that acceleration by 0.2 N at most, where
-    dry friction changes sign, by the set points' acceleration by 2.3 N (measured with exact encoders at 1 kHz).
+    Weight and inertia of the tool are taken off, by the acceleration that the joints' velocities show or, where
+    encoders are coarse, by that of the set points. At the limits of acceleration a tool of 1.1 kg would otherwise seem
+    to be pushed by 7 N; with the first, at 1 kHz, by 0.2 N, with the second by 2.3 N at most, where dry friction
+    changes sign. (With encoders of 1 mrad that is 2.6 N; their velocities would make 10 N of noise.)
     """
 
     inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
@@ -56,6 +58,7 @@ class ForceArmExecutor(ArmExecutor):
         self._most = self.cell.wrist.most
         self._on_limit = Reaction[params.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
+        self._exact = self.cell.encoders.exact
         self._before = np.zeros(len(self.cell.dof))  # (joints,), rad/s: velocities at the tick before
         self._since: int | None = None  # that tick; None: not known
         self._exceeded = 0  # cycles in which the contact was beyond the limits
@@ -89,14 +92,20 @@ class ForceArmExecutor(ArmExecutor):
 
     def feel(self, tick: int) -> None:
         """Sense the contact; stop the arm if it is too strong."""
-        sensors, contact, raw = self.sensors, self.contact, self.arm.feel()
+        raw, velocity = self.arm.feel(), self._velocity
         assert raw is not None, "the self-test refuses an arm without a sensor"
-        still = self._since is None or sensors.faulty
         passed_s = self.context.tick_s * (self.context.every if self._since is None else tick - self._since)
-        gained = np.zeros(len(self._before)) if still else sensors.velocity - self._before
-        contact.take(raw, sensors.state, gained / passed_s)
-        self._before[:], self._since = sensors.velocity, tick
+        known = self._since is not None and not self.sensors.faulty and (self._exact or not self.abandoned)
+        gained = velocity - self._before if known else np.zeros(len(velocity))
+        self.contact.take(raw, self.sensors.state, gained / passed_s)
+        self._before[:], self._since = velocity, tick
         self._limit(tick)
+
+    @property
+    def _velocity(self) -> Array:
+        """Velocities whose change is the arm's acceleration, (joints,), rad/s."""
+        velocity: Array = self.sensors.velocity if self._exact else self._wanted[1]
+        return velocity
 
     def _limit(self, tick: int) -> None:
         """Stop the arm if the contact is beyond a limit, or not known to be within it."""
@@ -118,7 +127,7 @@ class ForceArmExecutor(ArmExecutor):
 
     def started(self) -> None:
         """Continue from the state that was restored."""
-        self._before[:], self._since = self.sensors.velocity, self.arm.tick
+        self._before[:], self._since = self._velocity, self.arm.tick
 
     def terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with what the gripper holds, and with the contact."""

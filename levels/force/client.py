@@ -1,7 +1,7 @@
 """A client of a server of force and motion, on the host side: its calls, besides those of `Motions`.
 
     comply("wipe")                what follows is done with the axes of force of [task.contact.wipe]
-    comply("wipe", force={"z": 20.0})        the same with another force
+    comply("wipe", wrench={"z": 20.0})       the same with another force
     guard("touch")                the next of its wrenches ends the motion under way
     free()                        motion alone, without guards
     wrench(), mode()              of the tool on the surroundings, N, N m, by axis; what the server does

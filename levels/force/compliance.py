@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
+from rack.levels.force.contact import AXIS_NAMES, HALVES
 from rack.levels.force.hybrid_law import ForceTask, turned
 from rack.levels.force.messages import AXES
 from rack.levels.level import Ports, Reading
@@ -15,8 +16,6 @@ from rack.levels.operator import ABOVE_LOST
 
 OLDEST_CYCLES = 2
 """Cycles of the level after which a wrench is too old."""
-AXIS_NAMES = ("x", "y", "z", "rx", "ry", "rz")
-HALVES = ((slice(0, 3), "force", "N"), (slice(3, 6), "torque", "N m"))
 
 
 class ComplianceWatch:

@@ -15,6 +15,8 @@ Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXIS_NAMES: tuple[Axis, ...] = get_args(Axis)
 """Axes of a task frame: along x, y, z, then about them."""
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
+HALVES = ((slice(0, 3), "force", "N"), (slice(3, 6), "torque", "N m"))
+"""The halves of a wrench."""
 MAX_UNIT_ERROR = 1e-3
 """A quaternion whose length is farther from 1 is no orientation."""
 SAME = 1e-9
@@ -42,14 +44,14 @@ class Contact:
         if turned:
             self.guard[:] = 0.0
         self.id += 1
-        self.frame[:], self.selected[:], self.speed[:] = frame, selected, speed
+        self.frame[:], self.selected[:], self.speed[:] = frame / norm(frame), selected, speed
         self.wrench[:] = np.where(selected, wrench, 0.0)
         return begins_anew
 
     def watch(self, frame: Array, guard: Array) -> None:
         """Replace the guards."""
         self.id += 1
-        self.frame[:], self.guard[:] = frame, guard
+        self.frame[:], self.guard[:] = frame / norm(frame), guard
 
     def unguard(self) -> None:
         """End the guards."""
@@ -73,7 +75,7 @@ class Contact:
 
     def _is_frame(self, frame: Array) -> bool:
         # q and -q are the same orientation.
-        return bool(1.0 - abs(float((frame * self.frame).sum())) < SAME)
+        return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
     def fill(self, compliance: Message) -> None:
         """Fill a `COMPLIANCE`."""
@@ -98,7 +100,7 @@ def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) ->
     if not abs(norm(frame) - 1.0) <= MAX_UNIT_ERROR:
         return f"the task frame's quaternion has length {norm(frame):.3g}; permitted: 1"
     for wrench in vectors:
-        for part, limit, what, unit in ((slice(3), most[0], "force", "N"), (slice(3, 6), most[1], "torque", "N m")):
-            if not norm(wrench[part]) <= limit:
-                return f"{what} {norm(wrench[part]):g} {unit}; permitted by the arm and its sensor: {limit:g}"
+        for (half, what, unit), limit in zip(HALVES, most, strict=True):
+            if not norm(wrench[half]) <= limit:
+                return f"{what} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor: {limit:g}"
     return ""

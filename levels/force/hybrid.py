@@ -31,10 +31,11 @@ PASSED = ("opening", "force", "payload_mass", "payload_offset", "operator")
 class HybridExecutor(Executor):
     """Hands the references of the level above on, later by `LEAD_CYCLES`; on axes of force it moves for the force.
 
-    A guard that is struck ends the motion: the arm ramps to rest and holds, until the level above has another command;
-    axes of force keep their forces. Without a fresh wrench, or while the level above is lost, the arm rests on all of
-    them. References after that, after the brakes, and after a restart of this board, begin where `status` says that the
-    arm is held; those that go on are followed with the same difference as before.
+    A guard that is struck ends the motion: the arm ramps to rest and holds until the level above has another command;
+    axes of force keep their forces. Without a fresh wrench, or while the level above is lost, all axes rest.
+
+    References after that, after the brakes, and after a restart of this board, begin where `status` says that the arm
+    is held. References that go on when axes cease to be of force are followed at the distance that force has left.
     """
 
     inputs = {
@@ -112,8 +113,7 @@ class HybridExecutor(Executor):
         payload = Payload(command.payload_mass, command.payload_offset)
         joints = self._law.step(motion, watch.task, passed_s, payload)
         command.due = tick + LEAD_CYCLES * self.context.every
-        command.position, command.velocity, command.inertia, command.load = joints
-        command.acceleration[:] = 0.0
+        command.position, command.velocity, command.acceleration, command.inertia, command.load = joints
         self._target, self._moving[:] = joints.position, motion.velocity
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
             self._begin(self._target, tick)

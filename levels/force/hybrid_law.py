@@ -64,6 +64,7 @@ class JointCommand(NamedTuple):
 
     position: Array  # rad
     velocity: Array  # rad/s
+    acceleration: Array  # rad/s2
     inertia: Array  # kg m2: diagonal of the joint-space inertia
     load: Array  # N m: of gravity, of motion, and of the force wanted
 
@@ -124,7 +125,8 @@ class HybridLaw:
         self._away[:] = position - q
         if task is None:
             self._base[:] = self._away
-        return self._finish(task, position, velocity, passed_s, payload)
+        gained = motion.acceleration + (self._speed - before) / passed_s
+        return JointCommand(position, velocity, gained, *self._loads(task, position, velocity, passed_s, payload))
 
     def _velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
         """Return the joint velocities, rad/s, that follow the motion on its axes, and move for force on the others."""
@@ -146,15 +148,15 @@ class HybridLaw:
         excess = float((np.abs(velocity) / self._limits.velocity).max())
         return velocity / excess if excess > 1.0 else velocity
 
-    def _finish(
+    def _loads(
         self, task: ForceTask | None, position: Array, velocity: Array, passed_s: float, payload: Payload
-    ) -> JointCommand:
+    ) -> tuple[Array, Array]:
+        """Return inertia and load, N m, there; the force fed forward follows the one wanted at the loop's pace."""
         self._here.look(position, velocity, payload)
         forward = np.zeros(AXES) if task is None else turned(task.rotation, np.where(task.selected, task.wanted, 0.0))
         self._forward += min(self._pace * passed_s, 1.0) * (forward - self._forward)
         inertia, bias = self._here.terms
-        load = bias + transposed_mat_vec(self._here.jacobian, self._forward)
-        return JointCommand(position, velocity, inertia.diagonal(), load)
+        return inertia.diagonal(), bias + transposed_mat_vec(self._here.jacobian, self._forward)
 
 
 def turned(rotation: Array, vector: Array) -> Array:

@@ -42,9 +42,13 @@ class ContactConfig(Table):
     """`[task.contact.<name>]`: a contact for the calls `comply` and `guard`; axes that are not named are of motion."""
 
     frame: str = Field(description="task frame")
-    force: dict[Axis, Finite] = Field({}, description="wanted of the tool on the surroundings, N, N m, by axis")
-    speed: dict[Axis, Positive] = Field({}, description="most on an axis of force, m/s, rad/s; default: the server's")
-    guard: dict[Axis, Positive] = Field({}, description="wrench, either way, that ends a motion, N, N m, by axis")
+    wrench: dict[Axis, Finite] = Field(
+        {}, description="of the tool on the surroundings on axes of force, N or N m; by axis"
+    )
+    speed: dict[Axis, Positive] = Field(
+        {}, description="most on an axis of force, m/s or rad/s; by axis; default: the server's"
+    )
+    guard: dict[Axis, Positive] = Field({}, description="wrench, either way, that ends a motion, N or N m; by axis")
 
 
 class Wanted(NamedTuple):
@@ -65,31 +69,28 @@ class ForceProgram(Program):
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
         """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and sensor."""
-        for name, frame in self.frame.items():
-            if reason := frame.objection():
-                yield f"frame.{name}", frame.model_dump(), reason
+        bent = {name: reason for name, frame in self.frame.items() if (reason := frame.objection())}
+        for name, reason in bent.items():
+            yield f"frame.{name}", self.frame[name].model_dump(), reason
         for name, contact in self.contact.items():
-            if reason := self.objection(contact, robot):
+            if contact.frame not in bent and (reason := self.objection(contact, robot)):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
     def objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
         """Return why a contact is impossible; empty: it is not."""
-        frame = self.frame.get(contact.frame)
-        if frame is None:
+        if contact.frame not in self.frame:
             return f"frame '{contact.frame}' is not in [task.frame]; permitted: {', '.join(self.frame) or 'none'}"
-        if reason := frame.objection():
-            return f"frame '{contact.frame}': {reason}"
         if robot is None or robot.wrist is None:
             return "the arm has no wrist sensor"
-        if idle := [axis for axis in contact.speed if axis not in contact.force]:
-            return f"axis {idle[0]} has a speed and no force; axes of force: {', '.join(contact.force) or 'none'}"
+        if idle := [axis for axis in contact.speed if axis not in contact.wrench]:
+            return f"axis {idle[0]} has a speed and no force; axes of force: {', '.join(contact.wrench) or 'none'}"
         wanted = self.wanted(contact)
         return misfit(wanted.frame, (wanted.wrench, wanted.guard), (robot.wrist.most_force, robot.wrist.most_torque))
 
     def wanted(self, contact: ContactConfig) -> Wanted:
         """Return a contact as the numbers of a request."""
-        wrench, speed, guard = (by_axis(values) for values in (contact.force, contact.speed, contact.guard))
-        selected = np.array([name in contact.force for name in AXIS_NAMES])
+        wrench, speed, guard = (by_axis(values) for values in (contact.wrench, contact.speed, contact.guard))
+        selected = np.array([name in contact.wrench for name in AXIS_NAMES])
         return Wanted(self.frame[contact.frame].quaternion, selected, wrench, speed, guard)
 
 

@@ -25,10 +25,12 @@ class ServerParams(TrajectoryParams):
 
     speed: Positive = Field(0.05, description="most on an axis of force, where a request gives none, m/s")
     turning: Positive = Field(0.2, description="the same about an axis, rad/s")
-    tolerance: Positive = Field(0.3, lt=1.0, description="part of a wanted force by which it may be off")
-    settle: Positive = Field(0.2, description="time for which forces must be within it until a COMPLY is done, s")
-    reach: Positive = Field(4.0, description="longest time for which a force may be off, s: then compliance ends")
-    silence: Positive = Field(1.0, description="time without a sign of life after which the client is lost, s")
+    tolerance: Positive = Field(0.3, le=1.0, description="part of a wanted force by which it may be off")
+    settle: Positive = Field(
+        0.2, description="time for which forces are within it when they are settled, and a COMPLY is done, s"
+    )
+    reach: Positive = Field(4.0, description="longest time without settled forces, s: then compliance ends")
+    silence: Positive = Field(2.0, description="time without a sign of life after which the client is lost, s")
     hold: Positive = Field(3.0, description="time for which forces are held without a client, s")
 
 
@@ -49,7 +51,7 @@ class ServerWork(RequestWork):
         self.contact = Contact()
         self.force: Message | None = None  # FORCE_STATUS that answers the contact in force; None: none does yet
         self.guarded, self.axis = 0, -1  # newest request that a guard has ended, and the guard's axis
-        self._off_s = 0.0  # time since all forces were as wanted
+        self._on_s = self._off_s = 0.0  # time for which all forces are as wanted, and since they were settled
 
     def step(self, time_s: float, hold: bool) -> None:
         """Go on to the sample at `time_s`; with `hold`, ramp to rest. Judge the contact."""
@@ -57,7 +59,7 @@ class ServerWork(RequestWork):
         if self.contact.complies:
             self._judge()
         else:
-            self._off_s = 0.0
+            self._on_s = self._off_s = 0.0
 
     def strike(self, axis: int) -> None:
         """End the request under way: a guard was struck."""
@@ -97,18 +99,17 @@ class ServerWork(RequestWork):
         return params
 
     def _judge(self) -> None:
-        """Count how long forces have been as wanted, or off; end compliance when that is too long."""
-        off, current, period_s = self.off(), self.agenda.current, self._tools.period_s
-        is_off = bool((off > 1.0).any())
-        self._off_s = self._off_s + period_s if is_off else 0.0
+        """Count how long forces have been as wanted; end compliance when they have not settled for too long."""
+        off, current, params, period_s = self.off(), self.agenda.current, self._params, self._tools.period_s
+        self._on_s = 0.0 if (off > 1.0).any() else self._on_s + period_s
+        self._off_s = 0.0 if self._on_s >= params.settle else self._off_s + period_s
         if current is not None and current.kind == MotionKind.COMPLY:
-            self.passed_s = 0.0 if is_off else self.passed_s + period_s
-        if self._off_s > self._params.reach:
+            self.passed_s = self._on_s
+        if self._off_s > params.reach:
             axis = int(off.argmax())
             felt = 0.0 if self.force is None else -self.force.wrench[axis]
-            wanted, unit = self.contact.wrench[axis], UNITS[axis]
-            text = f"axis {AXIS_NAMES[axis]}: {felt:.3g} {unit} instead of {wanted:g} {unit}"
-            self.drop(RequestEnd.FAILED, f"{text} for {self._params.reach:g} s", Error.CONTACT)
+            wanted = f"axis {AXIS_NAMES[axis]} has not settled at {self.contact.wrench[axis]:g} {UNITS[axis]}"
+            self.drop(RequestEnd.FAILED, f"{wanted} for {params.reach:g} s: {felt:.3g} now", Error.CONTACT)
             self.release()
 
     def _begin_anew(self, why: str) -> None:
@@ -131,7 +132,7 @@ class ServerWork(RequestWork):
         elif request.kind == MotionKind.COMPLY and r["selected"].any():
             usual = np.array([self._params.speed] * 3 + [self._params.turning] * 3)
             speed = np.where(r["speed"] > 0.0, r["speed"], usual)
-            self._off_s = 0.0
+            self._on_s = self._off_s = 0.0
             if contact.comply(r["frame"], r["selected"].astype(bool), r["wrench"], speed):
                 self._begin_anew("the arm comes to rest: other axes of force")
         elif request.kind == MotionKind.COMPLY:

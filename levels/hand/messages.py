@@ -151,3 +151,6 @@ GRASP_STATUS = status(
     Field("plan", "u4", "1", "id of the grasp plan in use; 0: none"),
 )
 """From the grasp loop. Points and forces are in the frame of the palm."""
+
+STREAMED_DOWN = (TENSION_COMMAND.name, TENDON_TORQUE.name, FINGER_TARGET.name, GRASP_TARGET.name)
+"""Names of commands that change in every cycle."""

@@ -42,7 +42,7 @@ class WorkstationParams(Table):
     picture: str | None = Field(
         None, description="SVG file, replaced as the hand moves; {rack} stands for the rack's name; default: none"
     )
-    every_s: Positive = Field(0.2, description="time between pictures, s of the wall clock")
+    every_s: Positive = Field(0.2, description="time between pictures, s; by the wall clock")
 
 
 class Workstation(HostProgram):

@@ -15,11 +15,16 @@ from rack.boards.errors import ConfigError
 from rack.levels.servo.control import ServoParams
 
 DIMENSIONLESS = {
-    *("speed", "small_share", "phase", "damping", "braking", "quaternion", "direction"),  # ratios and directions
+    *("speed", "small_share", "phase", "damping", "braking", "tolerance"),  # ratios
+    *("quaternion", "direction", "x", "z"),
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
+    *("lead", "posture", "reserve"),  # of hands: parts and factors
     "for",  # s, or text with its unit
 }
-WHOLE = ("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit")
+WHOLE = (
+    *("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit", "posture", "points"),
+    *("wrench", "guard", "speed"),
+)
 """Keys whose tables hold names of the user's own."""
 
 

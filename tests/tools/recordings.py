@@ -53,8 +53,9 @@ def recorded(
     config: RackConfig,
     traces: Mapping[str, Sequence[Cycle | Row]],
     events: Sequence[Mapping[str, Any]] = (),
+    messages: Mapping[str, np.ndarray] | None = None,
 ) -> Recording:
-    """Write the recording of a rack whose tasks left these traces into `folder`; return it."""
+    """Write the recording of a rack whose tasks left these traces, and messages, into `folder`; return it."""
     folder.mkdir(exist_ok=True)
     (folder / "config.toml").write_text(config.text())
     (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
@@ -62,6 +63,8 @@ def recorded(
     for task, trace in traces.items():
         rows = [cycle.row(tick_ns(config)) if isinstance(cycle, Cycle) else cycle for cycle in trace]
         cycles.add(task, np.array(rows, RECORD))
+    for mailbox, rows in (messages or {}).items():
+        signals.add(mailbox, rows)
     cycles.close({})
     signals.close({})
     return Recording(folder)

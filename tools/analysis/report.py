@@ -14,6 +14,7 @@ from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
+from rack.levels.force.messages import FORCE_STATUS, WRENCH
 from rack.levels.hand.messages import HAND_STATUS
 from rack.levels.joint_messages import DRIVING
 from rack.levels.messages import TASK_STATUS
@@ -32,6 +33,7 @@ from rack.tools.analysis.report_markdown import markdown
 from rack.tools.faults.judge import faults
 from rack.tools.runs.history import counted, fired_rows, first_difference, frequency, holds, misses, steal
 from rack.tools.runs.host_side import entries_of
+from rack.tools.runs.interrupts import interrupts
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.queues import queues
 from rack.tools.runs.recording import Recording
@@ -81,7 +83,9 @@ def report_of(recording: Recording) -> Report:
         "task": _task_outcome(recording),
         "motion": _motion(recording),
         "hand": _hand(recording, config),
+        "force": _force(recording),
         "queues": queues(recording),
+        "interrupts": interrupts(recording),
         "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
     }
@@ -91,7 +95,8 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
         *("misses", "steal", "frequency_mhz", "notes", "holds", "state_tables", "faults", "unexplained", "restarts"),
-        *("system_response", "entries", "network", "task", "motion", "hand", "queues", "rows_lost"),
+        *("system_response", "entries", "network", "task", "motion", "hand", "force", "queues", "interrupts"),
+        "rows_lost",
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
@@ -237,6 +242,26 @@ def _hand(recording: Recording, config: RackConfig) -> Report | None:
         "closed_cycles": int(np.count_nonzero(recording.signal(mailbox, "stopped"))),
         **{name: int(recording.signal(mailbox, name)[-1]) for name in ("touches", "violations", "pushed")},
         "clipped_cycles": int(recording.signal(mailbox, "clipped")[-1]),
+    }
+
+
+def _force(recording: Recording) -> Report | None:
+    """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N, or None."""
+    wrench, status = _mailbox_of(recording, WRENCH.name), _mailbox_of(recording, FORCE_STATUS.name)
+    if wrench is None:
+        return None
+    halves = recording.signal(wrench, "wrench").reshape(-1, 2, 3)
+    force, torque = np.sqrt((halves**2).sum(axis=2)).max(axis=0)
+    error = np.zeros(0)
+    if status is not None:
+        # The tool exerts the opposite of what it feels.
+        off = recording.signal(status, "wanted") + recording.signal(status, "wrench")
+        error = off[:, :3][recording.signal(status, "selected")[:, :3] == 1]
+    return {
+        "largest_force_n": round(float(force), 6),
+        "largest_torque_nm": round(float(torque), 6),
+        "exceeded_cycles": int(recording.signal(wrench, "exceeded")[-1]),
+        "force_rms_n": round(float(np.sqrt(np.mean(error**2))), 6) if len(error) else None,
     }
 
 

@@ -85,7 +85,9 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _task(report["task"])
     yield from _motion(report["motion"])
     yield from _hand(report["hand"])
+    yield from _force(report["force"])
     yield from _queues(report["queues"])
+    yield from _interrupts(report["interrupts"])
     yield from _holds(report)
     yield from _state_tables(report["state_tables"])
     yield from _times(report)
@@ -252,12 +254,34 @@ def _hand(hand: Report | None) -> Iterator[str | Grid]:
     yield f"Largest force on each tip, N: {forces}."
 
 
+def _force(force: Report | None) -> Iterator[str]:
+    if force is None:
+        return
+    off = "" if force["force_rms_n"] is None else f"; axes of force {force['force_rms_n']:.2f} N RMS off"
+    yield (
+        f"Contact: at most {force['largest_force_n']:.1f} N and {force['largest_torque_nm']:.2f} N m, "
+        f"beyond the arm's limits in {force['exceeded_cycles']} cycles{off}."
+    )
+
+
 def _queues(queues: Sequence[Report]) -> Iterator[str]:
     for queue in queues:
         refused = f", {queue['refused']} refused" if queue["refused"] else ""
         yield (
             f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at most "
             f"{queue['waiting']} waiting, room for {queue['capacity']}{refused}."
+        )
+
+
+def _interrupts(boards: Sequence[Report]) -> Iterator[str]:
+    for board in boards:
+        lost, latency = f", {board['lost']} lost" if board["lost"] else "", board["latency_us"]
+        took = (
+            f"; {latency['p50']:g} us from sending to the end of service, at most {latency['max']:g}" if latency else ""
+        )
+        yield (
+            f"Interrupts of {board['board']}: {board['served']} messages served, at most {board['waiting']} waiting, "
+            f"room for {board['depth']}{lost}{took}."
         )
 
 

@@ -12,14 +12,35 @@ from rack.boards.errors import BoardError
 from rack.levels.errors import LevelError
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.reproduction.experiments.experiment import Experiment, Kept, Workshop, kept, machine, made, program
+from rack.tools.reproduction.experiments.experiment import (
+    KEPT,
+    Experiment,
+    Kept,
+    Workshop,
+    kept,
+    machine,
+    made,
+    program,
+)
 from rack.tools.reproduction.html import html
 from rack.tools.reproduction.markdown import markdown
-from rack.tools.reproduction.sections import gantt, timing
+from rack.tools.reproduction.sections import application, comparison, conclusion, gantt, model, opening, time, timing
 from rack.tools.reproduction.sections.page import Page, text
 from rack.tools.reproduction.sections.statement import Chapter
 
-CHAPTERS: tuple[Chapter, ...] = (timing.RESPONSE, timing.LOW, timing.HIGH, gantt.CHAPTER)
+CHAPTERS: tuple[Chapter, ...] = (
+    opening.ABSTRACT,
+    opening.INTRODUCTION,
+    model.CHAPTER,
+    time.CHAPTER,
+    timing.RESPONSE,
+    timing.LOW,
+    timing.HIGH,
+    gantt.CHAPTER,
+    application.CHAPTER,
+    comparison.CHAPTER,
+    conclusion.CHAPTER,
+)
 """The sections of the page, in the paper's order."""
 FILES = ("index.html", "README.md", "paper.json")
 PROJECT = (BackplaneError, BoardError, LevelError, Failure)
@@ -32,6 +53,12 @@ def chapters_named(names: Sequence[str]) -> list[Chapter]:
     if unknown := [name for name in names if name not in known]:
         raise Failure(f"--only {unknown[0]}: no such section; permitted: {', '.join(known)}", 2)
     return [known[name] for name in names] if names else list(CHAPTERS)
+
+
+def forget(wanted: Sequence[Chapter], folder: Path) -> None:
+    """Remove what is kept for these chapters, so that it is made again."""
+    for one in experiments(wanted):
+        (folder / KEPT / f"{one.name}.json").unlink(missing_ok=True)
 
 
 def reproduce(wanted: Sequence[Chapter], workshop: Workshop, progress: Progress) -> Page:

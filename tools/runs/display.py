@@ -149,6 +149,7 @@ class RackView:
             yield from _rows(rows, width)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
+        yield from (Text(inbox.line) for inbox in snapshot.inboxes)
         yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:

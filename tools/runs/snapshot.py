@@ -18,6 +18,7 @@ from rack.boards.exchange import EXCHANGE, PortAge, ages_of
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.runs.holds import Hold, Holds
 from rack.tools.runs.host_side import EntryRow, HostRow, entry_rows, host_rows
+from rack.tools.runs.interrupts import Inboxes, InboxFill
 from rack.tools.runs.network import ExportRow, ImportRow, Network, PeerRow
 from rack.tools.runs.queues import QueueFill, Queues
 
@@ -76,8 +77,9 @@ class Snapshot:
 
     `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
     the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
-    `queues` are all of them, empty ones too; `exchanges` the messages in use of boards with an exchange, by port;
-    `peers` other racks on the network, `imports` and `exports` what passes to and from them.
+    `queues` are all of them, empty ones too; `inboxes` those of boards that messages interrupt; `exchanges` the
+    messages in use of boards with an exchange, by port; `peers` other racks on the network, `imports` and `exports`
+    what passes to and from them.
     """
 
     rack: str
@@ -94,6 +96,7 @@ class Snapshot:
     hosts: tuple[HostRow, ...] = ()
     entries: tuple[EntryRow, ...] = ()
     queues: tuple[QueueFill, ...] = ()
+    inboxes: tuple[InboxFill, ...] = ()
     exchanges: Mapping[str, Mapping[str, PortAge]] = field(default_factory=dict)
     peers: tuple[PeerRow, ...] = ()
     imports: tuple[ImportRow, ...] = ()
@@ -109,6 +112,7 @@ class RackMonitor:
         self._faults = FaultTable(segment)
         self._holds = Holds(segment)
         self._queues = Queues(segment)
+        self._inboxes = Inboxes(segment)
         self._network = Network(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
@@ -145,6 +149,7 @@ class RackMonitor:
             hosts=host_rows(self._segment),
             entries=entry_rows(self._segment),
             queues=self._queues.look(),
+            inboxes=self._inboxes.look(),
             peers=self._network.peers(),
             imports=self._network.imports(),
             exports=self._network.exports(),

@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from rack.levels.force.contact import AXIS_NAMES, UNITS
 from rack.levels.robot.cell import Cell
 from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
@@ -23,7 +24,8 @@ LONGEST_M, TOOL_SHAFT_M = 1.0, 0.014
 """Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show beyond the tool."""
 TIP_M, TIP_SHAFT_M = 0.02, 0.003
 """Length of an arrow at a fingertip for 1 N, and its radius."""
-AXES = {"x": "N", "y": "N", "z": "N", "rx": "N m", "ry": "N m", "rz": "N m"}
+AXES = dict(zip(AXIS_NAMES, UNITS, strict=True))
+"""Units, by axis of a task frame."""
 
 
 class ContactPlace(NamedTuple):

@@ -17,7 +17,7 @@ from rack.backplane.words import System
 from rack.boards.config import RackConfig, loads, rack_timing
 from rack.boards.config.timing import tick_ns
 from rack.levels.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH
-from rack.levels.hand.messages import HAND_STATUS
+from rack.levels.hand.messages import HAND_STATUS, STREAMED_DOWN
 from rack.levels.joint_messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.messages import (
     ARM_STATE,
@@ -186,7 +186,7 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
     parts: list[ViewPart] = []
     if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
         parts.append(Activity(stream, mailbox).write)
-    elif mailbox.name.endswith(".command") and "id" in names and mailbox.message not in STREAMED:
+    elif mailbox.name.endswith(".command") and "id" in names and mailbox.message not in (*STREAMED, *STREAMED_DOWN):
         parts.append(Commanded(stream, mailbox).write)
     if {"table", "row", "fired", "in_state"} <= names:
         parts.append(FiredRows(stream, mailbox).write)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -56,7 +56,6 @@ class HybridRig:
         self._request = self.rack.message("client.requests")
         self.forces: list[Array] = []  # (6,), of the contact on the tool
         self.targets: list[Array] = []  # (joints,), of the arm
-        self.moved: list[Array] = []  # (3,), m: tool as simulated
 
     def line(self, position: Sequence[float], segment: float = 0.0) -> int:
         """Queue a line of the tool; return its id."""
@@ -83,7 +82,11 @@ class HybridRig:
             self.rack.step()
             self.forces.append(arm.write.wrench.wrench.copy())
             self.targets.append(arm.write.status.target.copy())
-            self.moved.append(self.ik.tool_at(arm.write.status.position).position)
+
+    @property
+    def tool(self) -> Array:
+        """Place of the tool, m, (3,)."""
+        return self.ik.tool_at(self.output("arm", "status").position).position
 
     def output(self, board: str, port: str) -> Message:
         """Return what a board wrote last."""
@@ -103,10 +106,6 @@ class HybridRig:
     def motion(self) -> Message:
         """The status of the trajectory level."""
         return self.output("trajectory", "status")
-
-    @property
-    def arm(self) -> Any:
-        return self.rack.tasks["arm"].level
 
     def steps(self) -> tuple[float, float]:
         """Return the greatest velocity and acceleration of the targets so far, as parts of the limits."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rack.levels.tables import RobotConfig, SceneConfig, WristConfig
+from rack.levels.tables import RobotConfig, SceneConfig, SensorConfig, WristConfig
 from tests.levels.arms import ROBOTS, config
 
 PAD = """
@@ -40,9 +40,13 @@ def pad(
     friction: float = 0.3,
     sites: tuple[str, str] = ("sensor", "sensor"),
     reach: float = 150.0,
+    resolution: float = 0.0,
     **wrist: Any,
 ) -> tuple[RobotConfig, SceneConfig]:
-    """Write the model to `folder`; return its config, with the keys `wrist` changed."""
+    """Write the model to `folder`; return its config, with the keys `wrist` changed.
+
+    `resolution` is that of the encoders, rad; `reach` the range of the sensor, N.
+    """
     before, _, rest = (ROBOTS / "puma560.xml").read_text().partition('<body name="hand"')
     after = rest.split("</body>", 3)[3].replace('<exclude body1="finger_left" body2="finger_right"/>', "")
     after = after.replace('body2="hand"', 'body2="tool"').replace("</worldbody>", WORLD + "</worldbody>")
@@ -54,4 +58,5 @@ def pad(
     model.write_text(text)
     robot, _ = config("puma560")
     changes = {"model": model, "gripper": None, "substeps": 4, "wrist": WristConfig(**{**WRIST, **wrist})}
+    changes["sensors"] = SensorConfig(resolution=resolution)
     return robot.model_copy(update=changes), SceneConfig(supports=("table", "wall"))

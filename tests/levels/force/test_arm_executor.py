@@ -35,8 +35,8 @@ FREE_M, WALL_M = 0.74, 0.76
 class PressRig:
     """An arm board and a board that servoes its joints, under references for the tool, forwards and backwards."""
 
-    def __init__(self, folder: Path, reach: float = 150.0, **arm: Any) -> None:
-        robot, scene = pad(folder, reach=reach)
+    def __init__(self, folder: Path, reach: float = 150.0, resolution: float = 0.0, **arm: Any) -> None:
+        robot, scene = pad(folder, reach=reach, resolution=resolution)
         boards = [
             BoardSpec("arm", 1, ForceArmExecutor, above="servo", params=arm),
             BoardSpec("servo", 1, JointServo, above="level", below="arm"),
@@ -115,11 +115,12 @@ def test_a_contact_within_the_limits_is_measured_and_no_fault(tmp_path: Path) ->
     assert (rig.wrench.exceeded, rig.wrench.saturated, rig.status.touches) == (0, 0, 0)
 
 
-def test_free_motion_is_no_contact(tmp_path: Path) -> None:
-    rig = PressRig(tmp_path)
+@pytest.mark.parametrize(("resolution", "most"), [(0.0, 0.1), (2e-4, 2.0)])
+def test_free_motion_is_no_contact(tmp_path: Path, resolution: float, most: float) -> None:
+    rig = PressRig(tmp_path, resolution=resolution)
     rig.go(FREE_M, 0.1)
     rig.go(FREE_M - 0.10, 0.2)
-    assert max(rig.forces) < 0.1
+    assert max(rig.forces) < most
 
 
 @pytest.mark.parametrize(("on_force_limit", "is_braked"), [("brake", True), ("stop", True), ("hold", False)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -15,6 +16,7 @@ from rack.levels.errors import LevelError
 from rack.levels.force.client import ForceMotions
 from rack.levels.force.messages import SERVER_STATUS, Mode
 from rack.levels.force.program import ForceProgram
+from rack.levels.force.server import ForceServer
 from rack.levels.level import LevelContext
 from rack.levels.trajectory.messages import MotionKind
 from tests.levels.arms import config
@@ -23,7 +25,7 @@ ROBOT, SCENE = config("penn_cell")
 TASK: Mapping[str, Any] = {
     "frame": {"table": {"x": [0.0, 2.0, 0.0], "z": [0.0, 0.0, -1.0]}},
     "contact": {
-        "wipe": {"frame": "table", "force": {"z": 15.0}, "speed": {"z": 0.1}},
+        "wipe": {"frame": "table", "wrench": {"z": 15.0}, "speed": {"z": 0.1}},
         "wall": {"frame": "table", "guard": {"x": 8.0, "ry": 0.5}},
     },
 }
@@ -77,7 +79,7 @@ def arm(bus: Bus) -> ForceMotions:
 
 
 def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
-    arm.comply("wipe", force={"z": 20.0, "rx": 0.0})
+    arm.comply("wipe", wrench={"z": 20.0, "rx": 0.0})
     arm.guard("wall")
     arm.free()
     comply, guard, free = bus.requests
@@ -118,7 +120,7 @@ def test_what_the_server_says_is_read(bus: Bus, arm: ForceMotions) -> None:
         (
             "comply",
             "wipe",
-            {"force": {"z": 90.0}},
+            {"wrench": {"z": 90.0}},
             "contact 'wipe': force 90 N; permitted by the arm and its sensor: 80",
         ),
         ("comply", "wall", {}, "contact 'wall' has no axis of force; free() ends compliance"),
@@ -130,7 +132,7 @@ def test_what_the_server_says_is_read(bus: Bus, arm: ForceMotions) -> None:
             {"guard": {"ry": 9.0}},
             "contact 'wall': torque 9 N m; permitted by the arm and its sensor: 8",
         ),
-        ("comply", "wipe", {"force": {"w": 5.0}}, "force.w"),
+        ("comply", "wipe", {"wrench": {"w": 5.0}}, "wrench.w"),
         ("comply", "wipe", {"speed": {"x": 0.1}}, "contact 'wipe': axis x has a speed and no force; axes of force: z"),
     ],
 )
@@ -153,12 +155,12 @@ def test_an_impossible_contact_is_refused_at_once(
             "its axes x and z are not at a right angle: no frame",
         ),
         (
-            {"contact": {"wipe": {"frame": "table", "force": {"z": 81.0}}}},
+            {"contact": {"wipe": {"frame": "table", "wrench": {"z": 81.0}}}},
             "contact.wipe",
             "frame 'table' is not in [task.frame]; permitted: none",
         ),
         (
-            {**TASK, "contact": {"wipe": {"frame": "table", "force": {"z": 60.0, "x": -60.0}}}},
+            {**TASK, "contact": {"wipe": {"frame": "table", "wrench": {"z": 60.0, "x": -60.0}}}},
             "contact.wipe",
             "force 84.8528 N; permitted by the arm and its sensor: 80",
         ),
@@ -167,3 +169,11 @@ def test_an_impossible_contact_is_refused_at_once(
 def test_a_program_that_is_impossible_is_found_before_the_launch(table: Any, key: str, reason: str) -> None:
     found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))
     assert [(place, why) for place, _, why in found] == [(key, reason)]
+
+
+def test_an_arm_without_a_sensor_has_no_contacts_and_no_server() -> None:
+    bare = ROBOT.model_copy(update={"wrist": None})
+    reasons = [reason for _, _, reason in ForceProgram.model_validate(TASK).misfits(bare, SCENE)]
+    assert reasons == ["the arm has no wrist sensor"] * 2
+    ((key, server, _),) = ForceServer.misfits(replace(CONTEXT, robot=bare), (), ())
+    assert (key, server) == ("executor", "ForceServer")

@@ -45,7 +45,7 @@ def test_sliding_keeps_the_force_and_follows_the_motion(tmp_path: Path) -> None:
     rig.line((START[0], START[1] + 0.08, START[2] - 0.015), segment=0.8)
     rig.run(1.6)
     assert np.abs(pressed(rig, 1.6) - WANTED_N).max() < 3.0
-    assert np.abs(rig.moved[-1][:2] - (START[0], START[1] + 0.08)).max() < 1e-3
+    assert np.abs(rig.tool[:2] - (START[0], START[1] + 0.08)).max() < 1e-3
     assert rig.motion.reason == ""
     assert max(rig.steps()) < 1.2
 
@@ -58,7 +58,7 @@ def test_motion_goes_on_without_a_step_when_compliance_ends(tmp_path: Path) -> N
     rig.run(1.0)
     assert max(rig.steps()) < 1.2
     assert np.abs(pressed(rig, 0.2)).max() < WANTED_N + 5.0
-    assert abs(rig.moved[-1][1] - START[1] - 0.08) < 1e-3
+    assert abs(rig.tool[1] - START[1] - 0.08) < 1e-3
     away = rig.status.target - rig.output("trajectory", "command").position
     assert 1e-3 < np.abs(away).max() < 0.1
 
@@ -91,9 +91,9 @@ def test_a_struck_guard_ends_the_motion_once(tmp_path: Path, axis: int) -> None:
     assert (rig.force.struck, rig.force.axis) == (command, axis)
     assert rig.force.reason == f"guard of axis {'xyz'[axis]} was struck: held until another command"
     assert rig.status.holding
-    rest = rig.moved[-1]
+    rest = rig.tool
     rig.run(0.2)
-    assert np.abs(rig.moved[-1] - rest).max() < 2e-3
+    assert np.abs(rig.tool - rest).max() < 2e-3
     assert max(rig.steps()) < 1.2
     before = rig.forces[-1][2]
     if axis == 1:

@@ -124,9 +124,21 @@ def test_a_surface_that_is_not_there_ends_compliance_with_a_reason() -> None:
     dropped = rig.line((X, 0.1, HEIGHT))
     rig.run(2.5)
     assert rig.ends() == {press: RequestEnd.FAILED, dropped: RequestEnd.CANCELLED}
-    assert rig.status.reason == f"request {press}: axis z: 0 N instead of 15 N for 1 s"
+    assert rig.status.reason == f"request {press}: axis z has not settled at 15 N for 1 s: 0 now"
     assert (rig.status.error, rig.mode) == (Error.CONTACT, Mode.MOTION)
     assert rig.places[0][2] - rig.places[-1][2] < 0.03
+
+
+def test_a_force_that_swings_about_the_wanted_one_has_not_settled() -> None:
+    rig = ServerRig(reach=1.0)
+    rig.floor = HEIGHT + 0.0355  # at home the pad presses there
+    press = rig.comply(20.0)
+    for cycle in range(100):
+        rig.floor += 0.003 if cycle % 12 == 0 else -0.003 if cycle % 12 == 6 else 0.0
+        rig.cycle()
+    assert sum(abs(force - 20.0) < 5.0 for force in rig.pressed) > 10
+    assert rig.ends() == {press: RequestEnd.FAILED}
+    assert rig.mode is Mode.MOTION
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def build(robot: RobotConfig, scene: SceneConfig = EMPTY) -> Cell:
     return build_cell(robot, scene, CLOCK_NS)
 
 
-@pytest.mark.parametrize("name", ["puma560", "puma560_crossing", "k1607"])
+@pytest.mark.parametrize("name", ["puma560", "puma560_crossing", "penn_cell", "k1607"])
 def test_every_arm_of_the_project_builds_and_starts_at_home_without_a_touch(name: str) -> None:
     robot, scene = config(name)
     made = build(robot, scene)
@@ -222,3 +222,15 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     robot.model.unlink()
     with pytest.raises(RobotError, match=r"model '.*pendulum.xml': no such file"):
         build(robot)
+
+
+def test_the_arm_of_the_cell_for_force_control_is_the_puma() -> None:
+    puma, own = cell("puma560").model, cell("penn_cell").model
+    for name in (f"link{k}" for k in range(1, 7)):
+        one, other = puma.body(name), own.body(name)
+        for field in ("mass", "inertia", "ipos", "iquat", "pos", "quat"):
+            assert np.array_equal(getattr(one, field), getattr(other, field)), (name, field)
+    for name in (f"j{k}" for k in range(1, 7)):
+        one, other = puma.joint(name), own.joint(name)
+        for field in ("axis", "range", "armature", "damping", "frictionloss"):
+            assert np.array_equal(getattr(one, field), getattr(other, field)), (name, field)

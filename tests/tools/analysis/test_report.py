@@ -220,3 +220,11 @@ def test_limits_that_a_push_broke_stand_beside_those_that_the_arm_broke(folder: 
     motion = {"tracking_rms_mrad": 0.1, "tracking_peak_mrad": 0.5, "touches": 4, "clipped_cycles": 0}
     text = markdown(write_report(folder)[0] | {"motion": motion | {"violations": 0, "pushed": 7}})
     assert "limits exceeded in 0 substeps, by a push from outside in 7." in text
+
+
+def test_contacts_stand_with_the_arms_limits_and_the_forces_wanted(folder: Path) -> None:
+    force = {"largest_force_n": 23.14, "largest_torque_nm": 0.4, "exceeded_cycles": 2, "force_rms_n": None}
+    text = markdown(write_report(folder)[0] | {"force": force})
+    assert "Contact: at most 23.1 N and 0.40 N m, beyond the arm's limits in 2 cycles." in text
+    text = markdown(write_report(folder)[0] | {"force": force | {"force_rms_n": 1.5}})
+    assert "in 2 cycles; axes of force 1.50 N RMS off." in text

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
+from rack.tools.reproduction.experiments.experiment import Workshop
 from rack.tools.reproduction.sections import timing
 from rack.tools.reproduction.sections.equations import PaperEquation, judged
 from rack.tools.reproduction.sections.page import Columns, Listing, Ruling
+from rack.tools.reproduction.sections.statement import Findings
 
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
 RUN = {"outcome": {"ticks": 800}, "breaches": {}, "steal": {}}
+
+NOWHERE = Workshop(Path("nowhere"), share=True)
 
 
 def test_all_ten_equations_are_there_in_their_order() -> None:
@@ -43,5 +48,5 @@ def verdict(holds: bool, mostly: bool) -> dict[str, object]:
     ids=["always", "mostly", "seldom"],
 )
 def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(holds: bool, mostly: bool, ruling: Ruling) -> None:
-    found = judged(timing.FITS, {"nasrem": {**RUN, "pairs": [verdict(holds, mostly)]}})
+    found = judged(timing.FITS, Findings({"nasrem": {**RUN, "pairs": [verdict(holds, mostly)]}}, NOWHERE))
     assert found.ruling is ruling

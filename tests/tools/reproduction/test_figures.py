@@ -10,6 +10,9 @@ from rack.tools.reproduction.experiments.experiment import Workshop
 from rack.tools.reproduction.experiments.figures import FigureRack, planning, sweep
 from rack.tools.reproduction.sections import gantt
 from rack.tools.reproduction.sections.page import Listing, Plate, Ruling
+from rack.tools.reproduction.sections.statement import Findings
+
+NOWHERE = Workshop(Path("nowhere"), share=True)
 
 
 def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
@@ -54,14 +57,14 @@ def document(late: int, jobs: int = 100) -> dict[str, object]:
 )
 def test_a_figure_that_works_is_judged_by_its_run(late: int, ruling: Ruling) -> None:
     (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2"]
-    assert statement.tested({"fig2": document(late)}).ruling is ruling
+    assert statement.tested(Findings({"fig2": document(late)}, NOWHERE)).ruling is ruling
 
 
 def test_runs_that_do_not_confirm_the_contradiction_make_it_no_finding() -> None:
     (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2-x"]
     confirmed = {gantt.SHORT_2.label: document(0), gantt.LONG_2.label: document(100)}
-    assert statement.tested(confirmed).ruling is Ruling.CONTRADICTS
-    assert statement.tested({**confirmed, gantt.LONG_2.label: document(0)}).ruling is Ruling.FAILS
+    assert statement.tested(Findings(confirmed, NOWHERE)).ruling is Ruling.CONTRADICTS
+    assert statement.tested(Findings({**confirmed, gantt.LONG_2.label: document(0)}, NOWHERE)).ruling is Ruling.FAILS
 
 
 def test_a_schedule_is_drawn_as_the_paper_draws_it(tmp_path: Path) -> None:

@@ -22,7 +22,8 @@ class RealTimeFigures(MissesBeyond):
     """What a run in real time has shown; times in ms of simulated time.
 
     `missed` is the share of the cycles of the fastest boards. `command_ms` and `status_ms` are the response measured
-    down the hierarchy from `commanded`, which is below a queue if there is one, and up. Ages are those of commands when
+    down the hierarchy from `commanded`, which is below a queue if there is one, and up; `command_bound_ms` is the
+    longest that the grid permits from there. Ages are those of commands when
     the lowest level reads them, and of its statuses when they are read above. None: the rack has no such thing. `loads`
     are processor time by core, `board_loads` by board, both as parts of one core; host boards are not traced.
     """
@@ -30,6 +31,7 @@ class RealTimeFigures(MissesBeyond):
     missed: float
     late: float | None
     commanded: str
+    command_bound_ms: float | None
     command_ms: Distribution | None
     status_ms: Distribution | None
     command_age_ms: Distribution | None

@@ -52,10 +52,9 @@ def plot(figures: Sequence[SystemFigures], folder: Path) -> list[Path]:
 
 def _responses(axes: Axes, figures: Sequence[SystemFigures]) -> None:
     """Draw the bounds of the response as bars, what was measured as marks."""
-    rows, predicted = range(len(figures)), [one.predicted for one in figures]
-    axes.barh(rows, [one.bound_ms for one in predicted], 0.6, color=BOUND, label="bound, eq. 3.2")
-    axes.barh(rows, [one.command_ms for one in predicted], 0.3, color=GRID, label="on the grid")
-    ran = [one.realtime for one in figures]
+    rows, ran = range(len(figures)), [one.realtime for one in figures]
+    axes.barh(rows, [one.predicted.bound_ms for one in figures], 0.6, color=BOUND, label="bound, eq. 3.2")
+    axes.barh(rows, [one.command_bound_ms or 0.0 for one in ran], 0.3, color=GRID, label="on the grid, down")
     down = [None if one.command_ms is None else one.command_ms["max"] for one in ran]
     up = [None if one.status_ms is None else one.status_ms["max"] for one in ran]
     _mark(axes, down, Marks("o", DOWN, "command, longest"), -LOWER)
@@ -150,8 +149,9 @@ def _bars(axes: Axes, values: Sequence[Value], label: str, digits: int, others: 
     axes.barh(range(len(values)), [value or 0.0 for value in values], 0.6, color=GRID)
     for row, value in enumerate(values):
         if value is not None:
-            text = f"{value:.{digits}f}"
-            axes.annotate(text, (value, row), (4, 0), textcoords="offset points", va="center", fontsize=7)
+            # In a column: next to a bar it would run into the marks.
+            place = axes.get_yaxis_transform()
+            axes.text(0.99, row, f"{value:.{digits}f}", transform=place, ha="right", va="center", fontsize=7)
     axes.set_xlim(0.0, 1.25 * max((value for value in (*values, *others) if value), default=0.8))
     axes.set_xlabel(label)
 

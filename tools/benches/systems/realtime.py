@@ -48,12 +48,12 @@ def cycles_in(run: RunResult, layout: Layout, board: str) -> CycleCount:
     return CycleCount(min(due, counted["missed"] + counted["skipped"]), due)
 
 
-def bus_traffic(run: RunResult, layout: Layout) -> dict[str, BusTraffic]:
-    """Return the traffic of every board on the bus, with that of its planner."""
-    lasted_s = run.outcome.ticks * layout.clock_ns * 1e-9
+def bus_traffic(counts: Mapping[str, Mapping[str, int]], ticks: int, layout: Layout) -> dict[str, BusTraffic]:
+    """Return the traffic of every board on the bus, with that of its planner; `counts` as in `RunResult.tasks`."""
+    lasted_s = ticks * layout.clock_ns * 1e-9
     found: dict[str, BusTraffic] = {}
     for task in layout.tasks:
-        counted, before = run.tasks[task.name], found.get(task.board, BusTraffic(0.0, 0.0))
+        counted, before = counts[task.name], found.get(task.board, BusTraffic(0.0, 0.0))
         found[task.board] = BusTraffic(
             before.accesses + (counted["reads"] + counted["writes"]) / lasted_s,
             before.bytes + (counted["read_bytes"] + counted["write_bytes"]) / lasted_s,

@@ -122,7 +122,8 @@ def judged(equation: PaperEquation, findings: Findings) -> Assessment:
         )
     if all(verdict["mostly"] for verdict in verdicts):
         why = f"It holds as predicted in 99 of 100 cycles; in the worst it fails for {text(', '.join(broken))}. "
-        why += f"{counts} cycles broke it by their own numbers. {stolen(found)}"
+        why += f"{counts} cycles broke it by their own numbers. " if counts else ""
+        why += stolen(found)
         return Assessment(side, Ruling.BOUNDED, why)
     return Assessment(side, Ruling.FAILS, f"It fails for {text(', '.join(broken))}, in more than one of 100 cycles.")
 

@@ -17,7 +17,7 @@ from rack.tools.reproduction.experiments.measured import LEVELS, PIPELINE, RATE_
 from rack.tools.reproduction.experiments.nasrem import NAME, NASREM, PHASES
 from rack.tools.reproduction.sections.equations import stolen
 from rack.tools.reproduction.sections.flow import between, flow_svg
-from rack.tools.reproduction.sections.gantt import FIG2, FIG4, MOSTLY
+from rack.tools.reproduction.sections.gantt import FIG2, FIG4, MOSTLY, budget_of
 from rack.tools.reproduction.sections.page import Assessment, Columns, Listing, Plate, Ruling, Side, code, text
 from rack.tools.reproduction.sections.statement import Chapter, Findings, Statement
 
@@ -123,14 +123,14 @@ def _loop_tested(findings: Findings) -> Assessment:
     if not bad:
         return Assessment(side, Ruling.HOLDS, f"All {due} cycles of all levels ended within their bound.")
     if bad < MOSTLY / 10 * due:
-        why = f"{due} cycles ended within their bound, {bad} were missed or skipped. {stolen(found)}"
+        why = f"{bad} of {due} cycles were missed or skipped; all others ended within their bound. {stolen(found)}"
         return Assessment(side, Ruling.BOUNDED, why)
     return Assessment(side, Ruling.FAILS, f"{bad} of {due} cycles were missed or skipped.")
 
 
 def _both(workshop: Workshop) -> Side:
     config, apart = FIG2.loaded(), FIG4.loaded()
-    plan = (config.board[LEVEL].budget.plan_ms, config.every(LEVEL) * config.clock_ns * 1e-6)  # type: ignore[union-attr]
+    plan = (budget_of(config).plan_ms, config.every(LEVEL) * config.clock_ns * 1e-6)
     return Side.of(
         f"In {code(FIG2.config)} a plan takes {plan[0]:g} ms of computing; the executor's cycle is {plan[1]:g} ms, "
         "and it needs part of that. The planner is therefore still computing when the next cycle begins: the executor "
@@ -184,7 +184,10 @@ def _bounds_tested(findings: Findings) -> Assessment:
     if late or undone:
         why = f"{late} of {count} faults were not detected, or not recovered from, within their bounds."
         return Assessment(side, Ruling.FAILS, f"{why} Tasks not done: {', '.join(undone) or 'none'}.")
-    why = f"All {count} losses were detected within their bounds, no level stopped cycling, and both tasks were done. Unexplained"
+    why = (
+        f"All {count} losses were detected within their bounds, no level stopped cycling, and both tasks were done. "
+        "Unexplained"
+    )
     return Assessment(side, Ruling.HOLDS, f"{why} detections: {unexplained}.")
 
 
@@ -240,7 +243,10 @@ def _pipeline_tested(findings: Findings) -> Assessment:
     if not any(others.values()):
         return Assessment(side, Ruling.HOLDS, f"Every message took {found['predicted']} cycles.")
     if not others["lockstep"] and all(int(took) >= found["predicted"] for c in found["cycles"].values() for took in c):
-        why = f"In lockstep every message took {found['predicted']} cycles; in real time {others['realtime']} took longer, after "
+        why = (
+            f"In lockstep every message took {found['predicted']} cycles; in real time {others['realtime']} took "
+            "longer, after "
+        )
         return Assessment(side, Ruling.BOUNDED, f"{why}missed cycles.")
     return Assessment(
         side, Ruling.FAILS, "Messages took another number of cycles, in lockstep too, or less than predicted."

@@ -48,7 +48,10 @@ def _determined_tested(findings: Findings) -> Assessment:
         why = "Lockstep twice and a run in real time without a miss wrote the same messages, bit for bit"
         missed = " Runs that missed deadlines diverged no earlier than at the first miss." if len(real) > 1 else ""
         return Assessment(side, Ruling.HOLDS, f"{why}.{missed}")
-    why = "Lockstep twice wrote the same messages. This machine kept no run in real time free of misses; none diverged before "
+    why = (
+        "Lockstep twice wrote the same messages. This machine kept no run in real time free of misses; none "
+        "diverged before "
+    )
     return Assessment(side, Ruling.BOUNDED, f"{why}its first miss, and every miss is on record.")
 
 

@@ -8,8 +8,16 @@ from dataclasses import dataclass
 from rack.tools.reproduction.experiments.experiment import Document, Experiment, Kept, Workshop
 from rack.tools.reproduction.sections.page import Assessment, PageClaim, PageSection, Ruling, Side, text
 
-Findings = Mapping[str, Document]
-"""What experiments have found, by their names."""
+
+@dataclass(frozen=True)
+class Findings:
+    """What experiments have found, by their names, and where pictures of it are drawn."""
+
+    found: Mapping[str, Document]
+    workshop: Workshop
+
+    def __getitem__(self, name: str) -> Document:
+        return self.found[name]
 
 
 @dataclass(frozen=True)
@@ -35,11 +43,11 @@ class Statement:
             title=self.title,
             quote=self.quote,
             predicted=self.predicted(workshop),
-            tested=self._tested(needed),
+            tested=self._tested(needed, workshop),
             equation=self.equation,
         )
 
-    def _tested(self, needed: Mapping[str, Kept | str]) -> Assessment:
+    def _tested(self, needed: Mapping[str, Kept | str], workshop: Workshop) -> Assessment:
         found: dict[str, Document] = {}
         for name, result in needed.items():
             if isinstance(result, str):
@@ -48,7 +56,7 @@ class Statement:
             if result.lacking:
                 return Assessment(Side(), Ruling.UNTESTABLE, f"{text(result.lacking)}.")
             found[name] = result.found
-        return self.tested(found)
+        return self.tested(Findings(found, workshop))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from rack.tools.benches.systems.bench import systems
 from rack.tools.benches.systems.motion import PosesBench, poses_config, three_poses
 
 TASKS = CONFIGS / "tasks"
-LIMITS = ("home", "velocity", "acceleration", "jerk", "gripper")
+LIMITS = ("home", "velocity", "acceleration", "jerk")
 
 
 def _moving() -> list[str]:
@@ -41,7 +41,7 @@ def test_every_form_of_the_motion_has_the_same_poses() -> None:
 
 
 def test_all_racks_move_the_same_arm_from_the_same_start_within_the_same_limits() -> None:
-    assert {"nasrem", "rccl", "chimera", "brown", "ibm", "nist-state-table"} <= set(_moving())
+    assert {"nasrem", "rccl", "chimera", "brown", "ibm", "nist-state-table", "penn"} <= set(_moving())
     first, *others = (load(poses_config(name) or name).robot for name in _moving())
     for other in others:
         assert all(getattr(other, name) == getattr(first, name) for name in LIMITS)

@@ -19,6 +19,7 @@ RAN = RealTimeFigures(
     missed=0.002,
     late=0.0015,
     commanded="top",
+    command_bound_ms=25.0,
     command_ms=TIMES,
     status_ms=TIMES,
     command_age_ms=TIMES,
@@ -44,26 +45,29 @@ def _rows(found: Systems, rack: str) -> list[list[str]]:
 
 
 def test_a_rack_has_a_row_in_the_table_of_each_theme() -> None:
-    promised, answered, first_plan, host, used, killed, moved = _rows(Systems((FOUND,), 1.0, None), "one")
-    assert promised == ["one", "2", "2", "0", "3", "1", "50", "400", "20", "40", "22.5", "22.5", "40", "0.50", "yes"]
-    assert answered[:5] == ["one", *["22.5/25"] * 4]
-    assert answered[5:] == ["top", "30.0", "42.5", "0.20", "0.15", "0.05"]
+    made, answered, stopped, first_plan, host, used, late, killed, moved = _rows(Systems((FOUND,), 1.0, None), "one")
+    assert made == ["one", "2", "2", "0", "3", "1", "50", "400", "0.50", "yes"]
+    spans = ["22.5/25"] * 2
+    assert answered == ["one", "20", "40", "22.5", "25", "22.5/25", "40", "22.5/25", *spans]
+    assert stopped == ["one", "top", "30.0", "42.5", "top", "0.80", "398", "-"]
     assert first_plan == ["one", "top.planner", "3", "22.5", "25.0", "22.5", "25.0"]
     assert host == ["one", "host", "2", "22.5", "25.0", "-", "-"]
     assert used == ["one", "900", "120", "low", "800", "100", "0.40", "0.40", "low", "0.30"]
+    assert late == ["one", "400", "0.20", "0.15", "0.05"]
     assert " ".join(killed) == "one 8x 3 0 .. 1 4 .. 9 10 .. 22.5 host low low top 1"
-    assert moved == ["one", "0.50", "5.00", "0.100", "0.400", "0.200", "3", "0.80", "top", "398", "-"]
+    assert moved == ["one", "0.50", "5.00", "0.100", "0.400", "0.200", "3"]
 
 
 def test_what_a_rack_lacks_is_shown_as_such() -> None:
-    still = replace(RAN, commanded="", command_ms=None, hold=None, plans=(), late=None)
+    still = replace(RAN, commanded="", command_bound_ms=None, command_ms=None, hold=None, plans=(), late=None)
     none = replace(FOUND, rack="none", predicted=replace(PROMISED, levels=(), rates_hz=()), realtime=still, poses=None)
     lines = list(Systems((FOUND, none), 1.0, Absent("cyclictest", "no program", "apt-get install rt-tests")).lines())
     assert "one: top > low" in lines
     assert "none: no level above another" in lines
     assert "no plan made in the run: none" in lines
+    assert "one: 4 ticks: host; 9 ticks: low; unnoticed: top" in lines
     *_, moved = [line.split() for line in lines if line.startswith("none ")]
-    assert moved == ["none", "no", "PUMA", *["-"] * 9]
+    assert moved == ["none", "no", "PUMA", *["-"] * 5]
     assert lines[-1].startswith("absent: cyclictest")
 
 

@@ -1,0 +1,42 @@
+"""The rack condor, with real processes in lockstep: the workstation plans the grasp and draws, the boards grasp."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.message import Message
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.levels.hand.messages import GraspKind
+from tests.processes import wait_until
+
+
+def test_an_order_of_the_workstation_comes_to_the_fingers_as_interrupts(tmp_path: Path) -> None:
+    picture = tmp_path / "hand.svg"
+    settings = ["clock.mode=lockstep", f'host.workstation.params.picture="{picture}"']
+    with Rack(load("condor", [f"name=test-condor-{os.getpid()}", *settings])) as rack:
+        rack.start()
+        grasp = open_observer(rack.segment, "coordinator.status")
+
+        def status() -> Message:
+            rack.watch(0.02)
+            return grasp.peek().value
+
+        wait_until(lambda: status().kind == GraspKind.CLOSE)
+        assert status().plan == 1
+        rack.stop("seen enough")
+        plan = open_observer(rack.segment, "adapter.plan").peek().value
+        tensions = [MailboxRing(rack.segment, f"{finger}.command").drain().rows for finger in ("index", "thumb")]
+    # Each finger is on its side of the can, and both sensed the hand a tick before they commanded.
+    assert (plan.normal[:3] * plan.normal[3]).sum(axis=1).max() < -0.99
+    for rows in tensions:
+        sampled = rows["message"]["sampled"]
+        assert np.unique((rows["tick"] - sampled)[sampled > 20]).tolist() == [1]
+    assert "plan 1" in picture.read_text()
+    ElementTree.parse(picture)
