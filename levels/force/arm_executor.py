@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
-
 import numpy as np
 from pydantic import Field
 
@@ -15,6 +12,7 @@ from rack.levels.arm import wrist
 from rack.levels.arm.wrist import ContactWrench
 from rack.levels.errors import LevelError
 from rack.levels.force.messages import WRENCH
+from rack.levels.force.wrist_level import WristLevel
 from rack.levels.level import Finding, Input, LevelContext, Ports
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import ArmExecutor
@@ -34,7 +32,7 @@ class ForceArmParams(ArmParams):
     )
 
 
-class ForceArmExecutor(ArmExecutor):
+class ForceArmExecutor(WristLevel, ArmExecutor):
     """Writes the wrench of the contact in every cycle; stops the arm when it is beyond `[robot.wrist]` most_*.
 
     A contact stops the arm for as long as it is too strong and for `retry` longer; after `patience` the fault is
@@ -68,15 +66,6 @@ class ForceArmExecutor(ArmExecutor):
         """Load the compiled functions of the level, its arm and its sensor."""
         super().preload()
         wrist.preload()
-
-    @classmethod
-    def misfits(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
-        """Yield an arm without a wrist sensor, and what `ArmExecutor` yields."""
-        yield from super().misfits(context, above, below)
-        if context.robot.wrist is None:
-            yield "executor", cls.__name__, "it needs a wrist sensor: give the arm a table [robot.wrist]"
 
     def self_test(self) -> None:
         """Raise `LevelError` for a class of arms that has no wrist sensor."""

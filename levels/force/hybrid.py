@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
-
 import numpy as np
 
 from rack.backplane.message import Message, State
@@ -12,8 +9,9 @@ from rack.levels.algebra import Array
 from rack.levels.force.compliance import ComplianceWatch
 from rack.levels.force.hybrid_law import HybridGains, HybridLaw
 from rack.levels.force.messages import COMPLIANCE, FORCE_STATUS, WRENCH
+from rack.levels.force.wrist_level import WristLevel
 from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_STATUS
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports
+from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Payload
@@ -28,7 +26,7 @@ PASSED = ("opening", "force", "payload_mass", "payload_offset", "operator")
 """Fields of a reference that are handed on as they are."""
 
 
-class HybridExecutor(Executor):
+class HybridExecutor(WristLevel):
     """Hands the references of the level above on, later by `LEAD_CYCLES`; on axes of force it moves for the force.
 
     A guard that is struck ends the motion: the arm ramps to rest and holds until the level above has another command;
@@ -70,14 +68,6 @@ class HybridExecutor(Executor):
         """Load the compiled functions of the level."""
         for module in (dynamics, reference):
             module.preload()
-
-    @classmethod
-    def misfits(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
-        """Yield an arm without a wrist sensor."""
-        if context.robot.wrist is None:
-            yield "executor", cls.__name__, "it needs a wrist sensor: give the arm a table [robot.wrist]"
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Follow references and forces; report."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
-
 import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.force.messages import COMPLIANCE, FORCE_STATUS, SERVER_REQUEST, SERVER_STATE, SERVER_STATUS, Mode
 from rack.levels.force.work import ServerParams, ServerWork
+from rack.levels.force.wrist_level import WristLevel
 from rack.levels.level import Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import Error
 from rack.levels.tables import read_params
@@ -17,7 +15,7 @@ from rack.levels.trajectory import TrajectoryExecutor
 from rack.levels.trajectory.messages import RequestEnd
 
 
-class ForceServer(TrajectoryExecutor):
+class ForceServer(WristLevel, TrajectoryExecutor):
     """A trajectory level above one of hybrid control, which makes axes of a task frame ones of force.
 
     A client that falls silent while requests are left, or while axes are of force, is lost: its requests are CANCELLED,
@@ -54,14 +52,6 @@ class ForceServer(TrajectoryExecutor):
         self._heard: int | None = None  # tick of the client's last sign of life; None: not yet counted
         self._without, self._since = Mode.MOTION, 0  # mode without a client, and tick since when
         self._sensed = np.array(context.robot.home)  # (joints,), rad
-
-    @classmethod
-    def misfits(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
-        """Yield an arm without a wrist sensor."""
-        if context.robot.wrist is None:
-            yield "executor", cls.__name__, "it needs a wrist sensor: give the arm a table [robot.wrist]"
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take requests, look at client and contact, go on with the motion."""

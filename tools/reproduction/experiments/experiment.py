@@ -27,6 +27,7 @@ from rack.backplane.segment import racks
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.clean import remove_dead
+from rack.tools.benches.cyclictest import permits_fifo
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.runs.display import Display
@@ -165,17 +166,6 @@ def machine() -> Document:
         "real-time priorities": permits_fifo(),
         "libraries": {name: version(name) for name in LIBRARIES},
     }
-
-
-@cache
-def permits_fifo() -> bool:
-    """Say whether this machine lets a process take a real-time priority."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    except PermissionError:
-        return False
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return True
 
 
 def need_real_time(cores: int = 1) -> None:
