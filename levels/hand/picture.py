@@ -5,6 +5,7 @@ Everything is in the world's frame: x to the right; z up in the view from the fr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
@@ -148,8 +149,8 @@ def local_points(model: mujoco.MjModel, geom: int) -> Array:
     """Return points on the surface of a geom, (n, 3), m, in its own frame; of a box or mesh the corners of its box."""
     kinds, (a, b, c) = mujoco.mjtGeom, model.geom_size[geom]
     kind = kinds(int(model.geom_type[geom]))
-    turns = np.linspace(0.0, 2.0 * np.pi, RIM, endpoint=False)
-    ring = np.stack([np.cos(turns), np.sin(turns), np.zeros(RIM)], axis=1)
+    turns = [2.0 * math.pi * k / RIM for k in range(RIM)]
+    ring = np.array([(math.cos(turn), math.sin(turn), 0.0) for turn in turns])
     up = np.array([0.0, 0.0, 1.0])
     if kind in (kinds.mjGEOM_CYLINDER, kinds.mjGEOM_CAPSULE):
         ends = [a * ring + b * up, a * ring - b * up]
