@@ -135,6 +135,7 @@ def test_the_lab_of_a_killed_process_is_removed_by_the_next_one() -> None:
         subprocess.Popen([sys.executable, "-c", ABANDONED], stdout=subprocess.PIPE, text=True) as maker,
     ):
         sleeper, *names = maker.stdout.readline().split()
+        wait_until(lambda: Path(f"/proc/{sleeper}/comm").read_text() == "sleep\n")  # `ip netns exec` has entered
         maker.kill()
         maker.wait(BOUND_S)
         assert runs(int(sleeper))
