@@ -29,6 +29,7 @@ RUNS = (
     "nist-state-table --seconds 5",
     "rccl --seconds 4",
     "brown --seconds 4",
+    "hic --seconds 6",
     "nasrem --faults bad-sensors --seconds 8",
     "nasrem --faults bad-motors --seconds 8",
     "nasrem --faults noisy-bus --seconds 9",
