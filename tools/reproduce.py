@@ -43,7 +43,7 @@ def reproduce(
     The page is DIR/index.html, self-contained, and DIR/README.md with its pictures next to it. DIR/paper.json has
     everything as data, DIR/runs the recordings: `rack report`, `rack gantt` and `rack analyze` read them.
 
-    It takes about ten minutes on two cores. Do not use the machine meanwhile: real-time figures suffer. What is
+    It takes about six minutes on two cores. Do not use the machine meanwhile: real-time figures suffer. What is
     finished is kept, also if the command is interrupted or killed: given again, it continues. A change of configs,
     program or machine makes the experiments anew that depend on it.
 
