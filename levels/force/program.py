@@ -27,7 +27,9 @@ class FrameConfig(Table):
     def objection(self) -> str:
         """Return why the axes are no frame; empty: they are one."""
         lengths = norm(self.x) * norm(self.z)
-        cosine = float((np.array(self.x) * self.z).sum()) / lengths if lengths > 0.0 else 1.0
+        if not lengths > 0.0:
+            return "an axis of length 0: no frame"
+        cosine = float((np.array(self.x) * self.z).sum()) / lengths
         return "" if abs(cosine) <= MAX_COSINE else "its axes x and z are not at a right angle: no frame"
 
     @property

@@ -155,6 +155,11 @@ def test_an_impossible_contact_is_refused_at_once(
             "its axes x and z are not at a right angle: no frame",
         ),
         (
+            {"frame": {"flat": {"x": [1.0, 0.0, 0.0], "z": [0.0, 0.0, 0.0]}}},
+            "frame.flat",
+            "an axis of length 0: no frame",
+        ),
+        (
             {"contact": {"wipe": {"frame": "table", "wrench": {"z": 81.0}}}},
             "contact.wipe",
             "frame 'table' is not in [task.frame]; permitted: none",
