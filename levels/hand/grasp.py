@@ -201,7 +201,7 @@ class GraspExecutor(Executor):
         self._work = WORKS[type(step)](grasp, step, self._passed_s)
 
     def _take_up(self, close: CloseStep) -> None:
-        """HandGrip by a CLOSE from now on."""
+        """Grip by a CLOSE from now on."""
         grasp, gripping = self._grasp, np.array([name in close.points for name in self._grasp.names])
         grasp.close, grasp.base = close, 0.0
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)

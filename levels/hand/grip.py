@@ -41,7 +41,7 @@ class HandGrip:
     """The grip of some fingers, of which one opposes the others. All forces are of the tips on the object."""
 
     def __init__(self, gains: GripGains, fingers: NDArray[np.bool_], opposing: int, period_s: float) -> None:
-        """HandGrip with `fingers`, (fingers,), every `period_s`."""
+        """Grip with `fingers`, (fingers,), every `period_s`."""
         self._gains, self._period_s, self._opposing = gains, period_s, opposing
         self.fingers = fingers.copy()
         self._others = fingers.copy()

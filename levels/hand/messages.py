@@ -59,7 +59,7 @@ HAND_STATUS = status(
     Field("tension", "f8", "N", "of the tendons, as sensed", (2, "joints")),
     Field("wanted", "f8", "N", "tensions commanded of the valves", (2, "joints")),
     Field("force", "f8", "N", "of the surroundings on the fingertips, as sensed", ("fingers", 3)),
-    Field("holding", "u1", "1", "1: no fresh tensions: the valves keep the last ones"),
+    Field("holding", "u1", "1", "1: no fresh tensions: the valves are closed"),
     Field("stopped", "u1", "1", "1: tensions are not followed: a demand, an operator, or a lost board"),
     Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
     Field("clipped", "u4", "1", "cycles in which a tension was cut to its limits"),
