@@ -8,13 +8,13 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from rack.tools.reproduction.experiments.deadline import DEADLINE
 from rack.tools.reproduction.experiments.experiment import KEPT, kept
+from tests.processes import wait_until
 from tests.tools.command_line import BOUND_S, rack
 
 pytestmark = pytest.mark.timeout(200)
@@ -27,11 +27,9 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page") / "paper"
     command = [sys.executable, "-m", "rack.tools.cli", "reproduce", "--out", str(folder), "--only", SECTION, "--share"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
-    deadline = time.monotonic() + BOUND_S
-    while not (folder / "runs" / "goto" / "events.jsonl").exists():
-        assert process.poll() is None, "it ended before its first run"
-        assert time.monotonic() < deadline, "no run began"
-        time.sleep(0.02)
+    begun = folder / "runs" / "goto" / "events.jsonl"
+    wait_until(lambda: begun.exists() or process.poll() is not None, BOUND_S)
+    assert process.poll() is None, "it ended before its first run"
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     return folder
