@@ -293,8 +293,8 @@ def systems(
 ) -> None:
     """Compare racks with each other: what their configs promise, and what their runs show.
 
-    Without CONFIG these are nasrem and the bundled racks that model other systems: about six minutes on two quiet
-    cores, 40 seconds a rack.
+    Without CONFIG these are nasrem and the bundled racks that model other systems: about four minutes on two quiet
+    cores, 25 seconds a rack.
 
     Of each config: the levels of its longest chain, boards, processes, cores, rates, the longest cycle R_max, the
     response R_s by eqs 3.2 and 3.3 and on the clock's grid, and whether it fits.
